@@ -18,7 +18,7 @@ import numpy as np
 
 import flexplant as fx
 from flexplant.lti import highpass
-from flexplant.plant import BaseAcceleration, GroundSpring, decouple, suspend
+from flexplant.plant import BaseAcceleration, GroundSpring, gravity_axes, suspend
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 SIZE, ELEMENTS = (0.4, 0.3, 0.05), (8, 6, 2)  # m
@@ -109,7 +109,7 @@ def main() -> dict[str, Any]:
     sampled = plant.discretized(RATE, delay=DELAY)
     path = [held(sampled.at(point)) for point in PATH]
     middle, corner = path[0]["loop"], path[-1]["observer"].plant
-    rigid = decouple(plant)
+    rigid = gravity_axes(plant)
     machine = fx.testbeds.magnet_stage(rate=RATE, delay=DELAY)
     return {
         "machine": machine.loop(ports(), path[0]["observer"], path[0]["servo"]),
@@ -120,7 +120,7 @@ def main() -> dict[str, Any]:
         "path": path,
         "budgets": {axis: middle.budget(f"die:{axis}") for axis in ("x", "z")},
         # a filter that reads the decoupled motions alone, at the corner
-        "six": fx.design_kalman(corner.through(decouple(corner).to_motions)),
+        "six": fx.design_kalman(corner.through(gravity_axes(corner).to_motions)),
     }
 
 

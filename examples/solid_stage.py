@@ -144,7 +144,7 @@ def main() -> dict[str, Any]:
     modes = fx.solve_modes(model, count=20, damping=fx.ModalDamping(0.005))
     plant = fx.assemble_plant(modes, ports())
     report = plant.check()
-    axes = fx.decouple(plant)
+    axes = fx.plant.gravity_axes(plant)
     sampled = plant.discretized(RATE, delay=DELAY)
     observer = fx.design_kalman(sampled)
     servo = fx.design_servo(sampled, bandwidth=BANDWIDTH)

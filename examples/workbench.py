@@ -63,14 +63,14 @@ def law(crossover: float, gain: float, *notches: float) -> ShapedAxis:
 def shaped(frf: fx.Frf, plant: fx.StandardPlant) -> LoopDesign:
     """Return laws of 60 Hz for the rigid body of the drawing, on the measured responses."""
     axes = {
-        "cog:z": law(60.0, 4.9e4, 455.0),
-        "cog:rx": law(60.0, 4.9e4, 636.0, 1130.0),
-        "cog:ry": law(60.0, 4.9e4, 630.0, 1130.0),
+        "die:z": law(60.0, 4.9e4, 455.0),
+        "die:rx": law(60.0, 4.9e4, 636.0, 1130.0),
+        "die:ry": law(60.0, 4.9e4, 630.0, 1130.0),
     }
     rigid = fx.decouple(plant)
     return LoopDesign.on(
         frf, axes, before=rigid.accelerations, after=rigid.to_motions, rate=RATE, hold=False,
-        references={"cog:z": "die:ref"},
+        references={"die:z": "die:ref"},
     )  # fmt: skip
 
 

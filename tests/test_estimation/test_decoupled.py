@@ -6,7 +6,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.plant import decouple, reference_errors
+from flexplant.plant import gravity_axes, reference_errors
 from stages import CORNERS, L, ports, reduced, sampled, some_modes
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
@@ -24,7 +24,7 @@ def machine(places):
 @pytest.mark.slow
 def test_as_many_motions_as_sensors_are_the_same_filter():
     plant = machine(CORNERS[:3])
-    motions = decouple(plant).to_motions
+    motions = gravity_axes(plant).to_motions
     decoupled = plant.through(motions)
     assert decoupled.y == ("cog:z", "cog:rx", "cog:ry")
     for whole in (None, WHOLE):
@@ -44,7 +44,7 @@ def test_as_many_motions_as_sensors_are_the_same_filter():
 
 def test_fewer_motions_than_sensors_against_a_dense_riccati_equation():
     plant = machine([*CORNERS, (L / 2, 0.1, 0.0)])
-    T = decouple(plant).to_motions
+    T = gravity_axes(plant).to_motions
     decoupled = plant.through(T)
     found = fx.design_kalman(decoupled)
     scale = 1e9  # measurements in nm
@@ -64,7 +64,7 @@ def test_refusals():
     plant = sampled(reduced(), ports())
     with pytest.raises(ModelError, match="mixes references with sensors"):
         fx.design_kalman(plant.through(reference_errors(plant)))
-    decoupled = plant.through(decouple(plant).to_motions)
+    decoupled = plant.through(gravity_axes(plant).to_motions)
     with pytest.raises(ModelError, match="read through a block"):
         fx.design_static(decoupled)
     with pytest.raises(ModelError, match="the plant is weighted and read through"):

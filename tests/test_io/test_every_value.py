@@ -175,6 +175,7 @@ def made():
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
     yield from (plants.GroundSpring(Z8, 1e3), plants.decouple(plant), plants.FastStates())
+    yield from (plants.gravity_axes(plant), plants.driven_axes(plant))
     yield plants.StandardPlant.from_statespace(plant.system)
     yield from (plants.FirstOrder(1e-3, 10.0), plants.NarrowBand(1e-3, 50.0))
     yield from (plants.RandomWalk(1e-3), plants.RigidForce("drag", asd=1e-3))

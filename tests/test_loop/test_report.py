@@ -13,7 +13,7 @@ from flexplant.loop.broken import scaled_size
 from flexplant.loop.report import loop_margins
 from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
 from flexplant.lti.interconnection import loop_poles
-from flexplant.plant import assemble_plant, decouple
+from flexplant.plant import assemble_plant, gravity_axes
 from stages import RATE, ports, reduced
 
 LINES = np.arange(0.5, 400.0, 0.05)
@@ -300,7 +300,7 @@ def test_each_loop_is_broken_with_the_others_closed():
 def test_a_measured_plant_in_axes_with_hold_and_delay():
     """The Frf of the continuous stage beside the discretised one, below its aliases."""
     continuous = assemble_plant(reduced(), ports(references=[]))
-    axes = decouple(continuous)
+    axes = gravity_axes(continuous)
     freq = np.arange(5.0, 300.0, 5.0)
     frf = frequency_response(continuous.Gyu, freq)
     found = in_axes(frf, before=axes.accelerations, after=axes.to_motions, rate=RATE, delay=1.5)

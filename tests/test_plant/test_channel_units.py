@@ -95,7 +95,7 @@ def test_designs_know_the_units_of_their_channels():
     plant = fx.assemble_plant(some_modes(), ports())
     sampled = plant.discretized(10e3, delay=1)
     weights = fx.stage_weights(plant, 30.0)
-    apart = fx.decouple(sampled)
+    apart = fx.plant.gravity_axes(sampled)
     systems = [
         fx.design_servo(sampled, bandwidth=50.0).system,
         fx.design_static(sampled).system,

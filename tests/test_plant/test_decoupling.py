@@ -1,4 +1,4 @@
-"""decouple: transformations to the centre of gravity, against geometry and a rigid body."""
+"""gravity_axes: transformations to the centre of gravity, against geometry and a rigid body."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from flexplant.plant import (
     Sensor,
     StandardPlant,
     assemble_plant,
-    decouple,
+    gravity_axes,
     suspend,
 )
 from stages import CORNERS, INSET, NOISE, RATE, Z8, L, full, ports, reduced, some_modes
@@ -29,7 +29,7 @@ def arms(points, centre=(L / 2, L / 2)):
 def test_products_are_the_identity(model):
     plant = assemble_plant(model(), ports())
     for base in (plant, plant.discretized(RATE, delay=1)):
-        axes = decouple(base)
+        axes = gravity_axes(base)
         assert axes.axes == ("z", "rx", "ry")
         assert axes.to_motions.dt == base.dt
         np.testing.assert_allclose(axes.T_y @ arms(CORNERS), np.eye(3), atol=1e-9)
@@ -43,7 +43,7 @@ def test_products_are_the_identity(model):
 
 def test_the_decoupled_plant_is_a_double_integrator_each_axis():
     plant = assemble_plant(full(), ports())
-    axes = decouple(plant)
+    axes = gravity_axes(plant)
     assert axes.to_actuators.inputs == ("cog:z:force", "cog:rx:force", "cog:ry:force")
     assert axes.to_motions.outputs == ("cog:z", "cog:rx", "cog:ry")
     s = 2j * np.pi * 0.5  # far below the first elastic mode at 246 Hz
@@ -56,7 +56,7 @@ def test_the_decoupled_plant_is_a_double_integrator_each_axis():
 
 @pytest.mark.slow
 def test_an_added_mass_moves_the_centre():
-    axes = decouple(assemble_plant(full(mass=0.5), ports()))
+    axes = gravity_axes(assemble_plant(full(mass=0.5), ports()))
     centre = (MASS * L / 2 + 0.5 * Z8[1]) / (MASS + 0.5)
     np.testing.assert_allclose(axes.centre[:2], [L / 2, centre], rtol=1e-9)
     spread = INERTIA + MASS * (L / 2 - centre) ** 2 + 0.5 * (Z8[1] - centre) ** 2
@@ -66,12 +66,12 @@ def test_an_added_mass_moves_the_centre():
 
 
 def test_on_weak_springs_it_is_the_same():
-    free = decouple(assemble_plant(some_modes(), ports()))
+    free = gravity_axes(assemble_plant(some_modes(), ports()))
     for model, damping in ((some_modes(), 0.5), (some_modes(0.0), 0.0), (reduced(), 0.5)):
         springs = [GroundSpring(p, 300.0, damping) for p in CORNERS]
         plant = assemble_plant(suspend(model, springs), ports())
         assert plant.n_rigid == 0
-        held = decouple(plant)
+        held = gravity_axes(plant)
         np.testing.assert_allclose(held.T_y, free.T_y, atol=1e-7)
         np.testing.assert_allclose(held.T_u, free.T_u, atol=1e-7)
         np.testing.assert_allclose(held.mass, free.mass, atol=1e-6)
@@ -82,8 +82,8 @@ def test_static_gains_count_and_other_quantities_do_not():
     y = [Sensor(f"y{i}", at=p, asd=NOISE, dynamics=double) for i, p in enumerate(CORNERS, 1)]
     y.append(Sensor("v", at=Z8, quantity="velocity", asd=1e-9))
     u = [Actuator(f"u{i}", at=p, dynamics=double) for i, p in enumerate(INSET, 1)]
-    axes = decouple(assemble_plant(some_modes(), ports(y=y, u=u)))
-    plain = decouple(assemble_plant(some_modes(), ports()))
+    axes = gravity_axes(assemble_plant(some_modes(), ports(y=y, u=u)))
+    plain = gravity_axes(assemble_plant(some_modes(), ports()))
     assert "v" not in axes.to_motions.inputs
     np.testing.assert_allclose(2 * axes.T_y, plain.T_y, atol=1e-12)
     np.testing.assert_allclose(2 * axes.T_u, plain.T_u, atol=1e-12)
@@ -91,39 +91,41 @@ def test_static_gains_count_and_other_quantities_do_not():
 
 def test_some_axes():
     plant = assemble_plant(some_modes(), ports())
-    one = decouple(plant, axes=["rx"])
-    np.testing.assert_allclose(one.T_y, decouple(plant).T_y[1:2], atol=1e-12)
+    one = gravity_axes(plant, axes=["rx"])
+    np.testing.assert_allclose(one.T_y, gravity_axes(plant).T_y[1:2], atol=1e-12)
     np.testing.assert_allclose(one.mass, [[INERTIA]], rtol=1e-8)
     # two sensors on a line along y tell z and rx, not ry; but at x = L/2 they do not see ry
     y = [Sensor("a", at=(L / 2, 0.1, 0.0)), Sensor("b", at=(L / 2, 0.5, 0.0))]
     two = assemble_plant(some_modes(), ports(y=y, references=[]))
-    assert decouple(two, axes=["z", "rx"]).axes == ("z", "rx")
+    assert gravity_axes(two, axes=["z", "rx"]).axes == ("z", "rx")
     with pytest.raises(AssumptionError, match=r"'ry' cannot be decoupled.*sensors"):
-        decouple(two)
+        gravity_axes(two)
     off = [Sensor("a", at=(0.1, 0.1, 0.0)), Sensor("b", at=(0.1, 0.5, 0.0))]
     with pytest.raises(AssumptionError, match=r"'z' with 'ry'|cannot be decoupled"):
-        decouple(assemble_plant(some_modes(), ports(y=off, references=[])), axes=["z", "rx"])
+        gravity_axes(assemble_plant(some_modes(), ports(y=off, references=[])), axes=["z", "rx"])
 
 
 @pytest.mark.slow
 def test_what_held_dofs_prevent_is_no_axis():
     hinged = full().fixed(full().dofs.where(directions="z", box=((0, 0, 0), (L, 0, 0))))
     with pytest.raises(AssumptionError, match=r"part in z, ry, against which DOFs .* are held"):
-        decouple(assemble_plant(hinged, ports()))
-    turning = decouple(assemble_plant(hinged, ports()), axes=["rx"])
+        gravity_axes(assemble_plant(hinged, ports()))
+    turning = gravity_axes(assemble_plant(hinged, ports()), axes=["rx"])
     # about the hinge, of what is free to move
     assert turning.mass[0, 0] == pytest.approx(INERTIA + MASS * L**2 / 4, rel=0.02)
     held = full().fixed(full().dofs.where(directions="z", box=((0, 0, 0), (0.1, 0.1, 0))))
     with pytest.raises(ModelError, match="DOFs are held against z, rx, ry"):
-        decouple(assemble_plant(held, ports()))
+        gravity_axes(assemble_plant(held, ports()))
 
 
 def test_refusals():
     plant = assemble_plant(some_modes(), ports())
     with pytest.raises(LabelError, match="no rigid-body axis 'x'"):
-        decouple(plant, axes=["x"])
+        gravity_axes(plant, axes=["x"])
     with pytest.raises(AssumptionError, match="actuators"):
-        decouple(assemble_plant(some_modes(), ports(u=[Actuator("u", at=Z8)])))
+        gravity_axes(assemble_plant(some_modes(), ports(u=[Actuator("u", at=Z8)])))
     with pytest.raises(ModelError, match="assembled from a structure"):
-        decouple(StandardPlant.from_statespace(lowpass(3.0), u=["in"], y=["out"]))
-    assert repr(decouple(plant)).startswith("<Decoupling z, rx, ry at (0.3, 0.3, 0) m: 4 actua")
+        gravity_axes(StandardPlant.from_statespace(lowpass(3.0), u=["in"], y=["out"]))
+    assert repr(gravity_axes(plant)).startswith(
+        "<GravityAxes z, rx, ry at (0.3, 0.3, 0) m: 4 actua"
+    )

@@ -8,7 +8,7 @@ import flexplant as fx
 import oracles_loop as oracle
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.modes import solve_modes
-from flexplant.plant import GroundSpring, decouple, driven_axes, suspend
+from flexplant.plant import GroundSpring, driven_axes, gravity_axes, suspend
 from flexplant.simulation import (
     design_feedforward,
     exposure_errors,
@@ -45,7 +45,7 @@ def run_of(loop, reference, noise=False):
 
 def compliance(plant, modes):
     """By hand: sum of c b / omega^2 over the flexible modes, from forces at the centre."""
-    T = decouple(plant).T_u
+    T = gravity_axes(plant).T_u
     model = plant.assembled.realisation.model
     b = np.array([model.row(p, "z") for p in INSET]) @ modes.phi
     c = np.array([model.row((0.3, 0.3, 0.0), a) for a in ("z", "rx", "ry")]) @ modes.phi
@@ -60,7 +60,7 @@ def test_the_gains_are_mass_delay_and_compliance(delay):
     modes = some_modes(0.01, 24, attached=False)
     plant = fx.assemble_plant(modes, ports())
     _, soft = compliance(plant, modes)
-    mass = decouple(plant).mass
+    mass = gravity_axes(plant).mass
     snap = -(mass @ soft @ mass)[:, 0]
     free = design_feedforward(plant)
     np.testing.assert_allclose(free.gains[0, 0], [0, 0, mass[0, 0], 0, snap[0]], rtol=1e-6, atol=0)

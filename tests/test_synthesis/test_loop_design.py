@@ -35,7 +35,7 @@ def plant():
 def measured():
     """The continuous stage, its Frf on lines, and its axes."""
     continuous = assemble_plant(reduced(0.001), ports(references=[]))
-    axes = decouple(continuous)
+    axes = decouple(continuous, bandwidth=0.01 * RATE)
     frf = frequency_response(continuous.Gyu, np.arange(2.0, 3000.0, 0.5))
     return frf, {"before": axes.accelerations, "after": axes.to_motions}
 
@@ -44,21 +44,21 @@ def measured():
 def test_a_law_for_each_decoupled_axis():
     """u = -T_u diag(laws) T_y (y), the reference taken from its axis; the loop is stable."""
     P, axes = plant(), decouple(plant())
-    laws = {"cog:z": law(), "cog:rx": law(45.0), "cog:ry": law(50.0)}
-    found = design_loops(P, laws, references={"cog:z": "die:ref"})
+    laws = {"die:z": law(), "die:rx": law(45.0), "die:ry": law(50.0)}
+    found = design_loops(P, laws, references={"die:z": "die:ref"})
     assert found.system.inputs == ("y1", "y2", "y3", "y4", "die:ref")
     assert found.system.outputs == P.u
     freq = np.array([3.0, 40.0, 900.0])
     K = frequency_response(found, freq).data
     each = [one.sampled(RATE).response(freq) for one in laws.values()]
-    wanted = -np.einsum("ua,af,ay->uyf", axes.T_u @ axes.mass, each, axes.T_y)
+    wanted = -np.einsum("ua,af,ay->uyf", axes.T_u, each, axes.T_y)
     np.testing.assert_allclose(K[:, :4], wanted, rtol=1e-7, atol=1e-9 * abs(wanted).max())
-    reference = (axes.T_u @ axes.mass)[:, :1] * each[0]
+    reference = axes.T_u[:, :1] * each[0]
     np.testing.assert_allclose(K[:, 4], reference, rtol=1e-7, atol=1e-9 * abs(reference).max())
     loop = fx.close_loop(P, found)
     assert loop.is_stable and found.report.is_stable
     crossings = [found.report[name].crossovers[0] for name in laws]
-    assert crossings == pytest.approx([40.3, 45.3, 50.4], rel=0.02)
+    assert crossings == pytest.approx([40.3, 45.3, 50.4], rel=0.03)  # the plate bends
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_the_measured_plant_gives_the_same_report():
         assert one.phase_margin == pytest.approx(model[name].phase_margin, abs=0.2)
         assert one.gain_margin == pytest.approx(model[name].gain_margin, rel=0.02)
         assert one.modulus_margin == pytest.approx(model[name].modulus_margin, rel=5e-3)
-    with pytest.warns(FlexplantWarning, match=r"unstable \(6 poles\); closest .* cog:"):
+    with pytest.warns(FlexplantWarning, match=r"unstable \(6 poles\); closest .* die:"):
         fast = design_loops(frf, law(gain=8.0), **axes, **states).report
     with pytest.warns(FlexplantWarning, match="unstable"):
         assert design_loops(plant(), law(gain=8.0)).report.unstable == fast.unstable
@@ -85,7 +85,7 @@ def test_modes_left_out_are_checked():
     """Tuned on 12 modes up to 1.3 kHz: the loop reaches those above."""
     P = sampled(small(12), ports(references=[]))
     gentle = Pid.corners(300.0, zero=3.0, pole=50.0) * LowPass(100.0)
-    fine = design_loops(P.replace(evaluation=many()), gentle, references={"cog:z": "z:ref"})
+    fine = design_loops(P.replace(evaluation=many()), gentle, references={"die:z": "z:ref"})
     assert fine.system.inputs[-1] == "z:ref"  # which takes no part in the loop
     assert fine.left_out is not None and fine.left_out.is_fine
     fast = tune_loops(P, notches=0)
@@ -161,8 +161,8 @@ def test_tuned_on_the_measured_machine_stable_on_the_truth():
 @pytest.mark.slow
 def test_what_does_not_go_together_is_refused():
     frf, axes = measured()
-    with pytest.raises(LabelError, match="axis 'cog:ry' has no law"):
-        design_loops(plant(), {"cog:z": law(), "cog:rx": law()})
+    with pytest.raises(LabelError, match="axis 'die:ry' has no law"):
+        design_loops(plant(), {"die:z": law(), "die:rx": law()})
     with pytest.raises(LabelError, match="no axis 'z'"):
         design_loops(plant(), {"z": law()})
     with pytest.raises(ModelError, match=r"at 2000 Hz, the plant runs at 10000 Hz.*rate="):
@@ -172,7 +172,7 @@ def test_what_does_not_go_together_is_refused():
     with pytest.raises(ModelError, match=r"pass discretized\(plant"):
         design_loops(plant(), law(), rate=RATE)
     with pytest.raises(ModelError, match=r"is no product of elements: 3.0.*is Pid\(gain\)"):
-        design_loops(plant(), dict.fromkeys(["cog:z", "cog:rx", "cog:ry"], 3.0))
+        design_loops(plant(), dict.fromkeys(["die:z", "die:rx", "die:ry"], 3.0))
     mass = StateSpace([[0, 1.0], [0, 0]], [[0], [1.0]], [[1.0, 0]], [[0]], inputs=["f"])
     with pytest.warns(FlexplantWarning, match=r"\(2 poles\) at 0.1592 Hz. Check sign"):
         design_loops(mass, Pid(1.0))
@@ -192,7 +192,7 @@ def test_what_does_not_go_together_is_refused():
         tune_loops(frf, **axes, peak=1.0)
     late = frf.replace(data=frf.data * np.exp(-2j * np.pi * frf.freq * 0.1))
     with pytest.raises(
-        SolverError, match=r"axis 'cog:z': no bandwidth from 8 to .* raise the rate"
+        SolverError, match=r"axis 'die:z': no bandwidth from 8 to .* raise the rate"
     ):
         tune_loops(late, **axes, rate=RATE)
     assert Law().system.n_states == 0

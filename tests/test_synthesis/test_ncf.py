@@ -8,7 +8,7 @@ from test_spill_over import many, small
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.loop import bandwidth, close_loop, modulus_margin
 from flexplant.lti import StateSpace, discretized, frequency_response
-from flexplant.plant import decouple
+from flexplant.plant import gravity_axes
 from flexplant.synthesis import design_ncf, ncf_margin
 from oracles_synthesis import brute_norm
 from stages import ports, reduced, sampled
@@ -99,7 +99,7 @@ def test_what_does_not_go_together_is_refused():
 def test_the_stage_in_decoupled_axes():
     """Three rigid motions, four sensors and actuators, a sample of delay: one gain an axis."""
     P = sampled(reduced(), ports(references=[]))
-    axes = decouple(P)
+    axes = gravity_axes(P)
     found = design_ncf(P, before=axes.accelerations, after=axes.to_motions, bandwidth=60.0)
     assert (found.system.inputs, found.system.outputs) == (P.y, P.u)
     assert found.gamma < 5.0

@@ -155,7 +155,7 @@ def test_the_stage_with_the_modes_left_out():
 def test_the_stage_follows_its_reference():
     """Two degrees of freedom on the sampled, late stage: a step ends on the reference."""
     P = sampled(reduced(), ports())
-    found = shape_loop(P, bandwidth=50.0, model=50.0, references={"cog:z": "die:ref"})
+    found = shape_loop(P, bandwidth=50.0, model=50.0, references={"die:z": "die:ref"})
     assert found.system.inputs == ("y1", "y2", "y3", "y4", "die:ref")
     loop = fx.close_loop(P, found)
     assert loop.is_stable and loop.modulus_margin > 0.5

@@ -266,7 +266,7 @@ def test_the_stage_with_decoupled_laws_at_two_poi_positions():
     assert found.gamma == pytest.approx(max(norms), rel=2e-3)
     assert found.certificate["norm of plant 2"] == pytest.approx(norms[1], rel=2e-3)
     assert found.left_out is not None and found.left_out.is_stable
-    assert set(found.structure.laws) == {"cog:z", "cog:rx", "cog:ry"}
+    assert set(found.structure.laws) == {"die:z", "die:rx", "die:ry"}
 
 
 def test_what_cannot_be_stabilised_says_which_pole():

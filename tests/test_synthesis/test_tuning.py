@@ -205,7 +205,9 @@ def test_slopes_of_the_joint_distances():
     C, D = (rng.standard_normal((n, k)) + 1j * rng.standard_normal((n, k)) for _ in range(2))
     assert one.of.places == ("at u", "at y", "of a", "of b")
     L = np.moveaxis(G, -1, 0) @ before @ (C[:, :, None] * after)
-    least = np.linalg.svd(np.eye(3) + L, compute_uv=False)[:, -1]
+    shown = np.linalg.norm(np.linalg.pinv(after), axis=1)  # each output in its own unit
+    own = L / shown[:, None] * shown
+    least = np.linalg.svd(np.eye(3) + own, compute_uv=False)[:, -1]
     assert one.distances(C)[1] == pytest.approx(least)
     change = (one.distances(C + 1e-6 * D) - one.distances(C - 1e-6 * D)) / 2e-6
     for place, slope in enumerate(change):

@@ -319,7 +319,7 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     plant = plant.discretized(2e3, delay=1)
     bench = fx.workbench(plant, open_browser=False)
     page = Page(bench)
-    assert bench.design.references == {"cog:x": "die:ref"}
+    assert bench.design.references == {"die:x": "die:ref"}
     K = page.design.controller()
     loop = fx.close_loop(plant, K)
     answer = page.answer
@@ -334,7 +334,7 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
         np.abs(closed_poles(plant.Gyu.select(feedback.inputs), feedback)).max() < 1.0
     )
     high = page.loop.margins.modulus_margin
-    page.gain.text.value = f"{40 * page.design.axes['cog:x'].gain:g}"
+    page.gain.text.value = f"{40 * page.design.axes['die:x'].gain:g}"
     assert "UNSTABLE" in verdict(page)
     assert "unstable" in page.further.object
     assert page.loop.margins.modulus_margin != high

@@ -150,6 +150,8 @@ class Places:
     points: tuple[FloatArray, ...]
     pois: tuple[FloatArray, ...]
     mounted: tuple[FloatArray, ...] = ()
+    #: the candidates that the plant has: what is measured there can be measured
+    fitted: tuple[str, ...] = ()
 
     @property
     def total(self) -> int:
@@ -200,6 +202,11 @@ def _least_distances(some: Sequence[FloatArray], others: Sequence[FloatArray]) -
     return np.array(found, dtype=np.float64).reshape(len(some), len(others))
 
 
+#: [m] what lies between nodes of a structure whose coordinates are not known: beyond any distance
+#: that a constraint may ask for
+_APART = 1e6
+
+
 def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
     """Return where candidates and POIs are; a port with several points is at each of them."""
     # of a plant made elsewhere no places are known
@@ -208,7 +215,12 @@ def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
         return Places(names, (), ())
     dofs, pois = plant.assembled.realisation.model.full_dofs, plant.assembled.ports.z
 
+    own = (*plant.y, *plant.u)
+    located = bool(np.any(np.ptp(dofs.xyz, axis=0)))
+
     def points(at: Any) -> FloatArray:
+        if isinstance(at, str) and not located:  # nodes without coordinates are far apart
+            return np.array([[_APART * dofs.nodes[dofs.index(at)], 0.0, 0.0]])
         if isinstance(at, str):
             return np.array(dofs.location(at)[None], dtype=np.float64)
         if isinstance(at, list):
@@ -223,6 +235,7 @@ def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
         ),
         tuple(points(_mounted(poi.at)) for poi in pois),
         tuple(points(_mounted(port.at)) for port in candidates),
+        tuple(name for name in names if name in own),
     )
 
 

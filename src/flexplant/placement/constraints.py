@@ -392,8 +392,8 @@ class Excluded(Constraint):
 class OffPoi(Constraint):
     """No candidate on a POI: what is there cannot be measured.
 
-    Sensors are never placed on the point of a POI. A radius keeps them off the whole die; a
-    negative one allows all places. A POI that is relative to another body,
+    Sensors are never placed on the point of a POI, but for those that the plant has. A radius keeps
+    all off the whole die; a negative one allows all places. A POI that is relative to another body,
     ``at={"tip:x": 1, "frame:x": -1}``, is where its positive weights are: sensors may measure
     against the frame.
 
@@ -418,7 +418,10 @@ class OffPoi(Constraint):
         """Return x_i <= 0 near a POI."""
         if self.radius < 0 or not places.pois:
             return LinearRows.closed(np.zeros(places.total, dtype=bool))
-        return LinearRows.closed(places.from_pois() <= self.radius + places.same)
+        near = places.from_pois() <= self.radius + places.same
+        if not self.radius:
+            near &= ~np.isin(places.names, places.fitted)
+        return LinearRows.closed(near)
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
         """Return discs about the POIs."""

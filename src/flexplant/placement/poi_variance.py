@@ -63,7 +63,7 @@ def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
 def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) -> dict[str, float]:
     """Return {z channel: factor}, the factor of the POI times that of the axis."""
     known = channels_by_poi(plant)
-    poi = only_one("POI", known, None, "by name, or all in a list") if poi is None else poi
+    poi = _alike(plant, known) if poi is None else poi
     found: dict[str, float] = {}
     for name, weight in _axis_factors(poi).items():
         require_known("POI", [name], known)
@@ -73,6 +73,17 @@ def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) ->
             require_known(f"axis of POI {name!r}", [axis], own)
             found[own[axis]] = weight * factor
     return found
+
+
+def _alike(plant: StandardPlant, known: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Return the POIs whose first axis has the unit of the first one's."""
+    if not known:
+        only_one("POI", known, None, "by name, or all in a list")
+    units = {
+        name: plant.system.units.get(next(iter(axes.values()))) for name, axes in known.items()
+    }
+    first = next(iter(units.values()))
+    return [name for name, unit in units.items() if unit == first]
 
 
 def _axis_factors(named: Any) -> dict[str, float]:
@@ -165,7 +176,7 @@ class PoiVariance(Criterion):
     Parameters
     ----------
     poi : str, sequence of str or mapping {name: factor}, optional
-        The POIs; not needed when the plant has one only.
+        The POIs; when not given all whose first axis has the unit of the first one's.
     axes : str, sequence of str or mapping {axis: factor}, optional
         Axes of each of them; its first when not given. A rotation is turned into a
         displacement by a factor [m], such as half the width of the die.

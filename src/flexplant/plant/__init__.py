@@ -8,7 +8,8 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 - `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` has a set of them.
 - `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is not known, opened
   as Deltas and drawn as machines; a kind of one's own derives from `Uncertainty`.
-- `decouple`: axes of the rigid body; `frequency_response` of structures between their ports.
+- `decouple`: the axes that the actuators move (`gravity_axes`: of a free body, with its mass);
+  `frequency_response` of structures between their ports.
 
 >>> import flexplant as fx
 >>> chain = fx.chain(masses=[1.0, 0.3], stiffnesses=[2e4])
@@ -74,6 +75,8 @@ from .assumptions import AssumptionReport as AssumptionReport
 from .assumptions import ModeVisibility as ModeVisibility
 from .axes import DrivenAxes as DrivenAxes
 from .axes import driven_axes as driven_axes
+from .decoupling import Decoupling as Decoupling
+from .decoupling import decouple as decouple
 from .evaluation_model import EvaluationModel as EvaluationModel
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
@@ -98,8 +101,8 @@ from .ports import Sensor as Sensor
 from .reach_and_sight import Assumption as Assumption
 from .realisation import FastStates as FastStates
 from .realisation import Feedthrough as Feedthrough
-from .rigid_motion import Decoupling as Decoupling
-from .rigid_motion import decouple as decouple
+from .rigid_motion import GravityAxes as GravityAxes
+from .rigid_motion import gravity_axes as gravity_axes
 from .scheduling import Moves as Moves
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position

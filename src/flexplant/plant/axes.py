@@ -23,8 +23,8 @@ _APART = 1e-2
 _ROUNDING = 1e-6
 #: sweeps that scale rows and columns of a gain to one length
 _SWEEPS = 20
-#: a usual bandwidth as a part of the rate, and of the fastest mode of a continuous plant
-_OF_RATE, _OF_MODE = 0.01, 0.1
+#: a usual bandwidth as a part of the rate, and of the slowest oscillation of a continuous plant
+_OF_RATE, _OF_MODE = 0.01, 0.2
 #: what counts as rest, relative to a usual bandwidth: squared it is below what tests of rest see
 _RESTING = 1e-4
 
@@ -82,7 +82,7 @@ def driven_axes(
         Continuous or sampled, of any origin.
     freq : float or mapping {channel: float} [Hz], optional
         Where each axis is decoupled, its bandwidth; a hundredth of the rate when not given, of a
-        continuous plant a tenth of the frequency of its fastest mode.
+        continuous plant a fifth of the frequency of its slowest oscillation.
     axes : sequence of str, optional
         Channels of z or y. When not given all axes of the POIs where the actuators move them
         independently, else those of the POIs that have a reference, else those with a reference.
@@ -179,11 +179,13 @@ def _sigmas(plant: Partition, channels: Sequence[str], freq: Any, named: Any) ->
 
 
 def usual_frequency(plant: Partition) -> float:
-    """Return a usual bandwidth [Hz] of a plant: a hundredth of its rate, a tenth of its modes."""
+    """Return a usual bandwidth [Hz]: a part of the rate, or of the slowest oscillation."""
     if plant.dt:
         return _OF_RATE / plant.dt
-    fastest = np.abs(plant.system.poles()).max(initial=0.0) / (2.0 * np.pi)
-    return _OF_MODE * float(fastest) or 1.0
+    oscillations = elastic(plant)
+    poles = np.abs(plant.system.poles()) / (2.0 * np.pi)
+    slowest = oscillations if oscillations.size else poles[poles > 0.0]
+    return _OF_MODE * float(slowest.min(initial=np.inf if slowest.size else 1.0))
 
 
 def resting_frequency(plant: Partition) -> float:

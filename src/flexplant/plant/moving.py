@@ -14,12 +14,12 @@ import numpy.typing as npt
 from ..checks import FloatArray, Value, function, instance, number, real_array
 from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_label
 from .assumptions import WEAK, mode_visibility
+from .axes import real_gain
 from .building import P, changed_densities, rebuilt, wired
+from .decoupling import Decoupling, decouple
 from .forces import Actuator, Disturbance
 from .partition import Partition
 from .ports import Poi, Ports, Sensor
-from .rigid_body import rigid_body_of
-from .rigid_motion import Decoupling, decouple, rigid_parts
 from .scheduling import values_over
 
 
@@ -208,8 +208,8 @@ class PositionMap(Value):
     decoupling : (..., 2) array
         Largest gain by which the transformations of the plant as it stands (`decouple`) miss the
         identity at each place of the grid: those of the sensors, then of the actuators; 0 where
-        they hold. Rotations count by the radius of gyration. NaN where the structure has no rigid
-        body that its channels decouple.
+        they hold. An axis counts by how far the sensors move with it. NaN where the actuators move
+        no axes apart.
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str
@@ -362,14 +362,15 @@ def _misses(own: Decoupling | None, plant: Any) -> tuple[float, float]:
     """Return by what transformations miss the identity at another place: of sensors, actuators."""
     if own is None:
         return np.nan, np.nan
-    realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    body = rigid_body_of(realisation)
-    inertia = np.sqrt(np.diag(body.mass))  # a rotation counts by its radius of gyration
-    rows = [body.axes.index(axis) for axis in own.axes]
-    scale = inertia[rows][:, None] / inertia
-    sensors = [sensor for sensor in ports.y if sensor.order == 0]
-    see = rigid_parts([sensor.static_row(realisation) for sensor in sensors], body.motions)
-    push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
-    one = np.eye(len(body.axes))[rows]
-    seen, pushed = scale * (own.T_y @ see - one), scale * (own.T_u.T @ push.T - one)
+    plant, r = plant.machine, len(own.axes)
+    sigma = 2.0 * np.pi * float(own.driven.freq[0])
+    late = sigma**2 * np.exp(sigma * plant.dt * (plant.delay + 0.5))
+    moved = late * real_gain(plant.system, sigma, own.axes, plant.u)
+    shown = late * real_gain(plant.system, sigma, own.to_motions.inputs, plant.u)
+    there = np.linalg.pinv(moved)
+    # an axis counts by the length that makes it a displacement at the sensors
+    arm = np.linalg.norm(np.linalg.pinv(own.T_y), axis=0)
+    scale = arm[:, None] / arm
+    seen = scale * (own.T_y @ shown @ there - np.eye(r))
+    pushed = scale * (moved @ own.T_u - np.eye(r))
     return float(np.linalg.norm(seen, 2)), float(np.linalg.norm(pushed, 2))

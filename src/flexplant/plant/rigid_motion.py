@@ -159,7 +159,7 @@ _UNITS = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Decoupling(Value):
+class GravityAxes(Value):
     """Static transformations between the channels of a plant and its rigid body.
 
     With G the rigid-body part of the plant u -> y, ``to_motions G to_actuators = mass^-1 / s^2``
@@ -192,7 +192,7 @@ class Decoupling(Value):
     def __repr__(self) -> str:
         at = ", ".join(f"{c:.4g}" for c in self.centre)
         return (
-            f"<Decoupling {', '.join(self.axes)} at ({at}) m: {len(self.to_actuators.outputs)} "
+            f"<GravityAxes {', '.join(self.axes)} at ({at}) m: {len(self.to_actuators.outputs)} "
             f"actuators, {counted(len(self.to_motions.inputs), 'sensor')}>"
         )
 
@@ -207,11 +207,12 @@ class Decoupling(Value):
         return self.to_motions.D
 
 
-def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupling:
+def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> GravityAxes:
     """Return the static transformations to and from the centre of gravity.
 
-    From the geometry: no mode shape is involved but the rigid-body ones, so that a structure on
-    weak springs is decoupled as if it were free.
+    From the geometry of a free or suspended body: no mode shape is involved but the rigid-body
+    ones, so that a structure on weak springs is decoupled as if it were free. What the actuators
+    move of any machine are the axes of `flexplant.decouple`.
 
     Parameters
     ----------
@@ -222,7 +223,7 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
 
     Returns
     -------
-    Decoupling
+    GravityAxes
         Filters of the ports count with their static gains. Only displacement sensors are used.
 
     Raises
@@ -241,7 +242,7 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.decouple(fx.testbeds.three_masses()).mass.round(6)  # all three masses
+    >>> fx.plant.gravity_axes(fx.testbeds.three_masses()).mass.round(6)  # all three masses
     array([[3.]])
     """
     plant = Partition.of(plant)
@@ -266,7 +267,7 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     mass = pick @ body.mass @ pick.T
     forces = [f"cog:{axis}:force" for axis in wanted]
     pushes = [f"cog:{axis}:acceleration" for axis in wanted]
-    return Decoupling(
+    return GravityAxes(
         _gain_system(T_u, forces, plant.u, plant),
         _gain_system(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
         _gain_system(T_u @ mass, pushes, plant.u, plant),
@@ -303,7 +304,7 @@ def _check_identity(
         raise AssumptionError(
             f"the axis {wanted[i]!r} cannot be decoupled: the {side} "
             f"({', '.join(names) or 'none'}) {what}. Add or move some, or choose fewer "
-            f"axes: decouple(plant, axes=...) of {', '.join(body.axes)}."
+            f"axes: gravity_axes(plant, axes=...) of {', '.join(body.axes)}."
         )
 
 

@@ -176,7 +176,7 @@ def stage_weights(
     >>> plant = fx.testbeds.three_masses()
     >>> weights = fx.stage_weights(plant, 20.0)
     >>> sorted(weights.z), sorted(weights.w)
-    (['die:error', 'die:x', 'u1:effort'], ['amp', 'y1:noise', 'y2:noise'])
+    (['die:error', 'die:x', 'u1:effort'], ['amp', 'die:ref', 'y1:noise', 'y2:noise'])
     """
     machine: StandardPlant = plant_of(plant).machine
     plant, ports = machine, machine.assembled.ports

@@ -25,7 +25,7 @@ from ..modes import Modes
 from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
-from ..plant import AnyPlant, StandardPlant, decouple
+from ..plant import AnyPlant, StandardPlant, driven_axes
 from ..plant.evaluation_model import NOT_JUDGED
 from ..reduction import ReducedModel
 from ..rooms import versions
@@ -161,17 +161,16 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
 
 
 def _axis_responses(plant: StandardPlant) -> None:
-    """Draw the plant from a force at the centre of gravity to the POI, along each axis."""
-    # where its rigid-body motions cannot be decoupled, the singular values from u to y
-    pois = plant.assembled.ports.z
+    """Draw the plant from a total force along each axis that the actuators move to the axis."""
+    # where they move none apart, the singular values from u to y
     try:
-        axes = decouple(plant, axes=pois[0].axes)
-    except (FlexplantError, IndexError):
+        driven = driven_axes(plant)
+    except FlexplantError:
         singular_values(plant.Gyu)
         return
-    channels = [pois[0].channel(axis) for axis in axes.axes]
+    channels = list(driven.channels)
     P = frequency_response(plant.system.select(channels, plant.u))
-    data = np.einsum("kuf,uk->kf", P.data, axes.T_u)
+    data = np.einsum("kuf,uk->kf", P.data, driven.T / np.abs(driven.T).sum(axis=0))
     panels = panel_axes(None, len(channels))
     for panel, name, row in zip(panels, channels, data, strict=True):
         panel.semilogx(P.freq, decibel(row), **STYLES["model"])

@@ -63,7 +63,8 @@ def design_stage(
 ) -> Controller:
     """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
 
-    `stage_weights` of rising bandwidths on ``plant.through(reference_errors(plant))``, each solved
+    `stage_weights` of rising bandwidths on ``plant.through(reference_errors(plant))`` (on the plant
+    itself where nothing is followed), each solved
     by ``design_hinf(uncertain=)``; the largest bandwidth is kept at which the modulus margin at u
     is at least `margin`, also with the modes left out where they are known, and 7/8 of it with the
     frequency of any one mode of the plant off as far as it is uncertain, of a mode that was not
@@ -74,7 +75,8 @@ def design_stage(
     Parameters
     ----------
     plant : StandardPlant or UncertainPlant
-        Of a stage with a reference, continuous or sampled. A plant of which nothing is said is
+        Of a machine that follows references, or of one that is held at rest where there is no
+        reference; continuous or sampled. A plant of which nothing is said is
         taken with all its frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})``
         and ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
     bandwidth : float [Hz], optional
@@ -153,8 +155,10 @@ class _StageTask:
         self.plant: AnyPlant = uncertain.plant
         #: with the modes left out: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
-        self.errors = reference_errors(self.plant, poi=poi)
-        self.through = self.plant.through(self.errors)
+        #: what the controller reads: the sensors themselves where nothing is followed
+        followed = self.plant.assembled.ports.references
+        self.errors = reference_errors(self.plant, poi=poi) if followed else None
+        self.through = self.plant if self.errors is None else self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
         self.failures: dict[float, FlexplantError] = {}
         self.best: _StageTry | None = None
@@ -240,7 +244,8 @@ class _StageTask:
         return margin, least
 
     def _block(self, system: StateSpace) -> StateSpace:
-        return series(self.errors, system).replace(name="stage")
+        block = system if self.errors is None else series(self.errors, system)
+        return block.replace(name="stage")
 
     def _tolerates(self, loop: ClosedLoop, ranges: Mapping[int, float]) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""

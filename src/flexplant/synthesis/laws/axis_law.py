@@ -19,6 +19,8 @@ from ...tolerances import TINY
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section, product, tustin_s
 
+#: power of 1 / s of a mass's response
+_MASS = 2
 #: corner of the integrator beside the bandwidth
 _INTEGRATOR = 0.1
 #: ranges of the lead's zero below the bandwidth (not below the integrator), of its pole and of the
@@ -48,8 +50,9 @@ _POOR = 0.2
 class AxisLaw:
     """``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)``, w_b as high as |S| allows.
 
-    F is a low-pass at c w_b and notches, k makes the loop of the rigid body cross 1 at w_b, w_i is
-    a tenth of it. The logarithms of w_b, a, b, c and, of each notch, frequency, depth and width
+    On the line of a spring ``k F(s) / s``, of a velocity ``k F(s)``: a and b are 1 then. F is a
+    low-pass at c w_b and notches, k makes the loop of the line cross 1 at w_b, w_i is a tenth of
+    it. The logarithms of w_b, a, b, c and, of each notch, frequency, depth and width
     are its numbers. A notch lies above the bandwidth or at a mode: others would lower the loop gain
     below the bandwidth until nothing is left of it but its crossover.
     """
@@ -61,7 +64,8 @@ class AxisLaw:
     @property
     def lowest(self) -> float:
         """The lowest bandwidth [Hz]: well above the first line and the springs."""
-        return max(4.0 * float(self.axis.freq[0]), 3.0 * self.axis.suspension)
+        above = 3.0 * self.axis.suspension if self.axis.power == _MASS else 0.0
+        return max(4.0 * float(self.axis.freq[0]), above)
 
     @property
     def highest(self) -> float:
@@ -72,7 +76,8 @@ class AxisLaw:
         """Return the law of the logarithms of its numbers."""
         (w, a, b, c), notches = np.exp(numbers[:4]), np.exp(numbers[4:]).reshape(-1, 3)
         pid = Pid.corners(1.0, integrator=_INTEGRATOR * w, zero=w / a, pole=w * b)
-        factors = (pid, LowPass(w * c), *(Notch(*one) for one in notches.tolist()))
+        action = {2: (pid,), 1: (), 0: (Pid(0.0, i=1.0),)}[self.axis.power]
+        factors = (*action, LowPass(w * c), *(Notch(*one) for one in notches.tolist()))
         return Law(factors, self._scale(numbers), self.axis.rate)
 
     def room(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
@@ -100,13 +105,17 @@ class AxisLaw:
         """Return the gain with which the loop of the rigid body crosses 1 at the bandwidth."""
         w = float(np.exp(numbers[0]))
         there = product(self.sections(numbers), tustin_s(np.array([w]), self.axis.rate))
-        return float(self.axis.inertia * (2.0 * np.pi * w) ** 2 / abs(there[0]))
+        return float(self.axis.inertia * (2.0 * np.pi * w) ** self.axis.power / abs(there[0]))
 
     def sections(self, numbers: FloatArray) -> list[Section]:
         """Return the factors of the law: PID with lead, low-pass, notches."""
         (w, a, b, c), notches = np.exp(numbers[:4]).tolist(), np.exp(numbers[4:]).reshape(-1, 3)
         slow, ab = _INTEGRATOR / b, a * b
-        lead = Section((ab, 1.0 + ab * slow, slow), (1.0, 1.0, 0.0), 2.0 * np.pi * b * w)
+        lead = {
+            2: Section((ab, 1.0 + ab * slow, slow), (1.0, 1.0, 0.0), 2.0 * np.pi * b * w),
+            1: Section((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 1.0),
+            0: Section((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 1.0),
+        }[self.axis.power]
         others = [((0.0, 0.0, 1.0), np.sqrt(2.0), c * w)]
         others += [((1.0, 2 * d * z, 1.0), 2.0 * z, f) for f, d, z in notches.tolist()]
         centred = [
@@ -138,7 +147,8 @@ class AxisLaw:
         stays beside the mode that it is at.
         """
         top = self.axis.ceiling
-        ranges = [(self.lowest, self.highest), _ZERO, _POLE, _ROLLOFF]
+        leads = [_ZERO, _POLE] if self.axis.power == _MASS else [(1.0, 1.0), (1.0, 1.0)]
+        ranges = [(self.lowest, self.highest), *leads, _ROLLOFF]
         rows = np.zeros((2, numbers.size))
         rows[:, 0] = rows[0, 2] = rows[1, 3] = 1.0
         most = [np.log(top), np.log(top)]
@@ -299,6 +309,9 @@ class MeasuredAxis:
     rate: float
     free: bool
     variance: FloatArray | None = None
+    #: of 1 / s on the line where its bandwidth is sought: 2 of a mass, 1 of its velocity, 0 of a
+    #: spring
+    power: int = _MASS
 
     @property
     def ceiling(self) -> float:
@@ -342,22 +355,22 @@ class MeasuredAxis:
 
     @cached_property
     def inertia(self) -> float:
-        """The inertia, with its sign, of the rigid body: ``G = 1 / (inertia s^2)``."""
+        """The inertia (or stiffness), with its sign: ``G = 1 / (inertia s^power)``."""
         # the median over the lowest decade of lines, above the springs and well below the first
         # mode
         known = self.deviation <= _KNOWN * np.abs(self.G)
         first = float(self.resonances.min(initial=np.inf))
-        above = self.freq >= 2.0 * self.suspension
+        above = self.freq >= (2.0 * self.suspension if self.power else 0.0)
         low = float(self.freq[known & above].min(initial=self.freq[-1]))
         near = known & above & (self.freq <= max(min(10.0 * low, 0.3 * first), 1.2 * low))
-        turned = -self.G[near] * (2.0 * np.pi * self.freq[near]) ** 2
+        turned = self.G[near] * (2j * np.pi * self.freq[near]) ** self.power
         sign = 1.0 if np.median(turned.real) >= 0.0 else -1.0
         return sign / float(np.median(np.abs(turned)))
 
     @cached_property
     def _peaks(self) -> FloatArray:
         """The frequencies [Hz] of peaks above what lies around them, the highest loop first."""
-        size = np.abs(self.G) * self.freq**2
+        size = np.abs(self.G) * self.freq**self.power
         inner = (size[1:-1] >= size[:-2]) & (size[1:-1] > size[2:])
         known = (self.deviation <= _KNOWN * np.abs(self.G)) & (self.freq < self.ceiling)
         peaks = 1 + np.flatnonzero(inner & known[1:-1])
@@ -375,7 +388,8 @@ class MeasuredAxis:
     @property
     def resonances(self) -> FloatArray:
         """The frequencies [Hz] of the elastic modes, the highest peak first."""
-        return self._peaks[self._peaks > self.suspension]
+        above = self.suspension if self.power == _MASS else 0.0
+        return self._peaks[self._peaks > above]
 
     def is_stable(self, law: Law) -> bool:
         """Return whether the loop of a law is stable, by the Nyquist count."""
@@ -383,7 +397,7 @@ class MeasuredAxis:
 
 
 def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid: int) -> bool:
-    """Return whether laws, which integrate once each, stabilise axes (k, k, n_freq) on lines."""
+    """Return whether laws stabilise axes (k, k, n_freq) on lines, by the Nyquist count."""
 
     def respond(freq: FloatArray) -> ComplexArray:
         each = np.array([-law.response(freq) for law in laws])
@@ -391,7 +405,8 @@ def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid:
 
     if freq.size < FEWEST:
         return False
-    hidden, at_zero = hidden_modes(freq, P, respond(freq)), 2 * rigid + len(laws)
+    integrators = sum(any(isinstance(f, Pid) and f.i for f in law.factors) for law in laws)
+    hidden, at_zero = hidden_modes(freq, P, respond(freq)), 2 * rigid + integrators
     count = nyquist_count(freq, P, respond, hidden, rigid=rigid, at_zero=at_zero, unstable=0)
     return count.unstable == 0
 
@@ -505,15 +520,18 @@ def _best_starts(
     """Return for each set of notches the numbers of the best start at one bandwidth [Hz]."""
     # with a score: the logarithm of the bandwidth, less where the peak is not held yet
     top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
-    shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in _LEADS for c in _TAILS})
+    leads = _LEADS if of.axis.power == _MASS else ((1.0, 1.0),)
+    shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in leads for c in _TAILS})
     numbers = [np.log([w, *shape]) for shape in shapes]
     bodies = np.array([product(of.sections(one), s) for one in numbers])
     stops = np.array([product(of.sections(np.append(numbers[0], one))[2:], s) for one in sets])
     gain = stops[:, None] * bodies
-    gain = gain[..., :-1] * of.axis.inertia * (2.0 * np.pi * w) ** 2 / np.abs(gain[..., -1:])
+    level = of.axis.inertia * (2.0 * np.pi * w) ** of.axis.power
+    gain = gain[..., :-1] * level / np.abs(gain[..., -1:])
     room = np.min(of.room_of(gain, rows), axis=-1)
     room[room < -_LACK] = -np.inf
-    room[~_turns_stably(gain * of.axis.points[1][rows], 3 if of.axis.free else 1)] = -np.inf
+    at_zero = 2 * of.axis.free + (of.axis.power != 1)
+    room[~_turns_stably(gain * of.axis.points[1][rows], at_zero)] = -np.inf
     best, each = np.argmax(room, axis=1), np.arange(len(sets))
     scores = np.log(w) + _LATER * np.minimum(room[each, best], 0.0)
     return [

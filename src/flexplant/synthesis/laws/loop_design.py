@@ -93,8 +93,8 @@ def axes_of(
         plant = Frf.from_control(plant)
     if given is not None:
         if before is None and after is None and given.is_assembled:
-            axes = decouple(given)
-            before, after = axes.accelerations, axes.to_motions
+            axes = decouple(given.machine)
+            before, after = axes.to_actuators, axes.to_motions
             errors = [f"{name}:error" for name in after.inputs]
             if set(errors) <= set(given.y):  # seen as reference minus measurement
                 after = (-after).replace(inputs=errors)
@@ -151,8 +151,8 @@ def design_loops(
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or Frf
-        Of an assembled StandardPlant the rigid-body axes are taken (`decouple`), unless `before`
-        and `after` are given.
+        Of an assembled StandardPlant the axes are those that the actuators move (`decouple`),
+        unless `before` and `after` are given.
     laws : Law or mapping {axis: Law}
         Error to command; one for all axes, or one each. Sampled at the rate of the plant.
     before, after : StateSpace or array, optional
@@ -164,7 +164,7 @@ def design_loops(
         Of an Frf: its rigid-body modes and its poles outside the stability region, as for
         `report_loops`.
     references : mapping {axis: channel of y}, optional
-        References that an axis follows, such as ``{"cog:z": "die:ref"}``.
+        References that an axis follows, such as ``{"die:z": "die:ref"}``.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def design_loops(
     ModelError, ShapeError
         When plant, transformations, laws and rate do not go together.
     AssumptionError
-        When the rigid-body axes cannot be decoupled.
+        When the axes cannot be decoupled.
 
     Warns
     -----

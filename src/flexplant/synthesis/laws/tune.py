@@ -21,6 +21,7 @@ from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
+from ...plant.axes import real_gain
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
@@ -105,12 +106,23 @@ def tune_loops(
     most = whole(notches, "notches", minimum=0)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
+    powers = _powers(axes, rigid)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         for i, name in enumerate(axes.names):
             variance = None if frf.variance is None else frf.variance[i, i]
-            one = MeasuredAxis(name, frf.freq, frf.data[i, i], axes.rate, rigid > 0, variance)
-            of.append(AxisLaw(one, float(peak), most))
-            alone.append(of[i].best())
+            laws = [
+                AxisLaw(
+                    MeasuredAxis(
+                        name, frf.freq, frf.data[i, i], axes.rate, rigid > 0, variance, power
+                    ),
+                    float(peak),
+                    most,
+                )
+                for power in powers[i]
+            ]
+            law, numbers = _fastest(laws)
+            of.append(law)
+            alone.append(numbers)
             bar.advance()
     found = JointSearch(of, plants, float(peak), alone).best()
     design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None)
@@ -147,6 +159,41 @@ def _joint_plants(
     return found
 
 
+#: how far next to rest the slope of a response is taken, relative to the rate [Hz], and its step
+_RESTING, _STEP_AT_REST = 1e-6, 2.0
+
+
+def _powers(axes: Axes, rigid: int) -> list[tuple[int, ...]]:
+    """Return the powers of 1 / s of the lines on which each axis may have its bandwidth."""
+    # a mass, always but of velocities; below its springs' frequency it is a spring
+    if isinstance(axes.plant, Frf):
+        return [(2,) if rigid else (2, 0)] * len(axes.names)
+    found: list[tuple[int, ...]] = []
+    low = 2.0 * np.pi * _RESTING * (axes.rate or float(np.abs(axes.plant.poles()).max(initial=1.0)))
+    g = axes.plant
+    for i in range(len(axes.names)):
+        near, far = (
+            abs(real_gain(g, s, [g.outputs[i]], [g.inputs[i]])[0, 0])
+            for s in (low, _STEP_AT_REST * low)
+        )
+        slope = -np.log(far / near) / np.log(_STEP_AT_REST) if near and far else 2.0
+        found.append((2,) if slope > 1.5 else (1,) if abs(slope) > 0.5 else (2, 0))
+    return found
+
+
+def _fastest(laws: Sequence[AxisLaw]) -> tuple[AxisLaw, FloatArray]:
+    """Return the law of the highest bandwidth among those of several lines."""
+    found, failures = [], []
+    for law in laws:
+        try:
+            found.append((law, law.best()))
+        except SolverError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    return max(found, key=lambda one: float(one[1][0]))
+
+
 def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
     """Return the response in the axes: that measured, or of a model through its resonances."""
     if isinstance(axes.plant, Frf):
@@ -159,6 +206,8 @@ def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
     return Frf(freq, data, axes.before.inputs, axes.names, variance=np.zeros(data.shape))
 
 
+#: least size of a channel, relative to the largest
+_IDLE = 1e-3
 #: logarithmic part of a grid through the resonances, and times that it is refined
 _POINTS, _REFINEMENTS = 250, 6
 
@@ -210,7 +259,28 @@ class JointPlant:
         """Return what couples the axes at some frequencies [Hz]."""
         G = self.respond(freq)
         seen, felt = G @ self.before, self.after @ G
-        return Coupling(freq, seen, felt, self.after @ seen, self)
+        su, sy = self.sizes
+        return Coupling(freq, seen / sy[:, None], felt * su, self.after @ seen, self)
+
+    @cached_property
+    def sizes(self) -> tuple[FloatArray, FloatArray]:
+        """The size of each input and output, by its part in the axes: |S| counts in these units."""
+        forces = np.linalg.norm(self.before, axis=1)
+        shown = np.linalg.norm(np.linalg.pinv(self.after), axis=1)
+        return (
+            np.maximum(forces, _IDLE * forces.max(initial=0.0)),
+            np.maximum(shown, _IDLE * shown.max(initial=0.0)),
+        )
+
+    @property
+    def own_before(self) -> FloatArray:
+        """Commands of axes to inputs in units of their sizes."""
+        return np.asarray(self.before / self.sizes[0][:, None])
+
+    @property
+    def own_after(self) -> FloatArray:
+        """Outputs in units of their sizes to motions of axes."""
+        return np.asarray(self.after * self.sizes[1])
 
     def is_stable(self, laws: Sequence[Law]) -> bool:
         """Return whether the loop is stable, by its poles or the Nyquist count of an Frf."""
@@ -292,8 +362,8 @@ class Coupling(NamedTuple):
         # S = left sigma right: I + M has the singular vectors the other way round
         v, w = right[:, 0, :], left[:, :, 0]
         if of.places[place] == "at u":
-            return np.asarray((v @ of.before) * np.einsum("fku,fu->fk", self.felt, w))
-        return np.asarray(np.einsum("fy,fyk->fk", v, self.seen) * (w @ of.after.T))
+            return np.asarray((v @ of.own_before) * np.einsum("fku,fu->fk", self.felt, w))
+        return np.asarray(np.einsum("fy,fyk->fk", v, self.seen) * (w @ of.own_after.T))
 
     def rows(self, rows: IntArray) -> Coupling:
         """Return what couples the axes at some of the frequencies."""
@@ -308,9 +378,9 @@ class Coupling(NamedTuple):
         CS, of = C[:, :, None] * S, self.of
         found = []
         if "at u" in of.places:
-            found.append(np.eye(of.before.shape[0]) - of.before @ CS @ self.felt)
+            found.append(np.eye(of.own_before.shape[0]) - of.own_before @ CS @ self.felt)
         if "at y" in of.places:
-            found.append(np.eye(of.after.shape[1]) - self.seen @ CS @ of.after)
+            found.append(np.eye(of.own_after.shape[1]) - self.seen @ CS @ of.own_after)
         return found
 
 
