@@ -90,14 +90,17 @@ neighbours is followed; where lines do not resolve it, the loop gain has to be s
 that fall between two lines unseen are not known: the lines have to be closer than a mode is wide.
 Above the last line the plant is unknown, and the loop gain there at most 0.1.
 
-**stage_weights.** In one length at the POI (1 m of reference) and in the force f0 that accelerates
-the rigid body by ``w_c^2`` times it, f_c being 1.6 times the bandwidth, the blocks are
+**stage_weights.** With Y = G_yu T of the decoupled axes at sigma = 2 pi f_c of the real axis,
+f_c being 1.6 times the bandwidth, axis i is multiplied by d_i = rms(Y_i) / rms(Y_1), actuator j
+has the size f0_j = (m / r)^(1/2) |(T / d)_j| (m actuators, r axes), and a sensor the noise that it
+shows of a unit of all axes. In these units the blocks are
 
 .. math:: \begin{bmatrix} W_S S & W_S P W_d \\ W_u K S & W_u K P W_d \end{bmatrix}
 
 with 1/W_S rising as f/f_c up to `peak`, W_u letting the efforts roll off from 6 f_c, and W_d =
-`disturbance` f0. K P W_d is the complementary sensitivity T at u, and the weights of z are divided
-by ``peak disturbance effort``, so that gamma = 1 requires |T| < peak at u: with the default ratios
+`disturbance` f0 at the actuators (a hundredth of it elsewhere, where actuators have noise). K P W_d
+is the complementary sensitivity T at u, and the weights of z are divided by
+``peak disturbance effort``, so that gamma = 1 requires |T| < peak at u: with the default ratios
 this block decides, and gamma is how far the loop is from it. The controller lists what each block
 reaches (`Controller.reached`).
 

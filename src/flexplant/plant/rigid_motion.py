@@ -22,8 +22,6 @@ from .rigid_body import RigidBody, refuse_lost, rigid_body_of
 #: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped
 #: beam's first mode has 0.990: that one bends
 _RIGID = 0.995
-#: a suspension mode is nothing to a loop whose bandwidth is this factor above
-_WEAK = 3.0
 
 
 class RigidModes(NamedTuple):
@@ -90,31 +88,9 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
         raise AssumptionError(
             "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
             "is for a free structure, assemble_plant(model, ports), or one on weak springs, "
-            "fx.plant.suspend(model, springs). Use design_hinf with weights of your own for a "
-            "held one."
+            "fx.plant.suspend(model, springs). Use design_kalman for a held one."
         )
     return motions
-
-
-def require_weak(motions: RigidModes, bandwidth: float, what: str) -> None:
-    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz]."""
-    # of an unstable pair the growth rate: a loop must cross 1 well above it to be stable
-    grows = -float(motions.freq.min(initial=0.0))
-    if grows > bandwidth / _WEAK:
-        raise AssumptionError(
-            "negative stiffness makes the rigid-body motion unstable, with poles at +-"
-            f"{2.0 * np.pi * grows:.4g} 1/s ({grows:.4g} Hz): {what} of {bandwidth:g} Hz reacts "
-            f"too slowly, it holds poles up to a third of that, {bandwidth / _WEAK:.4g} Hz. Raise "
-            f"the bandwidth above {_WEAK * grows:.4g} Hz, or lower the negative stiffness."
-        )
-    worst = float(motions.freq.max(initial=0.0))
-    if worst > bandwidth / _WEAK:
-        raise AssumptionError(
-            f"the rigid-body motion is constrained by springs at {worst:.4g} Hz: {what} of "
-            f"{bandwidth:g} Hz takes it for free, which holds for suspension modes up to a third "
-            f"of that, {bandwidth / _WEAK:.4g} Hz. Use softer springs, raise the bandwidth above "
-            f"{_WEAK * worst:.4g} Hz, or use design_hinf with weights of your own."
-        )
 
 
 def rigid_rows(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> FloatArray:
@@ -304,7 +280,7 @@ def _check_identity(
         raise AssumptionError(
             f"the axis {wanted[i]!r} cannot be decoupled: the {side} "
             f"({', '.join(names) or 'none'}) {what}. Add or move some, or choose fewer "
-            f"axes: gravity_axes(plant, axes=...) of {', '.join(body.axes)}."
+            f"axes: plant.gravity_axes(plant, axes=...) of {', '.join(body.axes)}."
         )
 
 
