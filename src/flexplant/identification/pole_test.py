@@ -172,28 +172,40 @@ def shared(fit: PoleFit, more: PoleFit, least: float) -> bool:
         return False
     if len(lines.parts) == 1:
         return True
-    if "own" not in vars(fit) and _proven(fit, more, least):
+    if fit.alone.keys() == set(range(len(lines.parts))) and not _disagrees(fit):
         return True
-    apart = own_cost(fit)
-    return fit.cost - apart < gain_due_of_own_poles(fit) or apart - own_cost(more) > least
+    if _proven(fit, more, least):
+        return True
+    return not _disagrees(fit) or own_cost(fit) - own_cost(more) > least
+
+
+def _disagrees(fit: PoleFit) -> bool:
+    """Return whether poles of their own at each output lower the cost by more than noise does."""
+    return fit.cost - own_cost(fit) >= gain_due_of_own_poles(fit)
 
 
 def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
     """Return whether a few outputs, with poles of their own, prove the pole more already."""
-    # most poles are: fits of the other outputs, which take most of the time, are not made then
-    found: list[PoleFit] = []
+    # most poles are: fits of the other outputs, which take most of the time, are not made then.
+    # Outputs that gain most by the pole are asked first
+    before, after = (
+        [sum(float(fit.bases[o][1] @ fit.bases[o][1]) for o in rows) for rows in fit.lines.parts]
+        for fit in (fit, more)
+    )
     gain = 0.0
-    for rows, own in zip(fit.lines.parts, more.own, strict=True):
-        alone = None
-        with attempted(f"a fit of {fit.lines.side} {len(found) + 1} alone", SolverError):
-            alone = fit.of_rows(rows, below=own.cost + least - gain)
-        if alone is None:
-            return True
-        found.append(alone)
-        gain += alone.cost - own.cost
+    for place in np.argsort(np.subtract(after, before), kind="stable").tolist():
+        own = more.own_of(place)
+        if place not in fit.alone:
+            least_of_it = own.cost + least - gain
+            alone = None
+            with attempted(f"a fit of {fit.lines.side} {place + 1} alone", SolverError):
+                alone = fit.of_rows(fit.lines.parts[place], below=least_of_it)
+            if alone is None:
+                return True
+            fit.alone[place] = alone
+        gain += fit.alone[place].cost - own.cost
         if gain > least:
             return True
-    vars(fit)["own"] = found  # all of them were made, as `PoleFit.own` does
     return False
 
 

@@ -239,6 +239,8 @@ class PoleFit:
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error
         self.bases: list[tuple[FloatArray, FloatArray]] = []
+        #: by place in `lines.parts`, the fits of single outputs that were made so far
+        self.alone: dict[int, PoleFit] = {}
         self.cost = 0.0
         for o, (right, stacked) in enumerate(zip(lines.goals, self._stacked(), strict=True)):
             size = np.maximum(np.linalg.norm(stacked, axis=0), TINY)
@@ -287,10 +289,16 @@ class PoleFit:
             found.append((columns.T @ columns, columns.T @ (Q.T @ right), float(right @ right)))
         return found
 
-    @cached_property
+    @property
     def own(self) -> list[PoleFit]:
         """The fits of each output, or set-up, alone."""
-        return [self.of_rows(rows) for rows in self.lines.parts]
+        return [self.own_of(place) for place in range(len(self.lines.parts))]
+
+    def own_of(self, place: int) -> PoleFit:
+        """Return the fit of one output, or set-up, alone, which is made once."""
+        if place not in self.alone:
+            self.alone[place] = self.of_rows(self.lines.parts[place])
+        return self.alone[place]
 
     def of_rows(self, rows: IntArray, below: float = np.inf) -> PoleFit:
         """Return the fit of some outputs alone: poles of their own, the participation of all."""
@@ -325,14 +333,16 @@ class PoleFit:
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
 
     def _moving(self, o: int) -> FloatArray:
-        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, what residual terms take too."""
+        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, 2 m of a single input."""
         # with Re and Im of the poles, then with those of the participation of the row's own input
         shape = self.shapes[o][:, None]
         l = self.participation[:, :, None]  # noqa: E741
         a, b = shape * l * self.slope, (shape * l).conj() * self.slope_minus
-        c, d = shape * self.plus, shape.conj() * self.minus
-        parts = np.concatenate([a + b, 1j * (a - b), np.zeros_like(a), np.zeros_like(a)], axis=1)
-        parts[:, 2 * self.m : 3 * self.m], parts[:, 3 * self.m :] = c + d, 1j * (c - d)
+        parts = np.concatenate([a + b, 1j * (a - b)], axis=1)
+        if l.shape[0] > 1:  # the participation of a single input is held at 1
+            c, d = shape * self.plus, shape.conj() * self.minus
+            more = np.concatenate([c + d, 1j * (c - d)])
+            parts = np.concatenate([parts, np.broadcast_to(more, parts.shape)], axis=1)
         return _real_and_imag(parts * self.lines.weight[o][:, None, :])
 
     @cached_property
@@ -385,11 +395,12 @@ class PoleFit:
             left, smooth = np.zeros_like(N), self.lines.smooth_bases[o][0]
             parts = zip(self._moving(o), smooth, bases, errors, self._places, strict=True)
             for D, terms, basis, e, (mine, at) in parts:
-                square, off = D @ D.T, D @ terms
-                whole[np.ix_(at, at)] += square[np.ix_(mine, mine)]
-                left[np.ix_(at, at)] += (square - off @ off.T)[np.ix_(mine, mine)]
-                g[at] += (D @ e)[mine]
-                common[:, at] += (D @ basis).T[:, mine]
+                own = D if mine.size == len(D) else D[mine]
+                square, off = own @ own.T, own @ terms
+                whole[np.ix_(at, at)] += square
+                left[np.ix_(at, at)] += square - off @ off.T
+                g[at] += own @ e
+                common[:, at] += (own @ basis).T
             left -= common.T @ common
             if np.any(np.diag(left) < OWN_SQUARE * np.diag(whole)):
                 J = self._jacobian(o)
