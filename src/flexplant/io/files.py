@@ -142,7 +142,7 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
     return most if most >= _DOUBLE or (most >= _ROUNDED and alike) else None
 
 
-#: what to do with a file that says a thing twice, and one in axes of its own
+#: what to do with a file that says a thing twice
 ONCE = "Export each once (one result set)."
 
 
