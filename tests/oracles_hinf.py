@@ -179,3 +179,35 @@ def least_cost(problem, tiny=1e-7):
     X = la.solve_continuous_are(A, B, C.T @ C, R, s=C.T @ p["D12"])[n:, n:]
     energy = (shapes.T @ shapes) / (rates[:, None] + rates)
     return float(np.sqrt(la.eigh(X, energy + 1e-12 * np.eye(rates.size), eigvals_only=True)[-1]))
+
+
+def h2_norm(loop):
+    """The H2 norm of a continuous loop by a Lyapunov equation of SciPy, infinite if not stable."""
+    A, B, C, _ = loop
+    if not all(np.isfinite(part).all() for part in loop) or stability(A, 0.0) >= 0:
+        return np.inf
+    P = la.solve_continuous_lyapunov(A, -B @ B.T)
+    return float(np.sqrt(max(np.trace(C @ P @ C.T), 0.0)))
+
+
+def smallest_h2(problem):
+    """The least H2 norm of a continuous problem: SciPy's Riccati equations, less and less added."""
+    speed = loop_speed(problem.parts, problem)
+    parts = scaled(problem.parts, speed)
+    plain, best = split(*parts, problem.nu, problem.ny), np.inf
+    for level in LEVELS:
+        changed, u, y = with_added(parts, problem.nu, problem.ny, level)
+        p = split(*changed, problem.nu, problem.ny)
+        R, V = p["D12"].T @ p["D12"], p["D21"] @ p["D21"].T
+        try:
+            S, N = p["C1"].T @ p["D12"], p["B1"] @ p["D21"].T
+            X = la.solve_continuous_are(p["A"], p["B2"], p["C1"].T @ p["C1"], R, s=S)
+            Y = la.solve_continuous_are(p["A"].T, p["C2"].T, p["B1"] @ p["B1"].T, V, s=N)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        F = -np.linalg.solve(R, p["B2"].T @ X + S.T)
+        L = -np.linalg.solve(V, p["C2"] @ Y + N.T).T
+        A = p["A"] + p["B2"] @ F + L @ p["C2"] + L @ p["D22"] @ F
+        K = (A, -L / y.T, u[:, None] * F, np.zeros((problem.nu, problem.ny)))
+        best = min(best, h2_norm(closed_loop(plain, *K)))
+    return best * np.sqrt(speed)

@@ -419,3 +419,19 @@ def problem(kind, seed):
     """The problem of a kind and a seed."""
     place = list(KINDS).index(kind)
     return KINDS[kind](np.random.default_rng([place, seed]))._replace(kind=kind)
+
+
+def strictly_proper(p, speed):
+    """The problem with lags on the z that w reaches at once [rad/s]: its H2 norm is finite."""
+    A, B, C, D = p.parts
+    m1, p1 = B.shape[1] - p.nu, len(C) - p.ny
+    at_once = np.flatnonzero(np.any(D[:p1, :m1], axis=1))
+    if p.dt or not at_once.size:
+        return p
+    E = np.eye(len(C))[:, at_once]
+    kept = np.eye(len(C)) - E @ E.T
+    A = np.block(
+        [[A, np.zeros((len(A), at_once.size))], [speed * C[at_once], -speed * np.eye(at_once.size)]]
+    )
+    B = np.vstack([B, speed * D[at_once]])
+    return p._replace(parts=(A, B, np.hstack([kept @ C, E]), kept @ D), G=None, weights=None)

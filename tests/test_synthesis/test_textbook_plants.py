@@ -7,9 +7,9 @@ import pytest
 
 from flexplant.lti import StateSpace, tf
 from flexplant.plant import StandardPlant, mixed_sensitivity
-from flexplant.synthesis import design_hinf
-from oracles_synthesis import split
-from textbook_plants import KINDS, problem
+from flexplant.synthesis import design_h2, design_hinf
+from oracles_synthesis import closed_loop, split
+from textbook_plants import KINDS, problem, strictly_proper
 
 oracle = pytest.importorskip("oracles_hinf", exc_type=ImportError)  # needs slycot
 
@@ -107,3 +107,18 @@ def test_slow_poles_and_integrators(G, S, KS, best):
     found = design_hinf(mixed_sensitivity(tf(*G), S=tf(*S), KS=KS))
     assert found.gamma == pytest.approx(best, rel=1.1e-2)
     assert 0.99 * best <= found.lower <= 1.002 * best
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "sampled"])
+def test_the_least_h2_norm(kind):
+    """Beside SciPy's Riccati equations, z made strictly proper by lags far above the loop."""
+    p = problem(kind, 1)
+    p = strictly_proper(p, 30.0 * oracle.loop_speed(p.parts, p))
+    found = design_h2(posed(p))
+    K = found.system
+    speed = oracle.loop_speed(p.parts, p)
+    loop = closed_loop(split(*p.parts, p.nu, p.ny), K.A, K.B, K.C, K.D)
+    norm = oracle.h2_norm(oracle.scaled(loop, speed)) * np.sqrt(speed)
+    assert norm == pytest.approx(found.gamma, rel=1e-3)
+    assert found.gamma <= 1.002 * oracle.smallest_h2(p)
