@@ -173,3 +173,18 @@ def test_what_was_tried_is_in_the_answer():
     P, u, y = flexible(2)
     found = design_hinf(P, u=u, y=y)
     assert found.tried == {"Riccati()": found.gamma}
+
+
+@pytest.mark.parametrize("side", ["u", "y"])
+@pytest.mark.parametrize("seed", range(4))
+def test_feedthrough_that_u_does_not_reach(side, seed):
+    """With D12 = 0 (D21 = 0) no controller changes D11: its norm is a lower bound."""
+    rng = np.random.default_rng(seed)
+    n = 3
+    A = rng.normal(size=(n, n)) - 4.0 * np.eye(n)
+    B, C = 0.1 * rng.normal(size=(n, 2)), 0.1 * rng.normal(size=(2, n))
+    parts = A, B, C, np.array([[0.8, 0.0], [1.0, 0.0]])
+    P, u, y = named(*(parts if side == "u" else dual(*parts)))
+    assert pointwise_bound(prepared(P, u, y)) == pytest.approx(0.8, rel=1e-12)
+    found = design_hinf(P, u=u, y=y)
+    assert 0.8 * (1 - 1e-9) <= found.lower <= found.gamma

@@ -55,7 +55,7 @@ def pointwise_bound(problem: Prepared) -> float:
         return parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
 
     swept, _ = highest(bounds, grid, _REFINEMENTS)
-    return max(swept, float(parrott(system.D[None], m1, p1)[0]))
+    return max(swept, *(one.direct for one in both_sides(problem)))
 
 
 def zero_bound(p: Prepared) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,10 +38,16 @@ MODERATION = 0.1
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 #: largest violation of an LMI, relative to its largest eigenvalue
 VIOLATION = 1e-6
+#: the same of LMIs that only choose states
+STATES = 1e-5
+#: part of the back-off at which states are chosen for the controller's LMIs
+NEARER = 0.4
+#: multiples of the back-off that are tried in turn, while they are at most so large
+LOOSER, LOOSEST = np.array([2.0, 4.0, 8.0]), 0.05
+#: relative distance of the smallest gamma from its lower bound above which neither is trusted
+UNRESOLVED = 0.02
 #: what a closed loop may exceed its target by
 _EXCESS = 1e-3
-#: multiples of the back-off that are tried in turn
-_LOOSER = np.array([1.0, 2.0, 4.0, 8.0])
 #: gamma, relative to the plant's size, that is taken for zero
 _NOTHING = 1e-7
 #: settings of Clarabel, tried in turn: its own; without its scaling of the data; regularised more
@@ -211,28 +218,48 @@ def symmetric_blocks(rows: list[list[Any]]) -> Any:
     return cp.bmat(full)
 
 
-def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimum:
-    """Return the smallest gamma of the projected LMIs ([GahinetApkarian1994]_, theorem 4.3)."""
+def projected(p: Plant, gamma: Any) -> tuple[Any, Any, list[Any]]:
+    """Return X, Y and the projected LMIs of a gamma ([GahinetApkarian1994]_, theorem 4.3)."""
     cp = modelling()
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
-    gamma = cp.Variable()
     onto_u = la.block_diag(la.null_space(np.hstack([p.B2.T, p.D12.T]), NULL), np.eye(nw))
     onto_y = la.block_diag(la.null_space(np.hstack([p.C2, p.D21]), NULL), np.eye(nz))
     AY, XA, w, z = p.A @ Y, X @ p.A, -gamma * np.eye(nw), -gamma * np.eye(nz)
     control = symmetric_blocks([[AY + AY.T, Y @ p.C1.T, p.B1], [z, p.D11], [w]])
     observe = symmetric_blocks([[XA + XA.T, X @ p.B1, p.C1.T], [w, p.D11.T], [z]])
-    constraints = [
-        half(-onto_u.T @ control @ onto_u) >> 0,
-        half(-onto_y.T @ observe @ onto_y) >> 0,
-        symmetric_blocks([[Y, np.eye(n)], [X]]) >> 0,
-    ]
+    return (
+        X,
+        Y,
+        [
+            half(-onto_u.T @ control @ onto_u) >> 0,
+            half(-onto_y.T @ observe @ onto_y) >> 0,
+            symmetric_blocks([[Y, np.eye(n)], [X]]) >> 0,
+        ],
+    )
+
+
+def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimum:
+    """Return the smallest gamma of the projected LMIs."""
+    cp = modelling()
+    gamma = cp.Variable()
+    X, Y, constraints = projected(p, gamma)
     # the little trace picks one of the many X and Y, and keeps them finite
     size = cp.trace(X) + cp.trace(Y)
     solve_program(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
     value = max(float(gamma.value), 1e-12)  # it may end below zero
     states = p.scaled(value).balanced(X.value, Y.value).with_unit_channels()
     return Optimum(value * scale, states)
+
+
+def moderate_states(p: Plant, gamma: float, settings: dict[str, float]) -> Plant:
+    """Return the plant in states balanced by the smallest X and Y of a gamma."""
+    # those of the smallest gamma are nearly singular, and no states for another program
+    cp = modelling()
+    X, Y, constraints = projected(p, gamma)
+    size = cp.Minimize(cp.trace(X) + cp.trace(Y))
+    solve_program(cp.Problem(size, constraints), settings, violation=STATES)
+    return p.balanced(X.value, Y.value).with_unit_channels()
 
 
 def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> Matrices:
@@ -402,7 +429,7 @@ class Lmi(Value):
     ----------
     back_off : float
         Relative distance of the target from the smallest gamma, at which the controller's gains
-        may be infinite. Doubled up to three times where no controller keeps the target.
+        may be infinite. Doubled up to three times, to at most 5 %, where no controller keeps it.
     tolerance : float
         Of the solver: gap and residuals, relative.
     max_states : int
@@ -450,20 +477,27 @@ class Lmi(Value):
             )
         with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:
             found, lower = self._smallest(problem, bar.advance)
+        if found.value > lower * (1.0 + UNRESOLVED):
+            raise SolverError(
+                f"the LMIs give gamma = {found.value:.6g} as smallest, but no proof excludes more "
+                f"than {lower:.6g}: {counted(n, 'state')} of such unlike speeds are beyond the "
+                "solver. Use Riccati(), loosen weights, or leave slow or fast states out."
+            )
         failures = []
-        for part in self.back_off * _LOOSER:
+        steps = [self.back_off, *(one for one in self.back_off * LOOSER if one <= LOOSEST)]
+        for step, choose in itertools.product(steps, (lambda same, *_: same, moderate_states)):
             try:
-                K = moderate_controller(found.plant, 1.0 + part, self._settings)
-                norm = verified(problem, K, found.value * (1.0 + part))
+                states = choose(found.plant, 1.0 + NEARER * step, self._settings)
+                K = moderate_controller(states, 1.0 + step, self._settings)
+                norm = verified(problem, K, found.value * (1.0 + step))
             except (FlexplantError, la.LinAlgError) as error:
-                failures.append(f"{100 * part:.3g} % above it: {error}")
+                failures.append(f"{100 * step:.3g} % above it: {error}")
                 continue
             return SolvedController(*K, norm, min(lower, norm))
         raise SolverError(
-            f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
-            + " ".join(failures)
-            + " Loosen weights, raise back_off, or use Riccati(), which adds a little noise and "
-            "effort where sensors and actuators have none."
+            f"the LMIs of {counted(n, 'state')} give gamma = {found.value:.6g} as smallest, but no "
+            f"controller. {' '.join(failures)} Loosen weights, raise back_off, or use Riccati(), "
+            "which adds a little noise and effort where sensors and actuators have none."
         )
 
     @property
