@@ -60,7 +60,10 @@ def norm_of(loop):
         norm = slycot.ab13dd("C", "I", "S", "D", *sizes, A, np.eye(len(A)), B, C, D, 1e-9)[0]
     # it was seen to pass over sharp resonances
     poles = np.linalg.eigvals(A)
-    found = response(loop, 1j * np.append(poles.imag, np.abs(poles)))
+    try:
+        found = response(loop, 1j * np.append(poles.imag, np.abs(poles)))
+    except np.linalg.LinAlgError:  # stable by no more than rounding
+        return np.inf
     return max(float(norm), float(np.linalg.norm(found, 2, axis=(1, 2)).max()))
 
 

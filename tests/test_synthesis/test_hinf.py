@@ -218,8 +218,8 @@ def test_what_the_weights_leave_out_is_named(rate, side, names, message):
 @pytest.mark.parametrize(
     ("rate", "side", "names", "note"),
     [
-        # sampled: the fourth combination bends the plate and is not seen at half the rate either
-        (RATE, "z", EFFORTS, r"D12 has rank 3 of 4: .*u1.* z "),
+        # sampled: two combinations move or bend the plate less than is felt at half the rate
+        (RATE, "z", EFFORTS, r"D12 has rank 2 of 4: .*u1.* z "),
         (0.0, "w", NOISES, r"D21 has rank 1 of 4: .*y1:error.* noise"),
     ],
 )

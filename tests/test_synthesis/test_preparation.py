@@ -138,11 +138,22 @@ def test_rank_deficient_directions_are_turned_and_kept():
     g = plant()
     D = g.D.copy()
     D[:4, 4] = 2.0 * D[:4, 3]  # u2 costs what u1 costs
-    D[:4, 3:] *= 1e-7
     p = prepared(g.replace(D=D), U, Y)
     sizes = np.linalg.svd(p.D12, compute_uv=False)
     np.testing.assert_allclose(sizes, [1.0, 0.0], atol=1e-9)
     assert np.linalg.matrix_rank(p.u_scale) == 2
+
+
+def test_what_is_not_felt_stays_in_the_unit_of_the_plant():
+    """Efforts of 1e-7 of what the plant does: the rank is missing, the efforts are not lost."""
+    g = plant()
+    D = g.D.copy()
+    D[:4, 3:] *= 1e-7
+    p = prepared(g.replace(D=D), U, Y)
+    sizes = np.linalg.svd(p.D12, compute_uv=False)
+    assert np.all((sizes > 1e-9) & (sizes < 1e-5))
+    own = np.linalg.svd(D[:4, 3:] @ p.u_scale, compute_uv=False)
+    np.testing.assert_allclose(sizes, own, rtol=1e-9)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.1])

@@ -9,7 +9,7 @@ from flexplant.lti import StateSpace, tf
 from flexplant.plant import StandardPlant, mixed_sensitivity
 from flexplant.synthesis import design_h2, design_hinf
 from oracles_synthesis import closed_loop, split
-from textbook_plants import KINDS, problem, strictly_proper
+from textbook_plants import KINDS, Problem, problem, strictly_proper
 
 oracle = pytest.importorskip("oracles_hinf", exc_type=ImportError)  # needs slycot
 
@@ -78,6 +78,22 @@ def test_what_is_typed_first(kind):
 def test_every_kind(kind, seed):
     verdict = judged(kind, seed)
     assert verdict.word == "right", verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_efforts_and_noises_that_are_tiny(seed):
+    """D12 and D21 of 1e-8 to 1e-3 of the plant's answers are there: gamma is within 1 %."""
+    rng = np.random.default_rng(seed)
+    n, m, q = (int(rng.integers(low, high)) for low, high in ((2, 8), (1, 3), (1, 3)))
+    A = rng.normal(size=(n, n)) - rng.uniform(0, 2) * np.eye(n)
+    B, C = rng.normal(size=(n, 2 + m)), rng.normal(size=(2 + q, n))
+    B, C = np.insert(B, [2] * q, 0.0, axis=1), np.insert(C, [2] * m, 0.0, axis=0)
+    D, (effort, noise) = np.zeros((len(C), B.shape[1])), 10.0 ** rng.uniform(-8, -3, 2)
+    D[2 : 2 + m, -m:], D[-q:, 2 : 2 + q] = effort * np.eye(m), noise * np.eye(q)
+    p = Problem("tiny", (A, B, C, D), m, q)
+    found = design_hinf(posed(p))
+    assert found.lower <= found.gamma <= FULL * oracle.smallest_norm(p)
 
 
 #: kinds whose optimum is that of a w which is known: u sees it in y as soon as it acts

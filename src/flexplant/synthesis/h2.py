@@ -115,7 +115,11 @@ def design_h2(
 def _optimal_controller(p: Prepared) -> SolvedController:
     """Return the optimal controller; noise and effort are added where the problem is singular."""
     lack = lacking(p)
-    return made_regular(p, _solve_regular, lack, h2_norm) if any(lack) else _solve_regular(p)
+    return (
+        _solve_regular(p)
+        if lack.is_full and not lack.modes
+        else made_regular(p, _solve_regular, lack, h2_norm)
+    )
 
 
 def _solve_regular(p: Prepared) -> SolvedController:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray
+from ..checks import ComplexArray, FloatArray
 from ..lti.equations import bordered_scale, state_scale
 from ..lti.norms import eigenvalues_with_error
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
-from ..tolerances import divisor
+from ..tolerances import TINY, divisor
 
 #: point at which answers are taken, in the unit of the loop's speed: away from resonances
 POINT = complex(np.exp(0.25j * np.pi))
@@ -19,8 +19,8 @@ _RANK = 1e-9
 #: fraction of its terms that an answer has at least: what they cancel to may be rounding
 _HIDDEN = 1e-3
 #: effort or noise that is smaller, relative to the plant's own answer at the loop's speed, is not
-#: felt: less than the least that is added where there is none. Rounding is 1e-14 or less
-FELT = 1e-7
+#: felt there: as much is added where there is none
+FELT = 1e-3
 #: relative to the fastest pole: where the search for the loop's speed ends. A double integrator has
 #: lost 14 digits there
 _FAR = 1e7
@@ -30,6 +30,10 @@ _THIRD = float(np.tan(np.pi / 3.0))
 #: points a decade of the search for the loop's speed, its start relative to the slowest pole (not
 #: a whole decade below it: an undamped pole is no point), and the factor a decade that is a fall
 _POINTS, _START, _FALL = 8, 0.09, 2.0
+#: change of slope [factor a decade] that makes a corner of an answer, and how far above the last
+#: corner the loop's speed may lie: of plants with efforts of 1e-3 to 1e-8 of their answers, 39 of
+#: 40 came within 1 % with 3, 31 with 30
+_CORNER, _BEYOND = 1.5, 3.0
 
 
 def balanced(
@@ -94,13 +98,23 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
     omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
     G = responses(g, omega / (2.0 * np.pi))
-    sides = np.linalg.norm(G[:p1, m1:], axis=0), np.linalg.norm(G[p1:, :m1], axis=1)
-    slopes = np.diff(np.log(np.maximum(np.vstack(sides), np.finfo(float).tiny)))
-    falls = slopes < -np.log(_FALL) / _POINTS
+    falls = _slopes(G, m1, p1) < -np.log(_FALL)
     # the first point after the first fall at which there is none
     settled = np.logical_or.accumulate(falls, axis=1) & ~falls
     found = [omega[np.argmax(one)] for one in settled if one.any()]
-    return float(min(found) if found else np.exp(np.mean(np.log(sizes))))
+    if not found:
+        return float(np.exp(np.mean(np.log(sizes))))
+    # far above the last corner of all answers nothing happens but that gains grow
+    plain = _slopes(G - g.D[:, :, None], m1, p1)
+    corners = np.any(np.abs(plain - plain[:, -1:]) > np.log(_CORNER), axis=0)
+    last = omega[np.flatnonzero(corners)[-1]] if corners.any() else np.inf
+    return float(min(min(found), _BEYOND * last))
+
+
+def _slopes(G: ComplexArray, m1: int, p1: int) -> FloatArray:
+    """Return the logarithmic slopes a decade of the answers to each u and of each y."""
+    sides = np.linalg.norm(G[:p1, m1:], axis=0), np.linalg.norm(G[p1:, :m1], axis=1)
+    return np.asarray(np.diff(np.log(np.maximum(np.vstack(sides), TINY))) * _POINTS)
 
 
 def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:

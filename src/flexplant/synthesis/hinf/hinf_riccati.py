@@ -25,8 +25,9 @@ from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks,
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
 #: gains stay finite where D12 and D21 have full rank, so that 1 % is kept with the tolerance, and
-#: with what is added for undamped modes; they grow without bound where the ranks are missing
-_REGULAR, _MODES, _SINGULAR = 0.008, 0.003, 0.05
+#: with what is added for undamped modes or to tiny efforts; they grow without bound where the ranks
+#: are missing
+_REGULAR, _ADDED, _SINGULAR = 0.008, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
 #: steps of the bisection, and of going up from its result
@@ -61,7 +62,8 @@ class Riccati(Value):
     ----------
     back_off : float, optional
         Relative distance from the smallest gamma found. Unless given 0.8 % where D12 and D21 have
-        full rank (0.3 % with what is added for a missed mode), and 5 % where they have not.
+        full rank (0.3 % with what is added for a missed mode or to a tiny effort or noise), and
+        5 % where they have not.
     tolerance : float
         Relative width at which the bisection stops.
     regularised : bool, optional
@@ -102,12 +104,12 @@ class Riccati(Value):
         """
         lack = lacking(problem)
         if self.regularised is False:
-            require_ranks(lack.ranks)
+            require_ranks(() if lack.is_full else lack.ranks)
             require_shown(problem)
             return self._regular(problem, _REGULAR)
-        if self.regularised is None and not any(lack):
+        if self.regularised is None and lack.is_nothing:
             return self._regular(problem, _REGULAR)
-        back_off = _SINGULAR if lack.ranks else _MODES
+        back_off = _ADDED if lack.is_full else _SINGULAR
         return made_regular(problem, lambda regular: self._regular(regular, back_off), lack)
 
     def _regular(
@@ -188,7 +190,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
     # seen at resonances alone
     quick = Riccati(tolerance=_QUICK, progress=False)
     lack = lacking(problem)
-    if not any(lack):
+    if lack.is_nothing:
         return quick._regular(problem, _REGULAR, _resonance_gain)
     regular = Regularised(problem, LEVELS[0], bool(lack.modes))
     found = quick._regular(regular.problem, _SINGULAR, _resonance_gain)

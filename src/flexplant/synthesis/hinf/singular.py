@@ -17,15 +17,16 @@ from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING, SPLIT
 from ..controller import SolvedController
 from ..preparation import Prepared
-from ..scaling import normalised
+from ..scaling import FELT, normalised
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
 #: what certificates call the size of what was added
 ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken
-LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
-#: two more where only modes are missed: what acts on a chain of k integrators costs the k-th root
+LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7)
+#: two more where D12 and D21 have full rank: what acts on a chain of k integrators costs the k-th
+#: root, and tiny efforts may be needed in full
 FINER = (*LEVELS, 1e-8, 1e-9)
 #: relative: what a level may cost in gamma, compared with a tenth of it
 _COST = 1e-3
@@ -42,7 +43,7 @@ _GROWTH = 3.0
 
 
 #: relative to the loop's speed: a mode that decays more slowly, and that z or w shows by less, is
-#: taken for undamped; the same of what is undamped but for rounding
+#: taken for undamped
 _SLOW = 1e-4
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
@@ -60,6 +61,18 @@ class Lacking(NamedTuple):
 
     ranks: tuple[str, ...]
     modes: tuple[str, ...]
+    #: whether all that is missing of D12 and D21 is there, but too small to be felt
+    weak: bool = False
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether the problem is regular as it is."""
+        return not self.ranks and not self.modes
+
+    @property
+    def is_full(self) -> bool:
+        """Whether D12 and D21 have full rank, however small they are."""
+        return self.weak or not self.ranks
 
     @property
     def words(self) -> str:
@@ -69,21 +82,30 @@ class Lacking(NamedTuple):
 
 def lacking(problem: Prepared) -> Lacking:
     """Return which of D12 and D21 has not full rank, and which slow modes z or w misses."""
-    return Lacking(missing_ranks(problem), missed_modes(problem, _SLOW, _SLOW))
+    least = min(_least(problem.D12), _least(problem.D21.T))
+    modes = missed_modes(problem, _SLOW, _SLOW)
+    return Lacking(missing_ranks(problem), modes, least > ROUNDING)
+
+
+def _least(D: FloatArray) -> float:
+    """Return the smallest singular value of the columns of a matrix."""
+    return float(la.svdvals(D)[-1]) if 0 < D.shape[1] <= len(D) else 0.0
 
 
 def missing_ranks(problem: Prepared) -> tuple[str, ...]:
     """Return in words which of D12 and D21 has not full rank."""
     found = []
     for name, matrix, names, cause in (
-        ("D12", problem.D12, problem.u, "costs nothing in z at high frequencies"),
-        ("D21", problem.D21.T, problem.y, "is free of noise in w at high frequencies"),
+        ("D12", problem.D12, problem.u, "costs {}nothing in z at high frequencies"),
+        ("D21", problem.D21.T, problem.y, "shows {}no noise of w at high frequencies"),
     ):
         needed = matrix.shape[1]
         rank = int(np.linalg.matrix_rank(matrix, tol=_RANK)) if matrix.size else 0
         if rank < needed:
+            little = "next to " if _least(matrix) > ROUNDING else ""
             found.append(
-                f"{name} has rank {rank} of {needed}: a combination of {', '.join(names)} {cause}"
+                f"{name} has rank {rank} of {needed}: a combination of {', '.join(names)} "
+                f"{cause.format(little)}"
             )
     return tuple(found)
 
@@ -206,7 +228,7 @@ def made_regular(
     """Return the controller of a singular problem, found with a little noise and effort added."""
     found: list[_Found] = []
     errors: list[FlexplantError] = []
-    for level in LEVELS if lack.ranks else FINER:
+    for level in FINER if lack.is_full else LEVELS:
         try:
             found.append(_with_level(Regularised(problem, level, bool(lack.modes)), solve, norm))
         except FlexplantError as error:
