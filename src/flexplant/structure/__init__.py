@@ -51,5 +51,7 @@ from .simple_models import beam as beam
 from .simple_models import chain as chain
 from .simple_models import kirchhoff_plate as kirchhoff_plate
 from .simple_models import solid_block as solid_block
+from .slides import slides as slides
+from .slides import sliding as sliding
 
 __dir__ = _public_names(__name__)

@@ -394,8 +394,9 @@ def check_stiffness(
     several = "an elastic mode has" if lost.size == 1 else f"{lost.size} elastic modes have"
     raise ModelError(
         f"{several} no stiffness ({found}): a mechanism, a zero-energy motion beyond the {r} "
-        f"rigid-body motions of the geometry, or springs too soft for the digits of K.{moved} Join "
-        "or hold these, look for wrong coordinates (see check(model)), or suspend the modes "
+        f"rigid-body motions of the geometry, or springs too soft for the digits of K.{moved} If "
+        "drives move them, they are slides: pass structure.sliding(model), which names them. Join "
+        "or hold others, look for wrong coordinates (see check(model)), or suspend the modes "
         "rather than the model on soft springs."
     )
 

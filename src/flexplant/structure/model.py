@@ -27,7 +27,7 @@ from .definite import (
     unstable_stiffness,
     without_inertia,
 )
-from .rigid import Placed, body_motions, force_parts, rigid_body_basis
+from .rigid import Placed, body_motions, force_parts, nearest_free, rigid_body_basis
 from .units import units
 from .zero_energy import digits_of, endangered, held_by_rounding
 
@@ -179,7 +179,8 @@ class FEModel(Placed, Value):
             motions = body_motions(self.M, self.K, self.dofs)
         else:
             # a mass or held DOFs may have been added since the machine was joined
-            motions = orthonormalised(self.M, self.joint_motions, dependent="drop")
+            given = nearest_free(self.K, self.joint_motions)
+            motions = orthonormalised(self.M, given, dependent="drop")
         return np.asarray(frozen(motions))
 
     @cached_property

@@ -14,8 +14,18 @@ import scipy.sparse.csgraph as csgraph
 from ..checks import FloatArray, IntArray, Matrix, real_array
 from ..errors import SolverError
 from ..labels import DIRECTIONS, DofSet, Place
+from ..sparse.factor import DENSE_LIMIT
 from ..sparse.lowest import definite_solver
-from ..sparse.symmetric import PRECISION, ZERO, Absolute, by_rows, diagonal, orthonormalised
+from ..sparse.symmetric import (
+    PRECISION,
+    ZERO,
+    Absolute,
+    by_rows,
+    dense,
+    diagonal,
+    orthonormalised,
+    unit_diagonal,
+)
 from ..tolerances import divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
@@ -231,6 +241,26 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
         found.append(moved if whole else np.zeros((len(dofs), moved.shape[1])))
         found[-1][rows] = moved
     return np.hstack(found)
+
+
+#: relative: by how much motions are mended that were given with few digits; springs that hold one
+#: change it wholly
+_FEW_DIGITS = 1e-6
+#: eigenvalues of K, scaled, up to this relative size are zero
+_NULL = 1e-11
+
+
+def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
+    """Return motions (n, r) without the little by which they stretch a structure: few digits."""
+    # ``m - K^+ K m`` is the null vector of K next to m
+    if K.shape[0] > DENSE_LIMIT or not motions.size:
+        return motions
+    scaled, scale = unit_diagonal(K)
+    force = scale[:, None] * np.asarray(K @ motions)
+    change = scale[:, None] * (la.pinvh(dense(scaled), rtol=_NULL) @ force)
+    size = divisor(np.linalg.norm(motions, axis=0))
+    small = np.linalg.norm(change, axis=0) <= _FEW_DIGITS * size
+    return np.asarray(motions - np.where(small, change, 0.0))
 
 
 def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray) -> FloatArray:

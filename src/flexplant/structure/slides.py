@@ -1,0 +1,96 @@
+"""Slides: motions that cost no energy beyond those of the geometry, as drives need them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..checks import FloatArray, name_list
+from ..errors import ModelError, require_known
+from ..sparse.factor import DENSE_LIMIT
+from ..sparse.symmetric import dense, unit_diagonal
+from .model import FEModel
+
+#: relative: eigenvalues of the scaled K up to this are zero
+_ZERO = 1e-11
+
+
+def slides(model: FEModel) -> dict[str, FloatArray]:
+    """Return the motions without energy that no rigid-body motion makes, each named by a DOF.
+
+    A carriage on a guide, a joint, a screw: what a drive moves is free. An import holds it as a
+    zero-energy motion, which `solve_modes` takes for a mechanism until it is said to be meant.
+
+    Parameters
+    ----------
+    model : FEModel
+        Of at most 3000 DOFs.
+
+    Returns
+    -------
+    dict {label: (n,) array}
+        A motion moves the DOF that names it by one unit, and no other DOF that names one.
+
+    Raises
+    ------
+    ModelError
+        When the model is too large.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> dofs = fx.DofSet([1, 1], ["x", "y"], [[0, 0, 0], [0, 0, 0]])
+    >>> model = fx.FEModel([[1, 0], [0, 1]], [[0, 0], [0, 5]], dofs=dofs)
+    >>> list(fx.structure.slides(model))  # a free x is a rigid-body motion of the geometry
+    []
+    """
+    if model.n_dof > DENSE_LIMIT:
+        raise ModelError(
+            f"slides are found of at most {DENSE_LIMIT} DOFs, the model has {model.n_dof}: reduce "
+            "it first, or pass joint_motions= of your own."
+        )
+    scaled, scale = unit_diagonal(model.K)
+    values, vectors = la.eigh(dense(scaled))
+    zero = scale[:, None] * vectors[:, np.abs(values) <= _ZERO * max(float(values[-1]), 1.0)]
+    rigid = model.rigid_body
+    left = zero - rigid @ (np.asarray(model.M @ rigid).T @ zero)
+    extra = zero.shape[1] - rigid.shape[1]
+    if extra <= 0:
+        return {}
+    space = la.svd(left, full_matrices=False)[0][:, :extra]
+    chosen = la.qr(space.T, mode="economic", pivoting=True)[2][:extra]
+    motions = space @ np.linalg.inv(space[chosen])
+    return {model.dofs.labels[row]: motions[:, i] for i, row in enumerate(chosen.tolist())}
+
+
+def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
+    """Return a model whose slides are meant: motions at 0 Hz of `solve_modes`, as `slides` names.
+
+    Parameters
+    ----------
+    model : FEModel
+    names : sequence of str, optional
+        Those that are meant; all when not given. Others stay mechanisms, which are refused.
+
+    Raises
+    ------
+    LabelError, ModelError
+        When there is no such slide; as for `slides`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> dofs = fx.DofSet([1, 2, 3], ["x", "x", "x"], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> K = [[9e3, -9e3, 0], [-9e3, 9e3, 0], [0, 0, 1e4]]
+    >>> model = fx.FEModel([[1, 0, 0], [0, 1, 0], [0, 0, 1]], K, dofs=dofs)
+    >>> fx.solve_modes(fx.structure.sliding(model), count=3).n_rigid
+    1
+    """
+    found: dict[str, Any] = slides(model)
+    chosen = list(found) if names is None else name_list(names, "names")
+    require_known("slide", chosen, found)
+    motions = [model.rigid_body, *(found[name][:, None] for name in chosen)]
+    return model.replace(joint_motions=np.hstack(motions))
