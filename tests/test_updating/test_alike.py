@@ -9,6 +9,8 @@ from scipy import stats
 
 import flexplant as fx
 from flexplant.updating import AddedMass, Eigenvalues, localise
+from flexplant.updating.judgement.subsets import Subsets
+from flexplant.updating.search import Objective
 
 
 def chain(masses, springs):
@@ -83,3 +85,20 @@ def test_a_place_too_many_is_as_rare_as_the_page_says():
     expected = (n - 1) * stats.chi2.sf(price, 1)
     assert stats.binom.cdf(extra, trials, expected) > 1e-3
     assert stats.binom.sf(extra - 1, trials, expected) > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_fit_by_way_of_negative_inertia_is_polished(seed):
+    """Fits in few coordinates may pass through values at which the whole model has no modes."""
+    rng = np.random.default_rng(seed)
+    n = 8
+    model, M, K = chain(rng.uniform(1.0, 2.0, n), rng.uniform(0.5e6, 2e6, n - 1))
+    place, size = int(rng.integers(n)), rng.uniform(0.1, 0.5)
+    data = poles(M, K, {place: size}, rng, 1e-6, 5)
+    candidates = [AddedMass(f"{i + 1}:z", name=str(i)) for i in range(n)]
+    whole = Objective(damped(model, K, M), candidates, data, prior=False)
+    fits = Subsets(whole, data, n)
+    fits.fit((place,))
+    fits.ways[place,] = [np.array([-2.0 * M[place, place]]), *fits.ways[place,]]
+    fits.polish((place,))
+    assert fits.fit((place,)).p[0] == pytest.approx(size, rel=1e-2)

@@ -102,7 +102,9 @@ class Subsets:
         if self.fit(subset) is None or not (subset or self.beside):
             return
         objective = self._objective([*subset, *self.beside])
-        objective.path = self.ways[subset][:-1]
+        # fits in few coordinates may pass through values that no machine has
+        way = self.ways[subset][:-1]
+        objective.path = [p for p in way if is_physical(objective.family, p)]
         end = self.ways[subset][-1]
         found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
         self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
