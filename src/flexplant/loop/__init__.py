@@ -18,7 +18,7 @@ Every quantity takes a measured `fx.Frf` as plant too; `in_axes` brings it into 
 (True, 0.57)
 >>> report = fx.loop.report_loops(loop)
 >>> round(report["u1"].phase_margin), round(loop.rms("die:error") * 1e9)
-(41, 245)
+(41, 248)
 
 Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, of a loop
 gain L (a system or a measured `fx.Frf`), of ``(plant, controller)`` or of a closed loop;

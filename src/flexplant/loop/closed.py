@@ -74,7 +74,7 @@ class ClosedLoop(Value):
     >>> loop.is_stable, loop.driven
     (True, ('u1',))
     >>> f"{1e9 * loop.rms('die:x'):.0f} nm"
-    '245 nm'
+    '248 nm'
     """
 
     plant: AnyPlant

@@ -22,7 +22,7 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 (0.67, 0.66)
 >>> loop = fx.close_loop(plant, errors, hinf)
 >>> loop.is_stable, round(loop.modulus_margin, 2)
-(True, 0.55)
+(True, 0.56)
 
 | MATLAB | here |
 |---|---|
