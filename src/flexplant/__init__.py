@@ -68,6 +68,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
   `examples/scanning_stage.py`
 - shape loops by hand in a browser, on measured responses: `examples/workbench.py`
 - follow set-points: `examples/feedforward.py`
+- design by mixed sensitivity, on textbook plants: `examples/textbook.py`
 - guarantee robustness: `examples/robust_control.py`
 - join components: `examples/joined_machine.py`
 - place sensors and actuators: `examples/placement.py`
