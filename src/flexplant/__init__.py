@@ -67,7 +67,8 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - control six axes: `examples/maglev.py`; a stage that scans below sensors on its frame:
   `examples/scanning_stage.py`
 - shape loops by hand in a browser, on measured responses: `examples/workbench.py`
-- follow set-points: `examples/feedforward.py`
+- a machine of which no body is free: `examples/gantry.py`; follow set-points:
+  `examples/feedforward.py`
 - design by mixed sensitivity, on textbook plants: `examples/textbook.py`
 - guarantee robustness: `examples/robust_control.py`
 - join components: `examples/joined_machine.py`
