@@ -156,7 +156,7 @@ def test_a_loop_that_tolerates_all_says_so():
 def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
     every, one = tolerances(), loop()
     worst = every.modes[np.argsort(every.least)[:3]]
-    limits = {int(mode): 0.05 if mode == worst[0] else 1e-3 for mode in worst}
+    limits = {int(mode): 0.05 if mode == worst[0] else 2e-3 for mode in worst}
     found = mode_tolerances(one.plant, one.broken, margin=every.margin, limit=limits)
     row = np.searchsorted(every.modes, found.modes)
     np.testing.assert_array_equal(found.modes, np.sort(worst))
