@@ -42,9 +42,9 @@ _SETTLED = 1.2
 _GROWTH = 3.0
 
 
-#: relative to the loop's speed: a mode that decays more slowly, and that z or w shows by less, is
-#: taken for undamped
-_SLOW = 1e-4
+#: relative to the loop's speed: a mode that decays more slowly is taken for undamped; what z or w
+#: shows by less than the other, the root of rounding, is missed
+_SLOW, _SHOWN = 1e-4, 1e-8
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
     "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
@@ -83,7 +83,7 @@ class Lacking(NamedTuple):
 def lacking(problem: Prepared) -> Lacking:
     """Return which of D12 and D21 has not full rank, and which slow modes z or w misses."""
     least = min(_least(problem.D12), _least(problem.D21.T))
-    modes = missed_modes(problem, _SLOW, _SLOW)
+    modes = missed_modes(problem, _SLOW, _SHOWN)
     return Lacking(missing_ranks(problem), modes, least > ROUNDING)
 
 
@@ -111,7 +111,7 @@ def missing_ranks(problem: Prepared) -> tuple[str, ...]:
 
 
 def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
-    """Return in words what z or w shows by less than `shown` of modes that decay so slowly.
+    """Return in words which modes that decay so slowly z or w misses, or shows by less than a size.
 
     Zeros of u -> z and of w -> y so close to the limit of stability count like such modes.
     """
@@ -119,19 +119,21 @@ def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
     found = []
     sides = ("z", p.A, p.B2, p.C1, p.D12), ("w", p.A.T, p.C2.T, p.B1.T, p.D21.T)
     for side, A, B, C, D in sides:
-        # [A - s I, B2; C1, D12] loses rank there: at poles of A, or of A without what D12 can hide
+        # [A - s I, B2; C1, D12] loses rank at poles of A, or of A without what D12 can hide: its
+        # least singular value on the limit of stability is at most the distance to that pole then
         inner = A - B @ np.linalg.pinv(D) @ C
-        for s in _limit(p, np.concatenate([la.eigvals(A), la.eigvals(inner)]), decay):
+        poles = np.concatenate([la.eigvals(A), la.eigvals(inner)])
+        for s, distance in _limit(p, poles, decay):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
-            if la.svdvals(pencil)[-1] <= shown:
+            if la.svdvals(pencil)[-1] <= max(distance, shown):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
                 found.append(_MISSED[side].format(f"{p.frequency(omega):.3g} Hz"))
                 break
     return tuple(found)
 
 
-def _limit(p: Prepared, poles: ComplexArray, decay: float) -> ComplexArray:
-    """Return the points of the limit of stability next to poles that decay slowly."""
+def _limit(p: Prepared, poles: ComplexArray, decay: float) -> list[tuple[complex, float]]:
+    """Return the points of the limit of stability next to slow poles, and the distances there."""
     if p.direct:
         decay *= abs(p.point - 1.0)
         near = poles[np.abs(np.abs(poles) - 1.0) <= decay]
@@ -139,7 +141,7 @@ def _limit(p: Prepared, poles: ComplexArray, decay: float) -> ComplexArray:
     else:
         near = poles[np.abs(poles.real) <= decay]
         limit = 1j * np.where(np.abs(near) <= decay, 0.0, near.imag)
-    return np.unique(limit[limit.imag >= 0.0])
+    return [(complex(s), abs(s - pole)) for s, pole in zip(limit, near, strict=True)]
 
 
 def require_shown(p: Prepared) -> None:
