@@ -187,7 +187,7 @@ def test_error_measurements_and_the_static_relation_are_the_free_ones(die):
     soft = held(die=die)
     np.testing.assert_allclose(design_static(soft).gain, design_static(free).gain, atol=1e-9)
     # at rest the forces against the springs bend the plate a little: 1.5 Hz beside 245 Hz, squared
-    bent = 5.0 * (1.5 / 245.0) ** 2
+    bent = 8.0 * (1.5 / 245.0) ** 2
     np.testing.assert_allclose(reference_errors(soft).D, reference_errors(free).D, atol=bent)
 
 
