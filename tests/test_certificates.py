@@ -203,7 +203,7 @@ WRONG = {
         "integral of the spectrum",
     ),
     "H2 norm by the other Gramian": (
-        "lti.norms.observability_gramian", larger(1.001),
+        "lti.norms.observability_factor", larger(1.001),
         lambda: fx.h2_norm(fx.StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])),
         "by the observability",
     ),
@@ -242,7 +242,8 @@ WRONG = {
         "is not stable.*stays undamped",
     ),
     "inverse of a plant": (
-        "simulation.feedforward.responder", lambda function: lambda g: larger(1.001)(function(g)),
+        "simulation.inverse_forces.responder",
+        lambda function: lambda g: larger(1.001)(function(g)),
         lambda: fx.simulation.inverse_forces(
             servo(), fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05),
             duration=0.2, bandwidth=60.0,

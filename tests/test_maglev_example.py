@@ -11,7 +11,7 @@ import flexplant as fx
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 #: [m] rms in closed loop in the middle and at the corner
-PINS = {"x": (2.24358e-9, 2.36432e-9), "z": (2.41497e-9, 4.07105e-9)}
+PINS = {"x": (2.23853e-9, 2.35997e-9), "z": (2.39947e-9, 4.06848e-9)}
 
 pytestmark = pytest.mark.long
 
@@ -88,7 +88,7 @@ def test_the_path_of_the_poi(found):
     for case in found["path"]:
         assert case["loop"].is_stable
         assert case["loop"].left_out.is_stable
-        assert case["loop"].modulus_margin == pytest.approx(0.469, abs=0.003)
+        assert case["loop"].modulus_margin == pytest.approx(0.467, abs=0.003)
         # what is not seen of the motion is far below what is not suppressed of it
         assert case["observer"].rms("die:z") < 0.2 * case["loop"].rms("die:z")
     # the fourth sensor along z tells how the stage twists: worth 23 % at the corner
