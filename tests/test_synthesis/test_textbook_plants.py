@@ -7,7 +7,7 @@ import pytest
 
 from flexplant.lti import StateSpace, tf
 from flexplant.plant import StandardPlant, mixed_sensitivity
-from flexplant.synthesis import design_h2, design_hinf
+from flexplant.synthesis import FixedOrder, Lmi, design_h2, design_hinf, design_structured
 from oracles_synthesis import closed_loop, split
 from textbook_plants import KINDS, Problem, problem, strictly_proper
 
@@ -138,3 +138,18 @@ def test_the_least_h2_norm(kind):
     norm = oracle.h2_norm(oracle.scaled(loop, speed)) * np.sqrt(speed)
     assert norm == pytest.approx(found.gamma, rel=1e-3)
     assert found.gamma <= 1.002 * oracle.smallest_h2(p)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["one lag", "double integrator"])
+def test_a_structured_design_of_full_order(kind):
+    """It begins at the controller of full order, and does not lose it."""
+    P = posed(problem(kind, 0))
+    found = design_structured(P, FixedOrder(P.system.n_states), rng=0, progress=False)
+    assert found.gamma <= 1.02 * oracle.smallest_norm(problem(kind, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["two lags", "double integrator", "distillation", "RHP zero"])
+def test_linear_matrix_inequalities(kind):
+    assert judged(kind, 0, Lmi()).gamma <= SINGULAR

@@ -40,6 +40,8 @@ TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 VIOLATION = 1e-6
 #: the same of LMIs that only choose states
 STATES = 1e-5
+#: relative distance from the smallest gamma at which states are chosen for the next program
+AWAY = 0.02
 #: part of the back-off at which states are chosen for the controller's LMIs
 NEARER = 0.4
 #: multiples of the back-off that are tried in turn, while they are at most so large
@@ -523,7 +525,8 @@ class Lmi(Value):
                         return one, lower
                     if number and one.value > 0.99 * scale:
                         break
-                    states, scale = one.plant.scaled(1.0 / one.value), one.value
+                    nearer = moderate_states(one.plant, 1.0 + AWAY, self._settings)
+                    states, scale = nearer.scaled(1.0 / one.value), one.value
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
         if not found:

@@ -142,11 +142,11 @@ class FixedOrder(Value):
         entries = _Entries(self.order, pattern, prepared, nests=self.start is None)
         known = self.start
         if known is None and self.order:
-            with attempted("a start from the reduced controller of full order"):
+            with attempted("a start from the controller of full order, reduced to this one"):
                 full = design_hinf(plant).system
-                known = (
-                    balanced(full, order=self.order).system if full.n_states > self.order else None
-                )
+                if full.n_states > self.order:
+                    full = balanced(full, order=self.order).system
+                known = full if full.n_states == self.order else None
         if known is None:
             return entries
         if known.n_states != self.order or known.D.shape != (nu, ny):
