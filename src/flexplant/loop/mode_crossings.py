@@ -278,16 +278,17 @@ class SizeBound(NamedTuple):
         product = self.a @ inverse @ c @ inverse.conj().swapaxes(1, 2)
         return np.asarray(np.linalg.eigvals(product).real.max(axis=1))
 
-    def exceeds(self, delta: FloatArray, count: int) -> BoolArray:
-        """Return for which of the modes |S| reaches the size at any point."""
-        over = self.modes.mode[self.share(delta) >= 1.0]
-        return np.bincount(over, minlength=count) > 0
+    def highest(self, delta: FloatArray, count: int) -> FloatArray:
+        """Return the largest share (modes,) over the points of each mode."""
+        found = np.full(count, -np.inf)
+        np.maximum.at(found, self.modes.mode, self.share(delta))
+        return found
 
     def halved(self, below: FloatArray, above: FloatArray, sign: float) -> FloatArray:
         """Return the sizes of change (modes,) between two at which it is reached first."""
         for _ in range(_HALVINGS):
             middle = 0.5 * (below + above)
-            over = self.exceeds(sign * middle, len(middle))
+            over = self.highest(sign * middle, len(middle)) >= 1.0
             above, below = np.where(over, middle, above), np.where(over, below, middle)
         return above
 
@@ -360,7 +361,8 @@ def axis_crossings(
     found = np.tile([-np.inf, np.inf], (len(ends), 1))
     limits = np.abs(ends).max(axis=1)[modes.mode]
     delta = modes.changes(kind, limits)
-    inside = (delta.real > ends[modes.mode, 0]) & (delta.real < ends[modes.mode, 1])
+    # a crossing next to an end of the range has a neighbour beyond it: the found change is judged
+    inside = np.abs(delta) <= _FIRST_STEP * limits
     same = modes.mode[:-1] == modes.mode[1:]
     low = np.flatnonzero(_sign_changes(delta.imag) & inside[:-1] & inside[1:] & same)
     edges, mode = np.stack([freq[low], freq[low + 1]], axis=1), modes.mode[low]
@@ -372,9 +374,9 @@ def axis_crossings(
         each = swept.loops.swept(fine.ravel()).swept_modes(
             np.arange(fine.size), np.repeat(mode, _WITHIN)
         )
-        delta = each.changes(kind, np.repeat(np.abs(ends).max(axis=1)[mode], _WITHIN))
-        delta = delta.reshape(fine.shape)
-        good = (delta.real > ends[mode, :1]) & (delta.real < ends[mode, 1:])
+        most = np.abs(ends).max(axis=1)[mode]
+        delta = each.changes(kind, np.repeat(most, _WITHIN)).reshape(fine.shape)
+        good = np.abs(delta) <= _FIRST_STEP * most[:, None]
         turns = _sign_changes(delta.imag) & good[:, :-1] & good[:, 1:]
         real = np.any(turns, axis=1)
         mode, fine, delta, k = mode[real], fine[real], delta[real], turns[real].argmax(axis=1)
@@ -385,7 +387,7 @@ def axis_crossings(
         value = left.real + share * (right.real - left.real)
     for i, change in zip(mode, value, strict=True):
         side = int(change > 0)
-        if abs(change) < abs(found[i, side]):
+        if ends[i, 0] < change < ends[i, 1] and abs(change) < abs(found[i, side]):
             found[i, side] = change
     return found
 
@@ -419,14 +421,18 @@ def size_reached(
     for side, sign in enumerate((-1.0, 1.0)):
         start = np.minimum(_LEAST, 0.5 * ends[:, side])
         steps = np.geomspace(start, ends[:, side], _TRIED)
-        reached = np.array([few.exceeds(sign * step, count) for step in steps])
-        where = np.flatnonzero(np.any(reached, axis=0))
+        highest = np.array([few.highest(sign * step, count) for step in steps])
+        reached = highest >= 1.0
+        on_line = np.any(reached, axis=0)
+        # a peak between two lines of the grid may reach the size where neither line does
+        where = np.flatnonzero(highest.max(axis=0) >= _NEAR)
         if not where.size:
             continue
-        first, each = np.argmax(reached, axis=0), np.arange(count)
+        each = np.arange(count)
+        first = np.where(on_line, np.argmax(reached, axis=0), np.argmax(highest, axis=0))
         below = np.where(first > 0, steps[first - 1, each], 0.0)
-        those = few.take(np.isin(few.modes.mode, where))
-        change = those.halved(below, steps[first, each], sign)
+        those, change = few.take(np.isin(few.modes.mode, where)), steps[first, each]
+        change = np.where(on_line, those.halved(below, change, sign), change)
         # the peak's top between the lines of the grid
         share, tops = few.share(sign * change), []
         for i in where:
@@ -438,6 +444,7 @@ def size_reached(
         mode = np.repeat(where, _WITHIN_PEAK)
         at_tops = fine.swept_modes(np.arange(mode.size), mode)
         top = SizeBound.of(fine.S, at_tops, size)
+        where = where[(on_line | (top.highest(sign * change, count) >= 1.0))[where]]
         change = top.halved(0.5 * change, change, sign)
         found[where, side] = sign * change[where]
     found[np.bincount(modes.mode[high[modes.at]], minlength=count) > 0] = 0.0
