@@ -494,6 +494,8 @@ def _draw_limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> Non
 def _draw_levels(ax: Axes) -> None:
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color=GREY, linestyle=style, linewidth=0.8, zorder=1.0)
-    ax.annotate("6 dB", (1.0, 6.0), (-3.0, 2.0), xycoords=ax.get_yaxis_transform(),
-                textcoords="offset points", ha="right", fontsize="x-small", color=GREY)  # fmt: skip
+    # below the line: above it, the label would cross the frame where the axes end at the line
+    ax.annotate("6 dB", (1.0, 6.0), (-3.0, -2.0), xycoords=ax.get_yaxis_transform(),
+                textcoords="offset points", ha="right", va="top", fontsize="x-small", color=GREY,
+                annotation_clip=True)  # fmt: skip
     readable(ax)
