@@ -116,7 +116,7 @@ def driven_axes(
     first: tuple[str, ...] = ()
     for channels in sets:
         sigma = _sigmas(plant, channels, freq, named)
-        gains = {s: _felt(plant, s, channels) for s in np.unique(sigma)}
+        gains = {s: _felt(plant, s, channels, plant.u) for s in np.unique(sigma)}
         if all(apart(G) for G in gains.values()):
             inverse = {s: np.linalg.pinv(G) for s, G in gains.items()}
             late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
@@ -193,10 +193,12 @@ def resting_frequency(plant: Partition) -> float:
     return _RESTING * usual_frequency(plant)
 
 
-def _felt(plant: Partition, sigma: float, channels: Sequence[str]) -> FloatArray:
+def _felt(
+    plant: Partition, sigma: float, channels: Sequence[str], actuators: Sequence[str]
+) -> FloatArray:
     """Return the gain (r, m) of channels to actuators on the real axis, rounding set to zero."""
     g = plant.system
-    rows, columns = g.output_index(list(channels)), g.input_index(list(plant.u))
+    rows, columns = g.output_index(list(channels)), g.input_index(list(actuators))
     states = _states(g, complex(sigma), columns).real
     G = g.C[rows] @ states + g.D[np.ix_(rows, columns)]
     most = np.abs(g.C[rows]) @ np.abs(states)
@@ -207,12 +209,37 @@ def apart(G: FloatArray) -> bool:
     """Return whether the rows of a gain (r, m) are independent, whatever the channels' units."""
     if not G.size or G.shape[0] > G.shape[1]:
         return False
-    scaled = np.array(G)
-    for _ in range(_SWEEPS):  # rows last: an actuator may move nothing, an axis may not stay
-        scaled = scaled / divisor(np.linalg.norm(scaled, axis=0, keepdims=True))
-        scaled = scaled / divisor(np.linalg.norm(scaled, axis=1, keepdims=True))
-    sizes = np.linalg.svd(scaled, compute_uv=False)
+    sizes = np.linalg.svd(_balanced(G)[0], compute_uv=False)
     return bool(np.all(np.any(G, axis=1)) and sizes[-1] > _APART * sizes[0])
+
+
+def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a gain (r, m) with rows and columns of one length, and the columns' factors (m,)."""
+    scaled, columns = np.array(G), np.ones(G.shape[1])
+    for _ in range(_SWEEPS):  # rows last: an actuator may move nothing, an axis may not stay
+        each = divisor(np.linalg.norm(scaled, axis=0))
+        scaled, columns = scaled / each, columns / each
+        scaled = scaled / divisor(np.linalg.norm(scaled, axis=1, keepdims=True))
+    return scaled, columns
+
+
+def opposing_part(plant: Partition, actuators: Sequence[str], forces: FloatArray) -> FloatArray:
+    """Return the part of forces (m, runs) that moves none of the POIs' axes at rest.
+
+    Actuators that move none of them even alone do not push against others: they have no part.
+    """
+    channels = _channels(plant.assembled.ports.z)
+    G = _felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, actuators)
+    moves = np.any(G, axis=0)
+    found = np.zeros_like(forces)
+    if not channels or not np.any(moves):
+        return found
+    scaled, columns = _balanced(G[:, moves])
+    size, directions = np.linalg.svd(scaled)[1:]
+    idle = directions[int(np.sum(size > _APART * size[0])) :]
+    given = forces[moves] / columns[:, None]
+    found[moves] = columns[:, None] * (idle.T @ (idle @ given))
+    return found
 
 
 def real_gain(

@@ -33,6 +33,7 @@ from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory, unscheduled
 from .nonlinear_elements import Acting, Acts, split_elements
+from .opposing_forces import warn_of_opposing_forces
 from .response import Response
 from .runs import Conditions, make_runner
 
@@ -111,7 +112,9 @@ def simulate(
     Returns
     -------
     Response
-        All z, y, driven u and monitored outputs of blocks.
+        All z, y, driven u and monitored outputs of blocks. A warning names actuators that end a
+        run with a reference or a disturbance by steadily pushing against each other: forces that
+        move none of the POIs' axes.
 
     Raises
     ------
@@ -206,7 +209,10 @@ def simulate(
                         )
                     bar.advance()
     drawn = seed_of(seed) if white.factor.size or white.columns.size else None
-    return Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
+    run = Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
+    if not positions and not grows and np.any(given):
+        warn_of_opposing_forces(loop, run)
+    return run
 
 
 def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
