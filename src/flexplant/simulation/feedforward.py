@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,8 @@ from ..plant.at_rest import OfS, at_rest, solved
 from ..plant.axes import resting_frequency
 from ..tolerances import divisor
 from .motion import SetPoint
+from .move_ranges import warn_beyond_ranges
+from .nonlinear_elements import Acts, split_elements
 from .response import Response
 from .simulate import simulate
 
@@ -127,6 +130,7 @@ def design_feedforward(
     order: int = 4,
     move: SetPoint | None = None,
     along: npt.ArrayLike | None = None,
+    elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
 ) -> Feedforward:
     """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
 
@@ -158,6 +162,9 @@ def design_feedforward(
         The move in which a loop is to have the least errors.
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
+    elements : mapping {name: element, or a list of some}, optional
+        Of actuators and sensors, as for `simulate`: a `Saturation` that the move exceeds is warned
+        of, with what the move needs. The gains do not depend on it.
 
     Returns
     -------
@@ -172,7 +179,7 @@ def design_feedforward(
         When the actuators cannot move the POI's axes apart from each other.
     ModelError
         When the plant was not assembled from a structure or is weighted, or the order is not 2 to
-        4; when a move is given without a loop, or with places.
+        4; when a move is given without a loop, or with places, or elements without a move.
 
     References
     ----------
@@ -199,11 +206,18 @@ def design_feedforward(
             f"{', '.join(driven)}. Leave other POIs out of the ports, or add actuators."
         )
     empty = Feedforward(name, driven, T, tuple(plant.u), np.zeros((1, len(driven), 5)), plant.dt)
+    if elements is not None and move is None:
+        raise ModelError("elements are compared with a move: pass design_feedforward(loop, "
+                         "move=move, elements=...).")  # fmt: skip
     if move is not None:
         if loop is None or along is not None:
             raise ModelError("a move needs a ClosedLoop, without along=: pass design_feedforward"
                              "(loop, move=move).")  # fmt: skip
-        return _of_move(empty, loop, move, highest)
+        split_elements(elements, plant, plant.u)  # refuses unknown channels
+        found = _of_move(empty, loop, move, highest)
+        time = np.arange(np.ceil(move.duration / plant.dt) + 1.0) * plant.dt
+        warn_beyond_ranges(plant, {name: move}, elements or {}, time)
+        return found
     blocks = () if loop is None else loop.blocks
     forced = close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
     find = _inverse_of(forced, poi, T, driven, wanted, name, along)

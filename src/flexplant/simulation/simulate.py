@@ -31,6 +31,7 @@ from ..plant import StandardPlant, standard_plant
 from ..plant.partitioned import require_sampled
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
+from .move_ranges import warn_beyond_ranges
 from .moving_machine import MovingMachine, trajectory, unscheduled
 from .nonlinear_elements import Acting, Acts, split_elements
 from .opposing_forces import warn_of_opposing_forces
@@ -84,6 +85,8 @@ def simulate(
         `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
         `Dropout`, any `Element` of one's own. `Jitter` moves the instants, unknown to blocks. On a
         disturbance, `Friction` (or an `Element` with `reads`) is a force that answers a motion.
+        A `Saturation` that the SetPoints of the references exceed (force of an actuator, range of
+        a sensor or of the reference itself) is warned of beforehand, with what they need.
     anti_windup : float [s], optional
         Time constant in which integrators (all poles slower than it) of blocks that drive
         actuators return to what is applied while that is not what they command.
@@ -169,7 +172,10 @@ def simulate(
         _paths(plant, None if positions else moving, time),
     )
     numbers = _run_numbers(runs)
-    given = _known_inputs(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
+    signals = _named(plant, reference)
+    given = _known_inputs(plant, signals, disturbance, time, 0 if runs is None else len(numbers))
+    if not positions:
+        warn_beyond_ranges(plant, signals, elements or {}, time)
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
     white = white_noise(silent)
     state = _start(loop, start)
@@ -294,9 +300,21 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
     return True
 
 
+def _named(
+    plant: StandardPlant, reference: Signal | Mapping[str, Signal] | None
+) -> Mapping[str, Signal]:
+    """Return signals of references by name, where one alone is for the plant's only reference."""
+    if reference is None:
+        return {}
+    if isinstance(reference, Mapping):
+        return reference
+    name = only_one("reference", references(plant), None, "reference={name: signal}")
+    return {name: reference}
+
+
 def _known_inputs(
     plant: StandardPlant,
-    reference: Signal | Mapping[str, Signal] | None,
+    reference: Mapping[str, Signal],
     disturbance: Mapping[str, Signal] | None,
     time: FloatArray,
     runs: int,
@@ -304,10 +322,6 @@ def _known_inputs(
     """Return the known part of w (runs, n_time, nw); (1, n_time, nw) where runs share it."""
     both = [name for name in plant.w if name in plant.y]
     own, others = references(plant), [name for name in plant.w if name not in both]
-    if reference is None:
-        reference = {}
-    elif not isinstance(reference, Mapping):
-        reference = {only_one("reference", own, None, "reference={name: signal}"): reference}
     if disturbance is not None and not isinstance(disturbance, Mapping):
         raise ModelError(
             f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "

@@ -1,0 +1,94 @@
+"""What a move needs of actuators and sensors, compared with their ranges before it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..checks import ComplexArray, FloatArray, several
+from ..errors import AssumptionError, warn
+from ..plant import StandardPlant, driven_axes
+from ..plant.at_rest import at_rest, followed_at_rest, solved
+from ..plant.axes import complex_gain, resting_frequency
+from .motion import SetPoint
+from .nonlinear_elements import Saturation
+
+#: derivatives of a move whose forces are counted: position (springs), velocity, acceleration
+_TERMS = 3
+#: excess, as a fraction of a range, that is not mentioned: no range is known better
+_MET = 1e-3
+
+
+def warn_beyond_ranges(
+    plant: StandardPlant, signals: Mapping[str, Any], elements: Mapping[str, Any], time: FloatArray
+) -> None:
+    """Warn of the `Saturation` that moves of references exceed, with what they need.
+
+    Forces and readings are those of the plant near rest that follows the moves exactly, without
+    the forces that answer disturbances. References without a
+    SetPoint count as at rest.
+    """
+    limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
+    moves = {name: move for name, move in signals.items() if isinstance(move, SetPoint)}
+    if not limits or not moves or not plant.is_assembled:
+        return
+    for name, needed in _needed(plant, moves, list(limits), time).items():
+        limit = limits[name]
+        least = -limit.limit if limit.least is None else limit.least
+        low, high = float(needed.min(initial=0.0)), float(needed.max(initial=0.0))
+        if low >= least * (1.0 + _MET) and high <= limit.limit * (1.0 + _MET):
+            continue
+        unit = plant.units.get(name, "")
+        advice = (
+            "Lower the acceleration of the move (its stroke, where springs are pushed), or choose "
+            "a stronger actuator"
+            if name in plant.u
+            else "Shorten the move, or choose a longer range"
+        )
+        warn(
+            f"the move of {', '.join(moves)} needs {low:.4g} to {high:.4g} {unit} of {name!r}, "
+            f"whose range is {least:.4g} to {limit.limit:.4g} {unit}. {advice}."
+        )
+
+
+def _limit(given: Any) -> Saturation | None:
+    """Return the Saturation among the elements of a channel."""
+    listed = given if several(given) else [given]
+    return next((one for one in listed if isinstance(one, Saturation)), None)
+
+
+def _needed(
+    plant: StandardPlant, moves: Mapping[str, SetPoint], names: list[str], time: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what actuators apply and sensors read over time, by name, while moves are followed."""
+    found = {name: moves[name].at(time).position for name in names if name in moves}
+    try:
+        driven = driven_axes(plant, freq=resting_frequency(plant))
+    except AssumptionError:  # the plant has no inverse, which is for the design to say
+        return found
+    followed = {
+        p.derived(axis, "ref"): p.channel(axis) for p, axis in plant.assembled.ports.followed
+    }
+    if any(followed.get(name) not in driven.channels for name in moves):
+        return found
+    signals = np.zeros((len(driven.channels), _TERMS, time.size))
+    for name, move in moves.items():
+        signals[driven.channels.index(followed[name])] += np.array(move.at(time))[:_TERMS]
+    g, T, axes, dt = plant.system, driven.T, driven.channels, plant.dt
+    forced = [name for name in names if name in plant.u]
+    if forced:
+
+        def inverse(s: complex) -> ComplexArray:
+            G = complex_gain(g, s, axes, plant.u) @ T
+            return np.asarray(T @ solved(G, np.eye(len(axes), dtype=np.complex128), axes))
+
+        gains = at_rest(inverse, dt, axes, _TERMS)
+        forces = np.einsum("uam,amt->ut", gains, signals)
+        found |= {name: forces[plant.u.index(name)] for name in forced}
+    seen = [name for name in names if name in plant.y and name not in moves]
+    if seen:
+        places = followed_at_rest(g, T, plant.u, axes, seen, dt)
+        found |= dict(zip(seen, places @ signals[:, 0], strict=True))
+    return found
