@@ -11,7 +11,13 @@ import pytest
 from test_aftercare import designed, pi_controller, plant
 
 import flexplant as fx
-from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError
+from flexplant.errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+)
 from flexplant.lti import StateSpace
 from flexplant.simulation import Saturation
 from flexplant.synthesis import anti_windup_form, write_c
@@ -172,7 +178,8 @@ def test_an_observer_a_servo_and_feedforward_in_one_file_with_limits(tmp_path):
     free = fx.simulate(loop, reference=move, duration=0.3, noise=False)
     assert np.abs(free["u1"]).max() > 1.3 * most
     options = {"elements": {"u1": Saturation(most)}, "anti_windup": 0.02}
-    run = fx.simulate(loop, reference=move, duration=0.3, noise=False, **options)
+    with pytest.warns(FlexplantWarning, match="needs -15 to 15 N of 'u1'"):  # 3 kg at 5 m/s^2
+        run = fx.simulate(loop, reference=move, duration=0.3, noise=False, **options)
     at = move.at(run.time)
     refs = {"die:ref": at.position, "die:ref:acceleration": at.acceleration}
     for limits, wanted in ((None, free), (most, run), ({"u1": (-most, most)}, run)):
