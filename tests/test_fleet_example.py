@@ -60,7 +60,7 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
 
 @pytest.mark.long
 def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
-    """Identify, localise among three places, update, design, verify on the larger model."""
+    """Identify, localise among three places, update, design, verify on the evaluation model."""
     machine = fx.testbeds.wafer_stage(
         damping=fleet.DAMPING, rate=fleet.RATE, delay=fleet.DELAY, added_mass=0.6
     )
@@ -80,7 +80,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
         [q.name for q in report.fit.unknowns].index(f"mass at {labels[0]}")
     ]
     assert low < 0.6 < high < low + 2.0
-    # the larger model has what decides on the machine, whose loop the chain never sees
+    # the evaluation model has what decides on the machine, whose loop the chain never sees
     own = machine.loop(fleet.PORTS, *report.blocks)
     assert report.row["stable"] and own.is_stable
     assert report.row["modulus margin"] == pytest.approx(own.modulus_margin, rel=0.05)
@@ -90,7 +90,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     text = (tmp_path / "report.txt").read_text()
     headings = [line for line in text.splitlines() if line and not line.startswith(" ")]
     assert headings[:6] == ["Measured", "Localised", "Updated", "Observer", "Controller",
-                            "Loop on the larger model"]  # fmt: skip
+                            "Loop on the evaluation model"]  # fmt: skip
     assert "plant 168 states" in text and "specification: " in text
     poles = report.measured  # numbered by now: measuring again is not needed
     assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
