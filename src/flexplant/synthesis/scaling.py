@@ -76,7 +76,7 @@ def answers(
         states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
     except np.linalg.LinAlgError:  # a pole at s
         states = np.asarray(B, dtype=np.complex128)
-    terms = np.linalg.norm(C) * np.linalg.norm(states, axis=0) + np.linalg.norm(D, axis=0)
+    terms = np.linalg.norm(np.abs(C) @ np.abs(states) + np.abs(D), axis=0)
     return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), hidden * terms))
 
 
