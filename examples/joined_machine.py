@@ -22,7 +22,7 @@ import flexplant as fx
 ALUMINIUM = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
 BEARING = {"stiffness": 5e7, "rate": 300.0}  # N/m, N s/m
 ISOLATOR = {"stiffness": 2e5, "rate": 400.0}
-PLACED = {"stage": fx.Pose(shift=(0.2, 0.1, 0.08))}  # on top of the frame
+PLACED = {"stage": fx.joining.Pose(shift=(0.2, 0.1, 0.08))}  # on top of the frame
 AXES = ("x", "y", "z")
 
 
@@ -41,17 +41,17 @@ def nodes(model: fx.FEModel, points: list[tuple[float, float, float]]) -> list[s
 
 
 # %% How they are joined
-def joints(models: dict[str, fx.FEModel]) -> tuple[list[fx.Joint], dict[str, list[str]]]:
+def joints(models: dict[str, fx.FEModel]) -> tuple[list[fx.joining.Joint], dict[str, list[str]]]:
     """Return the joints, and the nodes of each part that they hold."""
     corners = [(x, y) for y in (0.0, 0.3) for x in (0.0, 0.3)]
     feet = nodes(models["stage"], [(x, y, 0.0) for x, y in corners])
     pads = nodes(models["frame"], [(x + 0.2, y + 0.1, 0.08) for x, y in corners])
     floor = nodes(models["frame"], [(x, y, 0.0) for y in (0.0, 0.5) for x in (0.1, 0.7)])
     bearings = [
-        fx.Joint(f"stage/{foot}", f"frame/{pad}", axes=("y", "z"), **BEARING)
+        fx.joining.Joint(f"stage/{foot}", f"frame/{pad}", axes=("y", "z"), **BEARING)
         for foot, pad in zip(feet, pads, strict=True)
     ]
-    isolators = [fx.Joint(f"frame/{node}", axes=AXES, **ISOLATOR) for node in floor]
+    isolators = [fx.joining.Joint(f"frame/{node}", axes=AXES, **ISOLATOR) for node in floor]
     return [*bearings, *isolators], {"stage": feet, "frame": [*pads, *floor]}
 
 
@@ -61,7 +61,7 @@ def reduced(models: dict[str, fx.FEModel], held: dict[str, list[str]]) -> dict[s
     found = {}
     for name, count in (("stage", 24), ("frame", 24)):
         boundary = [f"{node}:{axis}" for node in held[name] for axis in AXES]
-        found[name] = fx.reduce(models[name], fx.CraigBampton(boundary, count))
+        found[name] = fx.reduce(models[name], fx.reduction.CraigBampton(boundary, count))
     return found
 
 
@@ -108,7 +108,7 @@ def main() -> dict[str, Any]:
     free = fx.joined(models, bearings, placed=PLACED)
     every = [f"{name}/{label}" for name in models for label in labels[name]]
     whole = measured(free, every, freq)
-    rest = fx.uncoupled(whole, {"frame": frfs["frame"]}, bearings)
+    rest = fx.joining.uncoupled(whole, {"frame": frfs["frame"]}, bearings)
     return {
         "machine": machine,
         "small": small,

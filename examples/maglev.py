@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import flexplant as fx
-from flexplant.lti import highpass
+from flexplant.lti import high_pass_filter
 from flexplant.plant import BaseAcceleration, GroundSpring, gravity_axes, suspend
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
@@ -74,14 +74,16 @@ def modes(count: int) -> fx.Modes:
 
 def ports() -> fx.Ports:
     """Return the channels: the floor, eight actuators, the POI, seven sensors."""
-    spectrum = fx.lowpass(60.0) * highpass(1.0, order=2)
+    spectrum = fx.lti.low_pass_filter(60.0) * high_pass_filter(1.0, order=2)
     return fx.Ports(
         w=[
             BaseAcceleration(f"floor:{axis}", axis, asd=FLOOR, shape=spectrum)
             for axis in ("x", "y", "z")
         ],
         u=[
-            fx.Actuator(name, at, direction=along, dynamics=fx.lowpass(4e3), asd=AMPLIFIER)
+            fx.Actuator(
+                name, at, direction=along, dynamics=fx.lti.low_pass_filter(4e3), asd=AMPLIFIER
+            )
             for name, (at, along) in ACTUATORS.items()
         ],
         z=[fx.Poi("die", at=PATH[0], axes=AXES)],

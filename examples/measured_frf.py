@@ -61,7 +61,7 @@ damping = fx.MatrixParameter("damping", dD=drawing.D)
 # %% The measurement: six runs, whose spread is the variance
 def measured(machine: Any) -> fx.Frf:
     """Return the mean FRFs of some noisy runs."""
-    return fx.average_frfs(
+    return fx.identification.average_frfs(
         machine.measure_frf(PORTS, period=0.5, periods=1, discard=2, amplitude=5.0, rng=seed)
         for seed in range(RUNS)
     )
@@ -84,10 +84,12 @@ def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
 def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Localisation]:
     """Return where the mass may be: by the poles, then by FRFs at the places left."""
     everywhere = {"nuisance": [stiffness, damping], "most": 1}
-    by_poles = fx.localise(drawing, [*masses.values()], [eigenvalues], screen=8, **everywhere)
+    by_poles = fx.updating.localise(
+        drawing, [*masses.values()], [eigenvalues], screen=8, **everywhere
+    )
     low = np.flatnonzero((frf.freq > BAND[0]) & (frf.freq < 700.0))[::4]
     left = [masses[place] for place in by_poles.alike]
-    return by_poles, fx.localise(drawing, left, [response(frf, low, FITTED)], **everywhere)
+    return by_poles, fx.updating.localise(drawing, left, [response(frf, low, FITTED)], **everywhere)
 
 
 # %% What the model says about responses that were not used

@@ -26,7 +26,9 @@ SENSOR = 1e-12  # m/sqrt(Hz)
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 #: m: the scan starts in the middle, exposes this length and leaves room to stop
-SCAN = fx.scan(0.2, velocity=0.3, acceleration=10.0, jerk=2000.0, settle=0.01, rest=0.05, rate=RATE)
+SCAN = fx.simulation.scan(
+    0.2, velocity=0.3, acceleration=10.0, jerk=2000.0, settle=0.01, rest=0.05, rate=RATE
+)
 DURATION = 0.8  # s
 
 # %% The machine, and the model: twelve modes of a mesh that has not its formulation

@@ -19,15 +19,15 @@ import numpy as np
 
 import flexplant as fx
 from flexplant.placement import (
-    AfterLoss,
     BranchAndBound,
-    ByRows,
     ClosedLoopH2,
+    DeviceLoss,
     Exchange,
     Excluded,
     MinimumDistance,
     ModeInformation,
     OverMachines,
+    RowSelection,
     Screened,
     device_worth,
     pareto_curve,
@@ -41,9 +41,9 @@ SENSORS = [fx.Sensor(f"s{i}", at=place, asd=ENCODER) for i, place in enumerate(G
 PLACES = [(x, y, 0.0) for x in np.linspace(0.1, L - 0.1, 3) for y in np.linspace(0.1, L - 0.1, 3)]
 ACTUATORS = [fx.Actuator(f"a{i}", at=place) for i, place in enumerate(PLACES)]
 #: nobody can measure on the die, nor near its edge
-DIE = fx.Disc((L / 2, L / 2), radius=0.05)
+DIE = fx.structure.Disc((L / 2, L / 2), radius=0.05)
 #: nor here, where a cable is
-CABLE = fx.Rectangle((-0.01, 0.15), (0.25, 0.45))
+CABLE = fx.structure.Rectangle((-0.01, 0.15), (0.25, 0.45))
 #: z at the die, and its rotations at the edge of a field, 13 mm away
 AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 
@@ -61,10 +61,13 @@ def on_machine(case: dict[str, Any], plant: fx.StandardPlant) -> tuple[float, fl
     judged = plant.replace(evaluation=full)
     design, static = {"estimate": fx.design_kalman(judged)}, fx.design_static(judged)
     servo = fx.design_servo(plant, bandwidth=10.0, observer=static)
-    blocks = static, servo, *fx.reading_along(design)
+    blocks = static, servo, *fx.simulation.reading_along(design)
     run = case["machine"].run(plant.assembled.ports, *blocks, duration=3.0, rng=1, runs=2)
     both = [
-        weight * np.array(fx.compare_estimators(design, run, f"die:{axis}", start=1.0)["estimate"])
+        weight
+        * np.array(
+            fx.simulation.compare_estimators(design, run, f"die:{axis}", start=1.0)["estimate"]
+        )
         for axis, weight in AXES.items()
     ]
     predicted, measured, *_ = np.linalg.norm(both, axis=0)
@@ -86,7 +89,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
         )
 
     spread = fx.place_sensors(
-        plant, SENSORS, 25, ModeInformation(), constraints=[off], method=ByRows()
+        plant, SENSORS, 25, ModeInformation(), constraints=[off], method=RowSelection()
     )
     return {
         "the die's error": best(goal),
@@ -94,7 +97,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
         "0.25 m apart": best(goal, constraints=[MinimumDistance(0.25)]),
         "none at the cable": best(goal, constraints=[Excluded(CABLE)]),
         "worst machine of three": best(OverMachines(goal, machines)),
-        "one may fail": best(AfterLoss(goal), method=Screened(goal, starts=1)),
+        "one may fail": best(DeviceLoss(goal), method=Screened(goal, starts=1)),
         "25 for the shapes": spread,
     }
 
@@ -105,7 +108,7 @@ def both(plant: fx.StandardPlant) -> dict[str, Any]:
     cost = ClosedLoopH2("die", AXES, effort=1e-9)
     few = [sensor for sensor in SENSORS[::3] if not DIE.holds(np.array([sensor.at[:2]]))[0]]
     search = Exchange(starts=1)
-    pair = fx.place_both(plant, few, ACTUATORS, (4, 4), cost, method=search, rng=0)
+    pair = fx.placement.place_both(plant, few, ACTUATORS, (4, 4), cost, method=search, rng=0)
     goal = fx.PoiVariance("die", AXES, own_modes=True)
     curve = pareto_curve(
         plant, few, range(3, 7), goal, constraints=[Excluded(DIE)], method=search, rng=0
@@ -127,7 +130,7 @@ def main() -> dict[str, Any]:
     corners = plant.assembled.ports.y[:3]
     three = plant.with_ports(plant.assembled.ports.replace(y=corners))
     goal = fx.PoiVariance("die", AXES, own_modes=True)
-    found = fx.sensor_map(three, grid, goal, asd=ENCODER, constraints=[Excluded(DIE)])
+    found = fx.placement.sensor_map(three, grid, goal, asd=ENCODER, constraints=[Excluded(DIE)])
     return result | both(plant) | {"map": found, "three": three}
 
 

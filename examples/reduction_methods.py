@@ -56,23 +56,25 @@ def methods() -> dict[str, tuple[Any, fx.ReducedModel, float]]:
     free = ORDER - len(PORTS)
     ways: dict[str, Any] = {
         "DesiredDofs": paper,
-        "Serep": fx.Serep(chosen, damping=DAMPING),
-        "Guyan": fx.Guyan(chosen, damping=DAMPING),
-        "Irs": fx.Irs(chosen, damping=DAMPING),
-        "Irs, 50 iterations": fx.Irs(chosen, iterations=50, damping=DAMPING),
-        "ModalTruncation": fx.ModalTruncation(
+        "Serep": fx.reduction.Serep(chosen, damping=DAMPING),
+        "Guyan": fx.reduction.Guyan(chosen, damping=DAMPING),
+        "Irs": fx.reduction.Irs(chosen, damping=DAMPING),
+        "Irs, 50 iterations": fx.reduction.Irs(chosen, iterations=50, damping=DAMPING),
+        "ModalTruncation": fx.reduction.ModalTruncation(
             ORDER, inputs=ACTUATORS, outputs=SENSORS, damping=DAMPING
         ),
-        "ModalTruncation, static": fx.ModalTruncation(
+        "ModalTruncation, static": fx.reduction.ModalTruncation(
             free, static_at=PORTS, inputs=ACTUATORS, outputs=SENSORS, damping=DAMPING
         ),
         "ModalBalanced": fx.ModalBalanced(
             ORDER, ACTUATORS, outputs=SENSORS, among=80, damping=DAMPING
         ),
-        "CraigBampton": fx.CraigBampton(PORTS, free, damping=DAMPING),
-        "Rubin": fx.Rubin(PORTS, free, damping=DAMPING),
-        "MacNeal": fx.MacNeal(PORTS, free, damping=DAMPING),
-        "Krylov": fx.Krylov([*ACTUATORS[:3], *SENSORS], [0.0, 500.0, 1100.0], damping=DAMPING),
+        "CraigBampton": fx.reduction.CraigBampton(PORTS, free, damping=DAMPING),
+        "Rubin": fx.reduction.Rubin(PORTS, free, damping=DAMPING),
+        "MacNeal": fx.reduction.MacNeal(PORTS, free, damping=DAMPING),
+        "Krylov": fx.reduction.Krylov(
+            [*ACTUATORS[:3], *SENSORS], [0.0, 500.0, 1100.0], damping=DAMPING
+        ),
     }
     done = {}
     for name, way in ways.items():
@@ -86,7 +88,7 @@ def methods() -> dict[str, tuple[Any, fx.ReducedModel, float]]:
 def ranking() -> Any:
     """Return the modal Hankel values from actuators to sensors."""
     modes = fx.solve_modes(plate, count=80, damping=DAMPING)
-    return fx.rank_modes(modes, inputs=ACTUATORS, outputs=SENSORS)
+    return fx.reduction.rank_modes(modes, inputs=ACTUATORS, outputs=SENSORS)
 
 
 # %% The run

@@ -124,7 +124,7 @@ def imported() -> fx.FEModel:
 
 def ports() -> fx.Ports:
     """Return six disturbances, six actuators, the POI with six axes, six sensors."""
-    amplifier = fx.lowpass(4e3)
+    amplifier = fx.lti.low_pass_filter(4e3)
     return fx.Ports(
         w=[fx.Disturbance(f"w{n}", p, direction=d, asd=FORCE) for n, (p, d) in PUSHERS.items()],
         u=[

@@ -127,10 +127,10 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
         "measured, all modes": fx.design_kalman(fit),
     }
     servo = fx.design_servo(alone, bandwidth=10.0, observer=static)
-    blocks = static, servo, *fx.reading_along(designs)
+    blocks = static, servo, *fx.simulation.reading_along(designs)
     run = case["machine"].run(ports(force), *blocks, duration=3.0, rng=seed, runs=5)
     axes = ("die:z", "die:rx", "die:ry")
-    return {axis: fx.compare_estimators(designs, run, axis, start=1.0) for axis in axes}
+    return {axis: fx.simulation.compare_estimators(designs, run, axis, start=1.0) for axis in axes}
 
 
 # %% Control: H-infinity of a sure model and of an unsure one, and the best servo that holds
@@ -179,7 +179,9 @@ def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     """Return the predicted error of the die over places of a sensor beside those at the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
     plant, goal = plant_of(case, "measured"), fx.PoiVariance("die")
-    return fx.sensor_map(plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)])
+    return fx.placement.sensor_map(
+        plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)]
+    )
 
 
 # %% What it shows: each claim is printed with its figures, and stops the example when untrue

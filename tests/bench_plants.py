@@ -19,7 +19,7 @@ def light(mode=MODE, damping=1e-3, residue=0.1, rate=RATE):
     body = fx.lti.tf([1.0], [1.0, 0.0, 0.0])
     swing = fx.lti.tf([residue], [1.0, 2.0 * damping * w, w * w])
     plant = fx.lti.parallel(body, swing).replace(inputs=["u1"], outputs=["y1"])
-    return fx.discretized(plant, rate, delay=1)
+    return fx.lti.discretized(plant, rate, delay=1)
 
 
 def lines(count=2000, last=500.0):

@@ -26,7 +26,9 @@ def masses():
 @cache
 def problem():
     """Continuous: a first-order plant with weights on S and K S."""
-    return fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    return fx.plant.mixed_sensitivity(
+        fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lti.low_pass_filter(0.1), KS=0.1
+    )
 
 
 @cache
@@ -80,7 +82,7 @@ def chains():
     return {name: fx.chain(masses=[1.0, 2.0], stiffnesses=[5e5]) for name in ("stage", "frame")}
 
 
-JOINT = fx.Joint("stage/1:x", "frame/1:x")
+JOINT = fx.joining.Joint("stage/1:x", "frame/1:x")
 
 
 def larger(by, place=None):

@@ -163,8 +163,13 @@ def hooks():
         *(fx.PoiVariance(), fx.placement.PoiLqr(), fx.placement.ClosedLoopH2()),
         *(fx.synthesis.H2(), fx.synthesis.Hinf(), fx.synthesis.FixedOrder(2), fx.Riccati()),
         *(fx.simulation.Quantiser(1.0), fx.Eigenvalues(fx.MeasuredModes([-1 + 9j], modes=[1]))),
-        *(fx.Spring("1:x", 1.0), fx.Rayleigh(1.0, 1e-6), fx.Sensor("y", at="1:x"), fx.Notch(9.0)),
-        *(fx.Actuator("u", at="1:x"), fx.BaseAcceleration("b"), fx.ModalTruncation(3)),
+        *(
+            fx.Spring("1:x", 1.0),
+            fx.structure.Rayleigh(1.0, 1e-6),
+            fx.Sensor("y", at="1:x"),
+            fx.Notch(9.0),
+        ),
+        *(fx.Actuator("u", at="1:x"), fx.BaseAcceleration("b"), fx.reduction.ModalTruncation(3)),
     ]
     for value in values:
         for name in dir(type(value)):

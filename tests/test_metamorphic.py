@@ -256,7 +256,7 @@ def test_two_parts_that_are_joined_are_the_whole(seed):
         "a": fx.FEModel(M1, K1, dofs=whole.dofs),
         "b": fx.FEModel(one.M - M1, one.K - K1, dofs=whole.dofs),
     }
-    joints = [fx.Joint(f"a/{label}", f"b/{label}") for label in whole.dofs.labels]
+    joints = [fx.joining.Joint(f"a/{label}", f"b/{label}") for label in whole.dofs.labels]
     found = fx.solve_modes(fx.joined(parts, joints))
     assert found.n_rigid == 6
     np.testing.assert_allclose(found.omega, fx.solve_modes(whole).omega, rtol=1e-9, atol=1e-6)

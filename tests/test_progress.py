@@ -42,7 +42,8 @@ weights = fx.stage_weights(small, 50.0)
 weighted = small.through(fx.reference_errors(small)).weighted(z=weights.z, w=weights.w)
 plate = fx.kirchhoff_plate(size=(0.4, 0.3), thickness=0.01, elements=(4, 3), density=2700,
                            youngs_modulus=70e9, poisson_ratio=0.33)
-four, z1 = fx.Guyan(["1:z", "5:z", "16:z", "20:z"]), {"inputs": ["1:z"], "outputs": ["1:z"]}
+four = fx.reduction.Guyan(["1:z", "5:z", "16:z", "20:z"])
+z1 = {"inputs": ["1:z"], "outputs": ["1:z"]}
 noise = rng.standard_normal((4, 16000))
 WORK = {
     "modes, steps of Lanczos": lambda: fx.solve_modes(block, count=30),
@@ -131,14 +132,17 @@ servo = fx.design_servo(sampled, bandwidth=30.0, observer=observer)
 loop = fx.close_loop(sampled, observer, servo)
 fit = fx.update(rom, unknowns, [fx.Eigenvalues(poles)])
 seen = list(sampled.assembled.ports.y)
-mixed = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+slow = fx.lti.low_pass_filter(0.1)
+mixed = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=slow, KS=0.1)
 MORE = {
     "machines": study,
     "samples": lambda: fx.simulate(loop, duration=2.0, rng=1, runs=3),
     "sets of sensors": lambda: fx.place_sensors(sampled, seen, len(seen) - 1),
-    "steps of walkers": lambda: fx.sample_posterior(rom, unknowns, [fx.Eigenvalues(poles)], fit),
+    "steps of walkers": lambda: fx.updating.sample_posterior(
+        rom, unknowns, [fx.Eigenvalues(poles)], fit
+    ),
     "tuning": lambda: fx.tune_loops(
-        fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)),
+        fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)),
     "structured": lambda: fx.synthesis.design_structured(mixed, fx.synthesis.FixedOrder(1)),
     "tolerance": lambda: fx.close_loop(sampled, observer, servo).mode_tolerances(),
 }

@@ -103,7 +103,7 @@ def test_its_scripts_pass_strict_type_checks(tmp_path):
     pytest.importorskip("mypy")
     script, options = tmp_path / "readme.py", tmp_path / "options.toml"
     script.write_text(
-        "\n".join([*BLOCKS, LISTS, "wrong: str = fx.lowpass(60.0)"]), encoding="utf-8"
+        "\n".join([*BLOCKS, LISTS, "wrong: str = fx.lti.low_pass_filter(60.0)"]), encoding="utf-8"
     )
     rules = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     declared = '[[tool.mypy.overrides]]\nmodule = ["flexplant.*"]\nignore_errors = true\n'

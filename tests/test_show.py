@@ -40,7 +40,7 @@ def test_certificates_in_words():
 
 def test_a_controller_shows_its_lower_bound_beside_gamma():
     g = fx.StateSpace([[-1.0]], [[1.0]], [[1.0]], 0)
-    plant = fx.plant.mixed_sensitivity(g, S=fx.lowpass(1.0) * 2.0, KS=0.1)
+    plant = fx.plant.mixed_sensitivity(g, S=fx.lti.low_pass_filter(1.0) * 2.0, KS=0.1)
     found = fx.design_hinf(plant)
     assert f"gamma {found.gamma:.4g} (lower bound {found.lower:.4g})" in repr(found)
     assert 0 < found.lower <= found.gamma

@@ -65,7 +65,7 @@ def shapes(**options):
 
 def located(**options):
     pool = options.pop("candidates", [fx.AddedMass(f"{i}:z") for i in (1, 2, 3)])
-    return fx.localise(chain(), pool, options.pop("residuals", data()), **options)
+    return fx.updating.localise(chain(), pool, options.pop("residuals", data()), **options)
 
 
 def region(**options):
@@ -171,15 +171,15 @@ CALLS = [
         lambda x: fx.updating.StaticCompliance(1.0, "1:z", x),
         ("text", "dict"),
     ),
-    ("localise model", lambda x: fx.localise(x, MASS, data()), ()),
+    ("localise model", lambda x: fx.updating.localise(x, MASS, data()), ()),
     ("localise residuals", lambda x: located(residuals=x), ()),
     ("localise candidates", lambda x: located(candidates=x), ()),
     ("localise nuisance", lambda x: located(nuisance=x), ()),
     ("localise most", lambda x: located(most=x), ()),
     ("localise screen", lambda x: located(screen=x), ()),
-    ("identifiability", lambda x: fx.identifiability(x, MASS, data()), ()),
-    ("identifiability parameters", lambda x: fx.identifiability(chain(), x, data()), ()),
-    ("identifiability residuals", lambda x: fx.identifiability(chain(), MASS, x), ()),
+    ("identifiability", lambda x: fx.updating.identifiability(x, MASS, data()), ()),
+    ("identifiability parameters", lambda x: fx.updating.identifiability(chain(), x, data()), ()),
+    ("identifiability residuals", lambda x: fx.updating.identifiability(chain(), MASS, x), ()),
     ("sensitivities", lambda x: eigenvalue_sensitivities(x, MASS), ()),
     ("sensitivities modes", lambda x: eigenvalue_sensitivities(chain(), MASS, modes=x), ("none",)),
     ("correlate", lambda x: fx.updating.correlate(x, data()), ()),

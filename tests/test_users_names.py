@@ -124,13 +124,13 @@ USES = {
     "noise levels": lambda c: est.estimate_noise(c.plant, c.run),
     "static": lambda c: fx.design_static(c.plant),
     "sensor scores": lambda c: fx.score_sensors(c.plant, [[c.y1], [c.y2]]),
-    "actuator scores": lambda c: fx.score_actuators(c.plant, [[c.u1], [c.u2]]),
+    "actuator scores": lambda c: fx.placement.score_actuators(c.plant, [[c.u1], [c.u2]]),
     "sensors": lambda c: fx.place_sensors(c.plant, c.sensors, 1),
     "actuators by H2": lambda c: fx.place_actuators(
         c.plant, c.actuators, 1, pl.ClosedLoopH2(c.die)
     ),
     "actuators by LQR": lambda c: fx.place_actuators(c.plant, c.actuators, 1, pl.PoiLqr(c.die)),
-    "sensor map": lambda c: fx.sensor_map(
+    "sensor map": lambda c: fx.placement.sensor_map(
         c.plant, [(0, 0, 0), (2, 0, 0)], asd=1e-10, direction="x"
     ),
     "feedback": lambda c: fx.lti.feedback(c.g, np.eye(2)),

@@ -132,6 +132,25 @@ lower bound too, by a perturbation that reaches it.
 | ``weighted``, ``through`` give a StandardPlant | a `plant.GeneralizedPlant` |
 | ``plant.is_weighted`` | ``isinstance(plant, GeneralizedPlant)`` |
 | ``plant.unweighted`` of any plant | of a GeneralizedPlant; ``plant.machine`` of any |
+| ``plant.uncertain(fit, modes=, deviations=)`` | ``plant.uncertain(Fit(fit, modes=))`` |
+| ``plant.uncertain(gain=, delay=)`` | ``plant.uncertain(Gains(...), Delay(...))`` |
+| ``plant.uncertain(shapes=, neglected=)`` | ``plant.uncertain(Shapes(...), Neglected())`` |
+| ``decouple``: mass, centre of gravity | `plant.gravity_axes`; `decouple` gives driven axes |
+| ``lti.solve_care``, ``lti.solve_dare`` | `lti.filter_care`, `lti.filter_dare` |
+| ``lowpass``, ``lti.highpass`` | `lti.low_pass_filter`, `lti.high_pass_filter` |
+| ``lti.notch``, ``lti.leadlag`` | `lti.notch_filter`, `lti.lead_lag_filter` |
+| ``discretized``, ``localise``, ``Guyan``, ... | in their rooms: ``fx.reduction.Guyan`` |
+| ``estimation.Consistency`` | `estimation.ConsistencyReport` |
+| ``estimation.Invertibility`` | `estimation.InvertibilityReport` |
+| ``updating.Identifiability`` | `updating.IdentifiabilityReport` |
+| ``lti.Split``, ``workbench.Workbench`` | `lti.StableSplit`, `workbench.WorkbenchServer` |
+| ``simulation.SetPoint`` | `simulation.SetPointProfile` |
+| ``simulation.FiltersAlong``, ``RmsAlong`` | `simulation.PathFilters`, `simulation.PathRms` |
+| ``placement.Among``, ``Together`` | `placement.CountLimits`, `placement.JointGroups` |
+| ``placement.Within``, ``AfterLoss`` | `placement.ZoneLimits`, `placement.DeviceLoss` |
+| ``placement.ByRows``, ``Found`` | `placement.RowSelection`, `placement.SearchResult` |
+| ``plant.Along`` | `plant.PortPath` |
+| ``plant.Seen``, ``plant.Moves`` | `plant.MeasuredRow`, `plant.PlaceMotion` |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy

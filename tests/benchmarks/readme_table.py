@@ -126,7 +126,7 @@ def hold():
     g = machine(0, 24, m=8, p=8)
     parts = g.A, g.B, g.C, g.D
     ours, peer, *times = race(
-        lambda: fx.discretized(g, RATE).A, lambda: cont2discrete(parts, 1 / RATE)[0], 5
+        lambda: fx.lti.discretized(g, RATE).A, lambda: cont2discrete(parts, 1 / RATE)[0], 5
     )
     near(ours, peer, 1e-9)
     return "zero-order hold, 48 states", "scipy cont2discrete", *times
@@ -223,7 +223,7 @@ def saturated():
 
 def designed_small():
     plant = fx.plant.mixed_sensitivity(
-        fx.lti.tf([1.0], [1.0, 0.02, 1.0]), S=fx.lowpass(0.02), KS=0.1
+        fx.lti.tf([1.0], [1.0, 0.02, 1.0]), S=fx.lti.low_pass_filter(0.02), KS=0.1
     )
     g = plant.system
     twin, sizes = control.ss(g.A, g.B, g.C, g.D), (len(plant.y), len(plant.u))

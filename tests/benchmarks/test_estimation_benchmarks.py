@@ -35,7 +35,7 @@ def test_a_record_through_the_stationary_filter():
     records = dict(zip((*kalman.sensors, *kalman.plant.u), np.hstack([y, u]).T, strict=True))
     at_rest = np.zeros(g.n_states)
     ours, seconds = best(lambda: kalman.estimate(records, start=at_rest), 30)
-    _, smooth = best(lambda: kalman.estimate(records, fx.Smoother(), start=at_rest), 2)
+    _, smooth = best(lambda: kalman.estimate(records, fx.estimation.Smoother(), start=at_rest), 2)
     rows = [("estimate", seconds), ("estimate, Smoother()", smooth)]
     both = np.hstack([y, u])
 

@@ -28,7 +28,7 @@ def race():
     )
     freq = np.geomspace(30.0, 1500.0, LINES)
     begin = time.process_time()
-    found = fx.frequency_response(plate, ports, freq, damping=fx.Hysteretic(ETA))
+    found = fx.frequency_response(plate, ports, freq, damping=fx.structure.Hysteretic(ETA))
     ours = time.process_time() - begin
     out = np.array([plate.row(place) for place in at])
     some = np.linspace(0, LINES - 1, SOLVED).astype(int)

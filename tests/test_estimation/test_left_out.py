@@ -9,7 +9,7 @@ from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, Mode
 from flexplant.estimation import design_kalman, design_static
 from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.modes import solve_modes
 from flexplant.plant import Disturbance, Sensor, assemble_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
@@ -94,7 +94,7 @@ def test_covariances_are_those_of_the_closed_form():
 def test_a_filter_far_above_all_modes_changes_no_covariance():
     modes = solve_modes(chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3), damping=ModalDamping(0.01))
     found = []
-    for shape in (None, lowpass(1e6)):
+    for shape in (None, low_pass_filter(1e6)):
         w = [Disturbance("amp", at="1:x", asd=1.0, shape=shape)]
         channels = three_masses().assembled.ports.replace(w=w)
         plant = assemble_plant(modes.select([0, 1, 2]), channels).discretized(2e3, delay=1)
@@ -233,13 +233,13 @@ def shaped(kind):
     """Channels with filters, delays and a velocity sensor."""
     base = ports(die=(0.1, 0.2, 0.0))
     if kind == "disturbance":
-        return base.replace(w=[d.replace(shape=lowpass(800.0)) for d in base.w])
+        return base.replace(w=[d.replace(shape=low_pass_filter(800.0)) for d in base.w])
     if kind == "filter":
-        return base.replace(y=[s.replace(dynamics=lowpass(2500.0)) for s in base.y])
+        return base.replace(y=[s.replace(dynamics=low_pass_filter(2500.0)) for s in base.y])
     if kind == "delay":
         return base.replace(y=[s.replace(latency=3.3e-5) for s in base.y])
     if kind == "actuator":
-        return base.replace(u=[a.replace(dynamics=lowpass(900.0)) for a in base.u])
+        return base.replace(u=[a.replace(dynamics=low_pass_filter(900.0)) for a in base.u])
     speed = Sensor("v", at=(0.3, 0.3, 0.0), quantity="velocity", asd=1e-7)
     return base.replace(y=[*base.y, speed])
 

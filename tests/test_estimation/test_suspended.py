@@ -8,7 +8,7 @@ import pytest
 from flexplant.errors import AssumptionError, FlexplantWarning
 from flexplant.estimation import design_kalman
 from flexplant.estimation.error import error_variances
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,
@@ -145,7 +145,7 @@ def test_a_block_on_springs(kind, freq, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reading", [{}, {"dynamics": lowpass(3e3)}, {"latency": 3e-5}])
+@pytest.mark.parametrize("reading", [{}, {"dynamics": low_pass_filter(3e3)}, {"latency": 3e-5}])
 def test_dampers_filters_and_delays(reading):
     """Complex modes; states of the sensors, which follow the suspension too."""
     springs = [GroundSpring(p, 4650.0, 0.03) for p in EDGES]

@@ -108,9 +108,9 @@ def made():
         {"mass": 0.5}, poles, fit, static, (static.system, servo), None, loop, response
     )
     yield fx.study([1.0, 2.0], lambda machine: {"twice": 2 * machine, "name": "m"})
-    along = fx.close_loop(sampled, static, servo, *fx.reading_along({"static": static}))
+    along = fx.close_loop(sampled, static, servo, *fx.simulation.reading_along({"static": static}))
     runs = fx.simulate(along, duration=0.01, rng=1, runs=2)
-    yield fx.compare_estimators({"static": static}, runs, "die:z")
+    yield fx.simulation.compare_estimators({"static": static}, runs, "die:z")
     yield fx.estimation.errors_on_machines({"static": static}, [sampled], "die")
     candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]
     small = fx.assemble_plant(some_modes(count=8, attached=False), ports()).discretized(RATE)
@@ -123,7 +123,14 @@ def made():
     yield fx.sparse.Cholmod()
     law = fx.ModalDamping(0.01)
     yield fx.frequency_response(fe, ports(), [50.0, 80.0], damping=law, checks=1)
-    yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
+    yield from (
+        fx.structure.Rayleigh(1.0, 1e-6),
+        fx.AddedStiffness(at),
+        *unknowns,
+        residual,
+        poles,
+        fit,
+    )
     yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
     yield from of_updates(rom, unknowns, residual, fit)
     yield from of_reductions(fe, modes, rom)
@@ -156,21 +163,25 @@ def made():
         placement.BranchAndBound(gap=0.1),
     )
     disc = structure.Disc((0.1, 0.1), 0.05)
-    yield from (placement.Excluded(disc), placement.Within(disc, at_most=1), placement.OffPoi(0.1))
+    yield from (
+        placement.Excluded(disc),
+        placement.ZoneLimits(disc, at_most=1),
+        placement.OffPoi(0.1),
+    )
     yield from (placement.ModalObservability("trace"), placement.ModalControllability())
-    loss = placement.AfterLoss(fx.PoiVariance("die", lag=fx.FixedLag(3), measure="max"))
+    loss = placement.DeviceLoss(fx.PoiVariance("die", lag=fx.estimation.FixedLag(3), measure="max"))
     yield from (loss, placement.Penalised(loss, placement.LeftOutModes(), 0.5))
     yield from (placement.SensorIndices("hinf"), placement.ActuatorIndices("hankel"))
     yield from (placement.ModeInformation(), placement.AutoMac(), placement.KineticEnergy(fe))
     yield from (placement.ClosedLoopH2("die"), placement.HinfLevel({"die:z": 1e6}))
-    yield placement.ByRows(fx.reduction.PivotedQr())
-    yield from (placement.OverMachines(loss, [small]), placement.Among(["a", "b"], at_most=1))
+    yield placement.RowSelection(fx.reduction.PivotedQr())
+    yield from (placement.OverMachines(loss, [small]), placement.CountLimits(["a", "b"], at_most=1))
     yield placement.OverPositions(loss, 3, measure="mean")
     curve = placement.pareto_curve(small, candidates, [4, 5])
     yield from (placement.PlantChannel("y1", "y"), curve, placement.Screened(loss, keep=3))
     yield placement.device_worth(small, sensors)
     yield from (placement.MinimumDistance(0.1), placement.Mirrored("x", 0.3))
-    yield from (placement.Together([("a", "b")]), placement.Budget(3.0, {"a": 2.0}))
+    yield from (placement.JointGroups([("a", "b")]), placement.Budget(3.0, {"a": 2.0}))
     yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
@@ -201,10 +212,10 @@ def of_positions(modes):
     servo = fx.design_servo(plant, bandwidth=20.0, notches=[])
     loops = [fx.close_loop(plant.at(x=v), fx.design_static(plant.at(x=v)), servo) for v in (0, 0.1)]
     yield fx.loop.ScheduledLoop("x", [0.0, 0.1], loops)
-    yield fx.simulation.RmsAlong([0.0], [[1e-9]], ["die:error"], {"die:error": "m"})
+    yield fx.simulation.PathRms([0.0], [[1e-9]], ["die:error"], {"die:error": "m"})
     yield fx.simulation.SpeedCertificate("x", 0.8, [0.0, 0.1], np.ones((2, 1, 1)), [(0.8, None)])
     one = np.ones((1, 1))
-    yield fx.simulation.FiltersAlong([0.0], ["die:z"], one, one, one, {"die:z": "m"})
+    yield fx.simulation.PathFilters([0.0], ["die:z"], one, one, one, {"die:z": "m"})
 
 
 def of_estimators(plant, small):
@@ -233,16 +244,25 @@ def of_estimators(plant, small):
 def of_reductions(fe, modes, rom):
     """One of each way to reduce, and what is said of the answer."""
     at = rom.dofs.labels[:6:2]
-    truncation = fx.ModalTruncation(count=8, inputs=at)
+    truncation = fx.reduction.ModalTruncation(count=8, inputs=at)
     yield from (truncation, fx.reduce(modes, truncation), fx.ModalBalanced(8, at))
-    yield from (fx.Guyan(at), fx.Irs(at, iterations=2), fx.Serep(at), fx.Krylov(at, [0.0, 500.0]))
-    yield from (fx.CraigBampton(at, 3), fx.Rubin(at, 5), fx.MacNeal(at, 5))
+    yield from (
+        fx.reduction.Guyan(at),
+        fx.reduction.Irs(at, iterations=2),
+        fx.reduction.Serep(at),
+        fx.reduction.Krylov(at, [0.0, 500.0]),
+    )
+    yield from (
+        fx.reduction.CraigBampton(at, 3),
+        fx.reduction.Rubin(at, 5),
+        fx.reduction.MacNeal(at, 5),
+    )
     yield from (
         fx.reduction.PivotedQr(),
         fx.reduction.EffectiveIndependence(),
         fx.reduction.Greedy(),
     )
-    yield fx.rank_modes(modes, inputs=at)
+    yield fx.reduction.rank_modes(modes, inputs=at)
     cycle = fx.synthesis.LimitCycle("y1", freq=33.0, amplitude=2e-9)
     gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=["y1"], outputs=["u1"])
     margins = {"modulus margin": 0.5, "modulus margin before": 0.52}
@@ -266,18 +286,20 @@ def of_structures():
     bar = fx.beam(length=1.0, elements=2, area=1e-4, inertia=1e-9, **steel)
     yield bar.fixed(["1:z"]).dofs.interpolation
     yield from (fx.PointMass((0.1, 0, 0), 0.5, inertia=0.1), fx.Damper("1:z", 2.0))
-    yield from (fx.Spring("1:z", 2.0, to="2:z"), fx.Hysteretic(0.02))
-    law = fx.Hysteretic(0.02, regions={"foot": (0.3, fx.Spring("1:z", 2.0)), "K": (0.1, np.eye(2))})
+    yield from (fx.Spring("1:z", 2.0, to="2:z"), fx.structure.Hysteretic(0.02))
+    law = fx.structure.Hysteretic(
+        0.02, regions={"foot": (0.3, fx.Spring("1:z", 2.0)), "K": (0.1, np.eye(2))}
+    )
     yield from (law, *law.regions.values())
-    yield from (fx.Rectangle((0, 0), (1, 1)), fx.Disc((0, 0), 1.0))
-    yield fx.Rib((0, 0), (1, 0), width=0.01, height=0.02)
+    yield from (fx.structure.Rectangle((0, 0), (1, 1)), fx.structure.Disc((0, 0), 1.0))
+    yield fx.structure.Rib((0, 0), (1, 0), width=0.01, height=0.02)
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
     corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))
     yield corner.dofs.interpolation
-    ends = fx.Patch("up", [1, 2]), fx.Joint("up/1:z", "bar/1:z")
-    machine = fx.joined({"up": bar, "bar": bar}, ends[1], placed={"up": fx.Pose((0, 0, 1))})
-    yield from (*ends, machine, fx.Pose((0, 0, 1)))
-    foreign = fx.FEMatrices(np.eye(2), np.diag([1.0, 0.0]), digits=9, constrained=["3:x"])
+    ends = fx.joining.Patch("up", [1, 2]), fx.joining.Joint("up/1:z", "bar/1:z")
+    machine = fx.joined({"up": bar, "bar": bar}, ends[1], placed={"up": fx.joining.Pose((0, 0, 1))})
+    yield from (*ends, machine, fx.joining.Pose((0, 0, 1)))
+    foreign = fx.structure.FEMatrices(np.eye(2), np.diag([1.0, 0.0]), digits=9, constrained=["3:x"])
     yield from (foreign, fx.check(foreign))
 
 
@@ -308,14 +330,16 @@ def of_updates(rom, unknowns, residual, fit):
     blow, answer = np.zeros(90), np.arange(90.0) % 7
     blow[[10, 50]] = 1.0
     yield fx.identification.impact_frf(blow, answer, 100.0, segment=0.3)
-    yield fx.identifiability(rom, unknowns, [residual])
-    yield fx.localise(rom, [fx.AddedMass(label) for label in rom.dofs.labels[:4]], [residual])
+    yield fx.updating.identifiability(rom, unknowns, [residual])
+    yield fx.updating.localise(
+        rom, [fx.AddedMass(label) for label in rom.dofs.labels[:4]], [residual]
+    )
     yield fx.updating.correlate(fit.model, [residual])
     yield from (fx.updating.Discrepancy("damping", 0.3, 6.0), fit.uncertainty())
     bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]
     yield fx.update(rom, bounded, [residual], method=fx.updating.TrustRegion(), starts=2)
-    yield fx.sample_posterior(rom, unknowns, [residual], fit, steps=20)
-    yield fx.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
+    yield fx.updating.sample_posterior(rom, unknowns, [residual], fit, steps=20)
+    yield fx.updating.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
     yield from (
         fx.identification.H1Estimator(),
         fx.identification.H2Estimator(),

@@ -198,7 +198,7 @@ def test_matlab_finds_the_usual_names(tmp_path, version):
     scipy.io.savemat(path, {"Kaa": sp.csc_matrix(K), "M0": M, "c": 0.1 * M}, format=version)
     found = fx.io.read_matlab(path, dofs=named())
     same(found, K, M)
-    same(fx.FEMatrices(found.D), 0.1 * M)
+    same(fx.structure.FEMatrices(found.D), 0.1 * M)
     assert found.digits is None
     same(fx.read_matrices(path), K, M)
 
@@ -420,7 +420,7 @@ def test_a_new_format_is_one_value(tmp_path, monkeypatch):
 
     def read_rows(path, *, mass=None, mesh=None):
         K = np.loadtxt(path, comments="!", ndmin=2)
-        return fx.FEMatrices(K, None if mass is None else np.diag(np.loadtxt(mass)))
+        return fx.structure.FEMatrices(K, None if mass is None else np.diag(np.loadtxt(mass)))
 
     rows = Format((".rows",), read_rows, lambda head: head.startswith(b"!Rows"), (".grid",), "mesh")
     monkeypatch.setattr(models, "FORMATS", (*models.FORMATS, rows))

@@ -141,7 +141,7 @@ def test_masses_that_none_has_are_refused(tmp_path, mode, mass):
         read_modes(path, zeta=0.01, rigid_below=0.1)
     with pytest.raises(ModelError, match="matrices need M"):
         path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES))
-        read_modes(path, zeta=0.0, rigid_below=0.1, matrices=fx.FEMatrices(np.eye(12)))
+        read_modes(path, zeta=0.0, rigid_below=0.1, matrices=fx.structure.FEMatrices(np.eye(12)))
 
 
 def test_what_op2_files_lack_is_said(tmp_path):

@@ -12,16 +12,16 @@ PLATE = {"thickness": 0.02, "density": 2702, "youngs_modulus": 70e9, "poisson_ra
 FREQ = np.array([60.0, 133.0, 290.0, 500.0])
 SIZES = {"stage": ((0.4, 0.3), (3, 2)), "frame": ((0.6, 0.5), (4, 3))}
 JOINTS = (
-    fx.Joint("stage/1:z", "frame/1:z"),
-    fx.Joint("stage/4:z", "frame/7:z", stiffness=2e5, rate=40.0),
-    fx.Joint("frame/20:z", stiffness=1e5, rate=10.0),
+    fx.joining.Joint("stage/1:z", "frame/1:z"),
+    fx.joining.Joint("stage/4:z", "frame/7:z", stiffness=2e5, rate=40.0),
+    fx.joining.Joint("frame/20:z", stiffness=1e5, rate=10.0),
 )
 #: measured on each: at its joints and at one more place
 CHANNELS = {"stage": ["1:z", "4:z", "9:z"], "frame": ["1:z", "7:z", "20:z", "12:z"]}
 
 
 def models():
-    law = fx.Rayleigh(0.0, 1e-6)
+    law = fx.structure.Rayleigh(0.0, 1e-6)
     found = {}
     for name, (size, elements) in SIZES.items():
         found[name] = fx.kirchhoff_plate(size=size, elements=elements, **PLATE).with_damping(law)
@@ -78,16 +78,16 @@ def test_coupled_responses_are_those_of_the_machine(quantity):
 @pytest.mark.slow
 def test_a_component_is_taken_out_again():
     whole, frame, stage = machine(), measured("frame"), measured("stage")
-    rest = fx.uncoupled(whole, {"frame": frame}, JOINTS[:2])
+    rest = fx.joining.uncoupled(whole, {"frame": frame}, JOINTS[:2])
     assert rest.outputs == tuple(f"stage/{label}" for label in CHANNELS["stage"])
     # the frame's spring to the ground was not taken out with it
     held = fx.joined({"frame": frame}, JOINTS[2])
     held = held.replace(inputs=frame.inputs, outputs=frame.outputs)
-    rest = fx.uncoupled(whole, {"frame": held}, JOINTS[:2])
+    rest = fx.joining.uncoupled(whole, {"frame": held}, JOINTS[:2])
     np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
     # a rigid joint may be measured on its other side
     kept = [name for name in whole.outputs if name != "frame/1:z"]
-    rest = fx.uncoupled(whole.select(kept, kept), {"frame": held}, JOINTS[:2])
+    rest = fx.joining.uncoupled(whole.select(kept, kept), {"frame": held}, JOINTS[:2])
     np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
 
 
@@ -125,10 +125,10 @@ def test_variances_of_responses_give_that_of_the_machine(part):
     np.testing.assert_allclose(found.variance, wanted, rtol=1e-4)
     held = fx.joined({"frame": parts["frame"]}, JOINTS[2])
     known = {"frame": held.replace(inputs=parts["frame"].inputs, outputs=parts["frame"].outputs)}
-    found = fx.uncoupled(stated(whole, factor[""]), known, JOINTS[:2])
-    left = fx.uncoupled(whole, known, JOINTS[:2])
+    found = fx.joining.uncoupled(stated(whole, factor[""]), known, JOINTS[:2])
+    left = fx.joining.uncoupled(whole, known, JOINTS[:2])
     wanted = sum(
-        np.abs(fx.uncoupled(frf, known, JOINTS[:2]).data - left.data) ** 2
+        np.abs(fx.joining.uncoupled(frf, known, JOINTS[:2]).data - left.data) ** 2
         for frf in perturbed(whole, factor[""])
     )
     np.testing.assert_allclose(found.variance, wanted, rtol=1e-3)
@@ -139,20 +139,20 @@ def test_an_extended_interface_uses_all_channels_of_what_is_known():
     """Inner channels of the frame say what goes through its joints, also without pairs."""
     parts = {name: measured(name) for name in CHANNELS}
     whole = fx.joined(parts, JOINTS[:2])
-    rest = fx.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
-    plain = fx.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2])
+    rest = fx.joining.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
+    plain = fx.joining.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2])
     np.testing.assert_allclose(rest.data, parts["stage"].data, rtol=1e-5)
     np.testing.assert_allclose(plain.data, parts["stage"].data, rtol=1e-5)
     uneven = whole.select(outputs=[name for name in whole.outputs if name != "frame/12:z"])
-    rest = fx.uncoupled(uneven, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
+    rest = fx.joining.uncoupled(uneven, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
     np.testing.assert_allclose(rest.data, parts["stage"].data, rtol=1e-5)
     # the variance is that of the errors, to first order, of least squares too
     factor = np.eye(len(whole.outputs))
     known = {"frame": parts["frame"]}
-    found = fx.uncoupled(stated(whole, factor), known, JOINTS[:2], extended=True)
-    left = fx.uncoupled(whole, known, JOINTS[:2], extended=True)
+    found = fx.joining.uncoupled(stated(whole, factor), known, JOINTS[:2], extended=True)
+    left = fx.joining.uncoupled(whole, known, JOINTS[:2], extended=True)
     wanted = sum(
-        np.abs(fx.uncoupled(frf, known, JOINTS[:2], extended=True).data - left.data) ** 2
+        np.abs(fx.joining.uncoupled(frf, known, JOINTS[:2], extended=True).data - left.data) ** 2
         for frf in perturbed(whole, factor)
     )
     np.testing.assert_allclose(found.variance, wanted, rtol=1e-2)
@@ -162,19 +162,22 @@ def test_a_difference_below_its_errors_is_warned_of():
     """A stage of 1 kg on a frame of 1000: its response is lost in 1 % of the others'."""
     free = lambda m: -1 / (m * (2 * np.pi * FREQ) ** 2)[None, None]  # noqa: E731
     machine = fx.Frf(FREQ, free(1001.0), ["stage/1:x"], ["stage/1:x"])
-    frame, joint = fx.Frf(FREQ, free(1000.0), ["1:x"], ["1:x"]), fx.Joint("stage/1:x", "frame/1:x")
+    frame, joint = (
+        fx.Frf(FREQ, free(1000.0), ["1:x"], ["1:x"]),
+        fx.joining.Joint("stage/1:x", "frame/1:x"),
+    )
     with pytest.warns(
         FlexplantWarning, match="of 1 % in each response exceed the answer at 4 of 4"
     ):
-        found = fx.uncoupled(machine, {"frame": frame}, joint)
+        found = fx.joining.uncoupled(machine, {"frame": frame}, joint)
     assert found.variance is None
     for part in (0.01, 1e-6):
         known = frame.replace(variance=(part * frame.mag) ** 2)
         if part == 0.01:
             with pytest.warns(FlexplantWarning, match="by their variances exceed the answer"):
-                found = fx.uncoupled(machine, {"frame": known}, joint)
+                found = fx.joining.uncoupled(machine, {"frame": known}, joint)
         else:
-            found = fx.uncoupled(machine, {"frame": known}, joint)
+            found = fx.joining.uncoupled(machine, {"frame": known}, joint)
         # 1 / G = 1 / G_machine - 1 / G_frame
         wanted = np.abs(found.data / frame.data) ** 4 * known.variance
         np.testing.assert_allclose(found.variance, wanted, rtol=1e-6)
@@ -222,13 +225,15 @@ def test_patches_and_lever_arms_of_responses(pushed):
     points = np.array([0.2, 0.2, 0.05]), np.array([0.4, 0.3, 0.05])
     nodes = {name: sorted({*sensed[name], *forced[name]}) for name in parts}
     joints = [
-        fx.Joint(*(fx.Patch(name, nodes[name]) for name in parts), point=points[0]),
-        fx.Joint("stage/12", "frame/20", axes=["z"], stiffness=3e5, rate=8.0, point=points[1]),
+        fx.joining.Joint(*(fx.joining.Patch(name, nodes[name]) for name in parts), point=points[0]),
+        fx.joining.Joint(
+            "stage/12", "frame/20", axes=["z"], stiffness=3e5, rate=8.0, point=points[1]
+        ),
     ]
     with pytest.warns(FlexplantWarning, match=r"<Patch of frame, \d nodes> bends: \d\d %"):
         found = fx.joined(frfs, joints, dofs=dofs)
     if pushed == sensed["frame"]:  # models joined say the same
-        machine = fx.joined(parts, joints, placed={"stage": fx.Pose((0.05, 0.08, 0.1))})
+        machine = fx.joined(parts, joints, placed={"stage": fx.joining.Pose((0.05, 0.08, 0.1))})
         direct = response_of(machine, found.outputs, ["stage/1:z", "frame/20:rx"])
         some = found.select(inputs=["stage/u 1:z", "frame/u 20:rx"])
         np.testing.assert_allclose(some.data, direct.data, rtol=1e-6)
@@ -247,8 +252,8 @@ def test_patches_and_lever_arms_of_responses(pushed):
             found.data[:, :, k], wanted, rtol=1e-6, atol=1e-12 * abs(Y).max()
         )
     # the stage comes back when the frame is taken out, its channels named as in the machine
-    rest = fx.uncoupled(found, {"frame": frfs["frame"]}, joints[:1], dofs=dofs)
-    alone = fx.uncoupled(
+    rest = fx.joining.uncoupled(found, {"frame": frfs["frame"]}, joints[:1], dofs=dofs)
+    alone = fx.joining.uncoupled(
         fx.joined(frfs, joints[:1], dofs=dofs), {"frame": frfs["frame"]}, joints[:1], dofs=dofs
     )
     assert rest.inputs == tuple(f"stage/{name}" for name in frfs["stage"].inputs)
@@ -259,16 +264,16 @@ def test_patches_and_lever_arms_of_responses(pushed):
 def test_what_responses_cannot_say_is_refused():
     frfs = {name: measured(name) for name in CHANNELS}
     with pytest.raises(LabelError, match="named alike"):
-        fx.joined(frfs, fx.Joint("stage/2:z", "frame/1:z"))
+        fx.joined(frfs, fx.joining.Joint("stage/2:z", "frame/1:z"))
     with pytest.raises(LabelError, match="no component 'base'"):
-        fx.joined(frfs, fx.Joint("base/2:z", "frame/1:z"))
+        fx.joined(frfs, fx.joining.Joint("base/2:z", "frame/1:z"))
     with pytest.raises(ModelError, match="between points, whose motion no channel is"):
-        fx.joined(frfs, fx.Joint(("stage", (0, 0, 0)), "frame/1:z"))
-    patch = fx.Joint(fx.Patch("stage", [1, 4, 9]), "frame/1:z", axes=["z"])
+        fx.joined(frfs, fx.joining.Joint(("stage", (0, 0, 0)), "frame/1:z"))
+    patch = fx.joining.Joint(fx.joining.Patch("stage", [1, 4, 9]), "frame/1:z", axes=["z"])
     with pytest.raises(LabelError, match=r"has nodes \[2\] that are not measured"):
         fx.joined(
             frfs,
-            fx.Joint(fx.Patch("stage", [1, 2, 9]), "frame/1:z", axes=["z"]),
+            fx.joining.Joint(fx.joining.Patch("stage", [1, 2, 9]), "frame/1:z", axes=["z"]),
             dofs={"stage": models()["stage"].dofs},
         )
     with pytest.raises(ModelError, match=r"needs the places of the channels of 'stage'.*dofs="):
@@ -280,13 +285,13 @@ def test_what_responses_cannot_say_is_refused():
     with pytest.raises(ModelError, match="models have their DOFs"):
         fx.joined(models(), JOINTS, dofs={"stage": models()["stage"].dofs})
     with pytest.raises(ModelError, match="are one channel"):
-        fx.joined(frfs, fx.Joint("stage/1:z", "stage/1:z"))
+        fx.joined(frfs, fx.joining.Joint("stage/1:z", "stage/1:z"))
     with pytest.raises(LabelError, match="has no axis 'x': it moves along z"):
-        fx.joined(frfs, fx.Joint("stage/1:z", "frame/1:z", axes=["x"]))
+        fx.joined(frfs, fx.joining.Joint("stage/1:z", "frame/1:z", axes=["x"]))
     with pytest.raises(ModelError, match="no place and no name"):
         fx.joined(frfs, JOINTS, name="machine")
     with pytest.raises(ModelError, match="responses by component"):
-        fx.uncoupled(machine(), frfs["frame"], JOINTS)
+        fx.joining.uncoupled(machine(), frfs["frame"], JOINTS)
     with pytest.raises(ModelError, match="frequencies of 'frame' are not those"):
         fx.joined(frfs | {"frame": frfs["frame"].replace(freq=FREQ + 1)}, JOINTS)
     with pytest.raises(ModelError, match="Convert them"):
@@ -296,9 +301,9 @@ def test_what_responses_cannot_say_is_refused():
     with pytest.raises(ModelError, match="an Frf each"):
         fx.joined(frfs | {"frame": models()["frame"]}, JOINTS)
     with pytest.raises(LabelError, match="no joint holds"):
-        fx.uncoupled(machine(), {"frame": frfs["frame"]}, ())
+        fx.joining.uncoupled(machine(), {"frame": frfs["frame"]}, ())
     double = frfs["stage"].replace(data=np.ones_like(frfs["stage"].data))
-    both = [fx.Joint(f"stage/{n}:z", f"frame/{n}:z") for n in (1, 4)]
+    both = [fx.joining.Joint(f"stage/{n}:z", f"frame/{n}:z") for n in (1, 4)]
     with pytest.raises(ModelError, match="the interface has the condition"):
         fx.joined({"stage": double, "frame": double}, both)
     nearly = double.replace(data=double.data + 1e-10 * np.eye(3)[:, :, None])

@@ -17,7 +17,7 @@ from flexplant.joining.component import components_of
 PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
 SOLID = {"density": 2700, "youngs_modulus": 70e9, "poisson_ratio": 0.3}
 KINDS = ("z", "rx", "ry")
-RIGHT = {"right": fx.Pose(shift=(0.3, 0, 0))}
+RIGHT = {"right": fx.joining.Pose(shift=(0.3, 0, 0))}
 
 
 def plate(nx, lx=0.6, ny=4):
@@ -31,7 +31,7 @@ def edge(model, x):
 
 def seam(half, names=("left", "right")):
     pairs = zip(edge(half, 0.3), edge(half, 0.0), strict=True)
-    return [fx.Joint(f"{names[0]}/{i}", f"{names[1]}/{j}") for i, j in pairs]
+    return [fx.joining.Joint(f"{names[0]}/{i}", f"{names[1]}/{j}") for i, j in pairs]
 
 
 def halves():
@@ -48,7 +48,7 @@ def stage_on_frame():
     stage = fx.solid_block(size=(0.3, 0.2, 0.05), elements=(3, 2, 1), **SOLID)
     frame = fx.solid_block(size=(0.6, 0.4, 0.1), elements=(4, 2, 1), **SOLID)
     models = {"stage": stage, "frame": frame}
-    return models, {"stage": fx.Pose(shift=(0.1, 0.1, 0.1))}
+    return models, {"stage": fx.joining.Pose(shift=(0.1, 0.1, 0.1))}
 
 
 #: three feet below the stage
@@ -56,7 +56,7 @@ FEET = [(0.2, 0.2, 0.1), (0.4, 0.2, 0.1), (0.3, 0.3, 0.1)]
 
 
 def at_feet(axes, **kind):
-    return [fx.Joint(("stage", p), ("frame", p), axes=axes, **kind) for p in FEET]
+    return [fx.joining.Joint(("stage", p), ("frame", p), axes=axes, **kind) for p in FEET]
 
 
 def test_two_halves_are_one_plate():
@@ -110,7 +110,7 @@ def test_a_machine_goes_through_a_file_and_is_held(tmp_path):
     assert machine.joining.n_rigid == 3
     for changed in (held, machine.with_parts(fx.PointMass("left/1:z", 1.0))):
         assert changed.joining is None  # held, it has no rigid-body motion; heavier, another mass
-    assert machine.with_damping(fx.Rayleigh(0.0, 1e-6)).joining is machine.joining
+    assert machine.with_damping(fx.structure.Rayleigh(0.0, 1e-6)).joining is machine.joining
     # held before they are joined: the same, with the inertia of the held DOFs
     left = plate(2, 0.3).fixed([f"{i}:{a}" for i in edge(plate(2, 0.3), 0.0) for a in KINDS])
     models = {"left": left, "right": plate(2, 0.3)}
@@ -118,7 +118,7 @@ def test_a_machine_goes_through_a_file_and_is_held(tmp_path):
     np.testing.assert_allclose(elastic(first, 8), elastic(same, 8), rtol=1e-10)
     np.testing.assert_allclose(first.held_inertia, held.held_inertia, atol=1e-15)
     boundary = [f"{i}:{axis}" for i in edge(models["right"], 0.3) for axis in KINDS]
-    rom = fx.reduce(left, fx.CraigBampton(boundary, 8))
+    rom = fx.reduce(left, fx.reduction.CraigBampton(boundary, 8))
     mixed = fx.joined({"left": rom, "right": models["right"]}, seam(models["right"]), placed=RIGHT)
     assert mixed.joining.n_rigid == 0
     np.testing.assert_allclose(mixed.modes().freq[:4], elastic(same, 4), rtol=1e-3)
@@ -130,34 +130,39 @@ def test_a_turned_component():
     """A quarter turn about z exchanges rx and ry, about y it makes a plate stand upright."""
     whole, half = plate(4), plate(2, 0.3)
     lying = fx.kirchhoff_plate(size=(0.6, 0.3), thickness=0.0272, elements=(4, 2), **PLATE)
-    pose = fx.Pose(shift=(0.6, 0.0, 0.0), rotation=(0, 0, np.pi / 2))
+    pose = fx.joining.Pose(shift=(0.6, 0.0, 0.0), rotation=(0, 0, np.pi / 2))
     other = components_of({"b": lying}, {"b": pose})[0].dofs
     joints = []
     for node in edge(half, 0.3):
         place = half.dofs.xyz[half.dofs.index(f"{node}:z")]
-        joints.append(fx.Joint(f"a/{node}", "b/" + other.nearest(place).partition(":")[0]))
+        joints.append(fx.joining.Joint(f"a/{node}", "b/" + other.nearest(place).partition(":")[0]))
     machine = fx.joined({"a": half, "b": lying}, joints, placed={"b": pose})
     np.testing.assert_allclose(elastic(machine, 15), elastic(whole, 15), rtol=1e-10)
     turn = machine.row((0.5, 0.2, 0.0), "rx") @ machine.rigid_motions()
     np.testing.assert_allclose(turn, np.eye(6)[3], atol=1e-14)
-    upright = fx.joined({"wall": half}, placed={"wall": fx.Pose(rotation=(0, np.pi / 2, 0))})
+    upright = fx.joined(
+        {"wall": half}, placed={"wall": fx.joining.Pose(rotation=(0, np.pi / 2, 0))}
+    )
     assert set(upright.dofs.directions) == {"x", "ry", "rz"}
     assert upright.rigid_body.shape[1] == 3
     with pytest.raises(ModelError, match="oblique"):
-        fx.joined({"wall": half}, placed={"wall": fx.Pose(rotation=(0.5, 0, 0))})
+        fx.joined({"wall": half}, placed={"wall": fx.joining.Pose(rotation=(0.5, 0, 0))})
     with pytest.raises(ModelError, match="mirror"):
-        fx.Pose(rotation=np.diag([1.0, 1.0, -1.0]))
+        fx.joining.Pose(rotation=np.diag([1.0, 1.0, -1.0]))
 
 
 def test_solids_at_any_angle():
     """A block cut in two and the machine turned by odd angles: the block's frequencies."""
     turn = (0.4, -0.7, 1.1)
-    R = fx.Pose(rotation=turn).rotation
+    R = fx.joining.Pose(rotation=turn).rotation
     whole = fx.solid_block(size=(0.4, 0.2, 0.1), elements=(4, 2, 1), **SOLID)
     half = fx.solid_block(size=(0.2, 0.2, 0.1), elements=(2, 2, 1), **SOLID)
-    placed = {"left": fx.Pose((0.1, 0, 0), turn), "right": fx.Pose([0.1, 0, 0] + 0.2 * R[:, 0], R)}
+    placed = {
+        "left": fx.joining.Pose((0.1, 0, 0), turn),
+        "right": fx.joining.Pose([0.1, 0, 0] + 0.2 * R[:, 0], R),
+    }
     pairs = zip(edge(half, 0.2), edge(half, 0.0), strict=True)
-    joints = [fx.Joint(f"left/{i}", f"right/{j}") for i, j in pairs]
+    joints = [fx.joining.Joint(f"left/{i}", f"right/{j}") for i, j in pairs]
     machine = fx.joined({"left": half, "right": half}, joints, placed=placed)
     assert machine.n_dof == whole.n_dof
     assert machine.rigid_body.shape[1] == 6
@@ -165,7 +170,7 @@ def test_solids_at_any_angle():
     point = np.array([0.1, 0, 0]) + R @ [0.3, 0.1, 0.05]
     turned_row = machine.row(point, "x") @ machine.rigid_motions()
     np.testing.assert_allclose(turned_row[:3], [1, 0, 0], atol=1e-12)
-    outer = fx.joined({"m": machine}, placed={"m": fx.Pose((0, 1, 0), (-0.2, 0.5, 0.9))})
+    outer = fx.joined({"m": machine}, placed={"m": fx.joining.Pose((0, 1, 0), (-0.2, 0.5, 0.9))})
     for axis in "xyz":  # the labels of nodes that follow, whose directions turn with them
         left, right = f"m/left/3:{axis}", f"m/right/1:{axis}"
         assert right not in outer.dofs.labels
@@ -178,7 +183,7 @@ def test_matching_meshes_with_few_digits():
     whole = fx.solid_block(size=(0.4, 0.2, 0.1), elements=(4, 2, 1), **SOLID)
     half = fx.solid_block(size=(0.2, 0.2, 0.1), elements=(2, 2, 1), **SOLID)
     models = {"left": half, "right": half}
-    placed = {"right": fx.Pose((0.2 + 4e-8, -3e-8, 2e-8))}
+    placed = {"right": fx.joining.Pose((0.2 + 4e-8, -3e-8, 2e-8))}
     joints = fx.joining.coincident_joints(models, placed=placed)
     assert [repr(joint) for joint in joints[:2]] == [
         "<Joint left/3 - right/1 along x, y, z, rigid>",
@@ -190,7 +195,7 @@ def test_matching_meshes_with_few_digits():
     np.testing.assert_allclose(elastic(machine, 16), elastic(whole, 16), rtol=1e-5)
     assert len(fx.joining.coincident_joints(models, placed=placed, box=[(0, 0, 0), (1, 1, 0)])) == 3
     with pytest.raises(ModelError, match="no nodes of left, right are within"):
-        fx.joining.coincident_joints(models, placed={"right": fx.Pose((1.0, 0, 0))})
+        fx.joining.coincident_joints(models, placed={"right": fx.joining.Pose((1.0, 0, 0))})
     with pytest.raises(ModelError, match="near several"):
         fx.joining.coincident_joints(models, placed=placed, tolerance=0.15)
 
@@ -198,12 +203,12 @@ def test_matching_meshes_with_few_digits():
 def test_joints_with_lever_arms_and_springs_are_those_of_dense_algebra():
     """A stage on three ball joints above the frame, springs beside: B and k written out by hand."""
     upper, lower = plate(3, 0.6, 3), plate(4)
-    placed = {"upper": fx.Pose(shift=(0.0, 0.0, 0.2))}
+    placed = {"upper": fx.joining.Pose(shift=(0.0, 0.0, 0.2))}
     # at (0.2, 0.2) of the frame, 0.05 m beside its node 13 at (0.15, 0.15), by lever arms
     joints = [
-        fx.Joint("upper/6", "lower/7", axes=("z", "rx", "ry")),
-        fx.Joint("upper/1:z", "lower/1:z", stiffness=2e5, rate=30.0),
-        fx.Joint("upper/16:z", stiffness=1e5),
+        fx.joining.Joint("upper/6", "lower/7", axes=("z", "rx", "ry")),
+        fx.joining.Joint("upper/1:z", "lower/1:z", stiffness=2e5, rate=30.0),
+        fx.joining.Joint("upper/16:z", stiffness=1e5),
     ]
     machine = fx.joined({"upper": upper, "lower": lower}, joints, placed=placed)
     names = [*(f"upper/{n}" for n in upper.dofs.labels), *(f"lower/{n}" for n in lower.dofs.labels)]
@@ -243,7 +248,7 @@ def test_reduced_components_to_their_truncation():
     whole, half = elastic(plate(4), 9), plate(2, 0.3)
     boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in KINDS]
     errors = []
-    for method in (fx.CraigBampton(boundary, 2), fx.CraigBampton(boundary, 30)):
+    for method in (fx.reduction.CraigBampton(boundary, 2), fx.reduction.CraigBampton(boundary, 30)):
         rom = fx.reduce(half, method)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -258,17 +263,19 @@ def test_reduced_components_to_their_truncation():
         assert np.all(errors[-1] > -1e-10)  # Rayleigh-Ritz
     assert errors[0].max() > 1e-4
     assert errors[1].max() < 1e-9  # all modes of the interior
-    truncated = fx.reduce(fx.solve_modes(half, count=20), fx.ModalTruncation(count=20))
+    truncated = fx.reduce(fx.solve_modes(half, count=20), fx.reduction.ModalTruncation(count=20))
     with pytest.warns(FlexplantWarning, match="no static shape for the load"):
         fx.joined({"left": half, "right": truncated}, seam(half), placed=RIGHT)
     label = half.dofs.nearest((0, 0.3, 0))
     vectors = fx.solve_modes(half, count=20, compliance_at=[label])
-    rom = fx.reduce(vectors, fx.ModalTruncation(count=20, static_at=[label]))
+    rom = fx.reduce(vectors, fx.reduction.ModalTruncation(count=20, static_at=[label]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         node = half.dofs.nearest((0.3, 0.3, 0))
         machine = fx.joined(
-            {"left": half, "right": rom}, fx.Joint(f"left/{node}", f"right/{label}"), placed=RIGHT
+            {"left": half, "right": rom},
+            fx.joining.Joint(f"left/{node}", f"right/{label}"),
+            placed=RIGHT,
         )
     assert machine.row(f"right/{label}") == pytest.approx(machine.row(f"left/{node}"))
 
@@ -279,7 +286,9 @@ def test_complex_modes_of_plates_on_dampers():
     half = fx.kirchhoff_plate(size=(0.3, 0.6), thickness=0.02, elements=(16, 32), **PLATE)
     places = fx.joining.coincident_joints({"left": half, "right": half}, placed=RIGHT)
     soft = {"stiffness": [1e7, 1e5, 1e5], "rate": [3.0, 0.03, 0.03]}
-    joints = [fx.Joint(joint.first, joint.second, axes=joint.axes, **soft) for joint in places]
+    joints = [
+        fx.joining.Joint(joint.first, joint.second, axes=joint.axes, **soft) for joint in places
+    ]
     machine = fx.joined({"left": half, "right": half}, joints, placed=RIGHT)
     assert sp.issparse(machine.D)
     modes = fx.solve_modes(machine, count=10)
@@ -294,8 +303,8 @@ def test_complex_modes_of_plates_on_dampers():
 def test_modes_on_a_spring():
     """Motions that the spring does not feel leave rounding alone, which is no force."""
     model = fx.solid_block(size=(0.3, 0.2, 0.05), elements=(3, 2, 1), **SOLID)
-    rom = fx.reduce(fx.solve_modes(model, count=20), fx.ModalTruncation(14))
-    machine = fx.joined({"stage": rom}, fx.Joint("stage/1:z", stiffness=1e5))
+    rom = fx.reduce(fx.solve_modes(model, count=20), fx.reduction.ModalTruncation(14))
+    machine = fx.joined({"stage": rom}, fx.joining.Joint("stage/1:z", stiffness=1e5))
     row = rom.row("1:z")
     K = np.diag(np.diag(rom.K)) + 1e5 * np.outer(row, row)
     assert machine.joining.n_rigid == 5
@@ -309,11 +318,14 @@ def test_a_reduced_machine_is_a_model_like_any():
     """Labels, plants, an update of a joint's stiffness, a machine in a machine."""
     half = plate(2, 0.3)
     boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in KINDS]
-    rom = fx.reduce(half, fx.CraigBampton(boundary, 6, damping=fx.ModalDamping(0.01)))
+    rom = fx.reduce(half, fx.reduction.CraigBampton(boundary, 6, damping=fx.ModalDamping(0.01)))
     corner = half.dofs.nearest((0, 0, 0))
     springs = [
-        fx.Joint(f"left/{half.dofs.nearest((0, y, 0))}", f"right/{half.dofs.nearest((0, y, 0))}",
-                 stiffness=1e6)
+        fx.joining.Joint(
+            f"left/{half.dofs.nearest((0, y, 0))}",
+            f"right/{half.dofs.nearest((0, y, 0))}",
+            stiffness=1e6,
+        )
         for y in (0.0, 0.3, 0.6)
     ]  # fmt: skip
     machine = fx.joined({"left": rom, "right": rom}, springs)
@@ -328,9 +340,12 @@ def test_a_reduced_machine_is_a_model_like_any():
     fit = fx.update(machine, [unknown], [fx.Eigenvalues(measured)])
     assert fit.values[0] == pytest.approx(4e5, rel=1e-6)
     assert fit.model.joining is None  # its checks are of the machine before
-    wafer = fx.chain(masses=[1.0, 0.5], stiffnesses=[1e7]).with_damping(fx.Rayleigh(0.0, 1e-6))
+    wafer = fx.chain(masses=[1.0, 0.5], stiffnesses=[1e7]).with_damping(
+        fx.structure.Rayleigh(0.0, 1e-6)
+    )
     outer = fx.joined(
-        {"machine": machine, "wafer": wafer}, placed={"wafer": fx.Pose(rotation=(0, np.pi / 2, 0))}
+        {"machine": machine, "wafer": wafer},
+        placed={"wafer": fx.joining.Pose(rotation=(0, np.pi / 2, 0))},
     )
     assert dict(outer.joining.pieces) == {"machine": 4, "wafer": 1}
     assert "machine/left/1:z" in outer.full_dofs
@@ -341,22 +356,26 @@ def test_a_reduced_machine_is_a_model_like_any():
 def test_a_node_of_a_machine_in_a_machine():
     """By the name of its component, also where it follows another node; a number is not enough."""
     part = fx.chain(masses=[1.0, 2.0], stiffnesses=[1e6])
-    inner = fx.joined({"a": part, "b": part}, fx.Joint("a/2", "b/1"))
+    inner = fx.joined({"a": part, "b": part}, fx.joining.Joint("a/2", "b/1"))
     for node in ("a/1", "b/1"):
         first, second = (
-            fx.joined({"m": inner, "c": part}, fx.Joint(f"m/{node}{axis}", f"c/1{axis}"))
+            fx.joined({"m": inner, "c": part}, fx.joining.Joint(f"m/{node}{axis}", f"c/1{axis}"))
             for axis in ("", ":x")
         )
         assert first.dofs.labels == second.dofs.labels
         np.testing.assert_array_equal(first.K.toarray(), second.K.toarray())
-    patch = fx.joined({"m": inner, "c": part}, fx.Joint(fx.Patch("m/b", [2]), "c/1", axes=["x"]))
-    first = fx.joined({"m": inner, "c": part}, fx.Joint("m/b/2", "c/1"))
+    patch = fx.joined(
+        {"m": inner, "c": part}, fx.joining.Joint(fx.joining.Patch("m/b", [2]), "c/1", axes=["x"])
+    )
+    first = fx.joined({"m": inner, "c": part}, fx.joining.Joint("m/b/2", "c/1"))
     np.testing.assert_allclose(patch.K.toarray(), first.K.toarray(), rtol=1e-12)
     assert list(patch.joining.patches) == ["joint 1, <Patch of m/b, 1 nodes>"]
     with pytest.raises(LabelError, match=r"which a, b may share.*Patch\('m/a', nodes\)"):
-        fx.joined({"m": inner, "c": part}, fx.Joint(fx.Patch("m", [2]), "c/1", axes=["x"]))
+        fx.joined(
+            {"m": inner, "c": part}, fx.joining.Joint(fx.joining.Patch("m", [2]), "c/1", axes=["x"])
+        )
     with pytest.raises(LabelError, match="no node '2' for the joint at 'm/2'"):
-        fx.joined({"m": inner, "c": part}, fx.Joint("m/2", "c/1"))
+        fx.joined({"m": inner, "c": part}, fx.joining.Joint("m/2", "c/1"))
 
 
 @pytest.mark.slow
@@ -399,7 +418,7 @@ def test_a_joint_within_a_component_stretches_no_rigid_motion():
     """A bar between two of its nodes, rigid or a spring: three motions at zero stay."""
     model = plate(3)
     for stiffness in (None, [1e6, 1e3]):
-        bar = fx.Joint("a/1", "a/8", axes=["z", "rx"], stiffness=stiffness)
+        bar = fx.joining.Joint("a/1", "a/8", axes=["z", "rx"], stiffness=stiffness)
         machine = fx.joined({"a": model}, bar)
         assert machine.joining.n_rigid == machine.rigid_body.shape[1] == 3
         zeros = np.linalg.eigvalsh(machine.K.toarray())[:4]
@@ -414,9 +433,11 @@ def test_very_unlike_components():
     rubber = fx.solid_block(size=(0.3, 0.2, 0.02), elements=(3, 2, 1), density=1100,
                             youngs_modulus=2e5, poisson_ratio=0.45)  # fmt: skip
     pairs = zip(edge_z(rubber, 0.02), edge_z(steel, 0.0), strict=True)
-    joints = [fx.Joint(f"pad/{i}", f"steel/{j}") for i, j in pairs]
+    joints = [fx.joining.Joint(f"pad/{i}", f"steel/{j}") for i, j in pairs]
     machine = fx.joined(
-        {"pad": rubber, "steel": steel}, joints, placed={"steel": fx.Pose(shift=(0, 0, 0.02))}
+        {"pad": rubber, "steel": steel},
+        joints,
+        placed={"steel": fx.joining.Pose(shift=(0, 0, 0.02))},
     )
     modes = fx.solve_modes(machine, count=10)
     assert modes.n_rigid == 6
@@ -443,45 +464,47 @@ def test_what_is_refused(monkeypatch):
         return fx.joined(more.pop("models", models), joints, placed=placed, **more)
 
     with pytest.raises(ModelError, match="would hold the machine's motion rx, ry against"):
-        join(fx.Joint("stage/1:z", "frame/1:z"))
+        join(fx.joining.Joint("stage/1:z", "frame/1:z"))
     with pytest.warns(FlexplantWarning, match="would hold the machine's motion") as said:
-        join(fx.Joint("stage/1:z", "frame/1:z", stiffness=1e4))
+        join(fx.joining.Joint("stage/1:z", "frame/1:z", stiffness=1e4))
     assert {one.filename for one in said} == {__file__}  # at the caller's line
     with pytest.raises(LabelError, match=r"component 'frame': no DOF '1:rz'"):
-        join(fx.Joint("stage/1:z", "frame/1:rz"))
+        join(fx.joining.Joint("stage/1:z", "frame/1:rz"))
     with pytest.raises(LabelError, match="needs its rotation r"):
-        join(fx.Joint("stage/1", "frame/1"))
+        join(fx.joining.Joint("stage/1", "frame/1"))
     with pytest.raises(LabelError, match="has no axis 'rx'"):
-        join(fx.Joint("stage/1", "frame/1", axes=["rx"]))
+        join(fx.joining.Joint("stage/1", "frame/1", axes=["rx"]))
     with pytest.raises(LabelError, match=r"no component 'stag'.*Close matches: 'stage'"):
-        join(fx.Joint("stag/1:z", "frame/1:z"))
+        join(fx.joining.Joint("stag/1:z", "frame/1:z"))
     with pytest.raises(LabelError, match="nowhere"):
-        join(fx.Joint(("stage", (5.0, 5.0, 5.0)), "frame/1"))
+        join(fx.joining.Joint(("stage", (5.0, 5.0, 5.0)), "frame/1"))
     with pytest.raises(LabelError, match="not clear what is joined"):
-        fx.joined({"a": plate(2), "b": models["frame"]}, fx.Joint("a/1", "b/1"))
+        fx.joined({"a": plate(2), "b": models["frame"]}, fx.joining.Joint("a/1", "b/1"))
     with pytest.raises(ModelError, match="needs a second end"):
-        fx.Joint("stage/1:z")
+        fx.joining.Joint("stage/1:z")
     with pytest.raises(ModelError, match="units differ"):
-        fx.joined({"a": plate(2)}, fx.Joint("a/1", stiffness=1e3))
+        fx.joined({"a": plate(2)}, fx.joining.Joint("a/1", stiffness=1e3))
     with pytest.raises(ModelError, match="of type FEModel or ReducedModel, got Modes"):
         join(models={"stage": fx.solve_modes(models["stage"], count=8)})
     with pytest.raises(LabelError, match="cannot name a component"):
         join(models={"st:age": models["stage"]})
-    rom = fx.reduce(models["stage"], fx.CraigBampton(["1:x", "1:y", "1:z", "4:y", "4:z", "9:z"]))
+    rom = fx.reduce(
+        models["stage"], fx.reduction.CraigBampton(["1:x", "1:y", "1:z", "4:y", "4:z", "9:z"])
+    )
     monkeypatch.setattr(join_module, "_LARGEST", 20)
     with pytest.raises(ModelError, match=r"are too many .* Reduce the large components first"):
         join(models=models | {"stage": rom})
     with pytest.raises(ModelError, match=r"times as stiff as its components .* joint is rigid"):
         join(*at_feet(("x", "y", "z"), stiffness=1e21))
     with pytest.raises(LabelError, match="the end of a joint must be a DOF"):
-        fx.Joint("stage/", "frame/1")
+        fx.joining.Joint("stage/", "frame/1")
     with pytest.raises(ModelError, match="it is in radians"):
-        fx.Pose(rotation=(0, 0, 90))
+        fx.joining.Pose(rotation=(0, 0, 90))
     with pytest.raises(LabelError, match="node numbers must be whole"):
-        fx.Patch("stage", ["a", "b"])
+        fx.joining.Patch("stage", ["a", "b"])
     with pytest.raises(LabelError, match="must be different ones"):
-        fx.Patch("stage", [1, 2, 1], weights=[1.0, 2.0, 3.0])
-    damped = {"stage": models["stage"].with_damping(fx.Rayleigh(0.0, 1e-6))}
+        fx.joining.Patch("stage", [1, 2, 1], weights=[1.0, 2.0, 3.0])
+    damped = {"stage": models["stage"].with_damping(fx.structure.Rayleigh(0.0, 1e-6))}
     with pytest.warns(FlexplantWarning, match=re.escape("components ['frame'] have no D")):
         join(models=models | damped)
 
@@ -517,11 +540,11 @@ def test_one_joint_of_patches_listed_twice(stiffness):
         poisson_ratio=0.3,
     )  # fmt: skip
     ends = (
-        fx.Patch("a", box=[(0.05, 0, 0.05), (0.15, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
-        fx.Patch("b", box=[(0.06, 0, 0.05), (0.16, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
+        fx.joining.Patch("a", box=[(0.05, 0, 0.05), (0.15, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
+        fx.joining.Patch("b", box=[(0.06, 0, 0.05), (0.16, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
     )
-    joint = fx.Joint(*ends, stiffness=stiffness)
-    placed = {"b": fx.Pose(shift=(0.06, 0, 0.05))}
+    joint = fx.joining.Joint(*ends, stiffness=stiffness)
+    placed = {"b": fx.joining.Pose(shift=(0.06, 0, 0.05))}
     once, twice = (fx.joined({"a": below, "b": above}, [joint] * n, placed=placed) for n in (1, 2))
     assert set(twice.joining.patches) == set(once.joining.patches)
     if stiffness is None:

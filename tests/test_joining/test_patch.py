@@ -17,7 +17,7 @@ def block(length, elements):
 
 
 def face(name, x):
-    return fx.Patch(name, box=[(x - 1e-9, -9, -9), (x + 1e-9, 9, 9)])
+    return fx.joining.Patch(name, box=[(x - 1e-9, -9, -9), (x + 1e-9, 9, 9)])
 
 
 @pytest.mark.slow
@@ -26,8 +26,8 @@ def test_unlike_meshes_against_one_piece():
     left, right = block(0.3, (6, 3, 2)), block(0.3, (6, 4, 3))
     machine = fx.joined(
         {"left": left, "right": right},
-        fx.Joint(face("left", 0.3), face("right", 0.3)),
-        placed={"right": fx.Pose((0.3, 0, 0))},
+        fx.joining.Joint(face("left", 0.3), face("right", 0.3)),
+        placed={"right": fx.joining.Pose((0.3, 0, 0))},
     )
     assert machine.joining.n_rigid == 6
     found = fx.solve_modes(machine, count=10).freq[6:]
@@ -72,20 +72,20 @@ def test_the_mean_of_rigid_motion_is_that_motion():
     model = block(0.2, (4, 2, 2))
     nodes = np.unique(model.dofs.where(box=[(0.2, -9, -9), (0.2, 9, 9)]).nodes)
     at = (0.2, 0.01, 0.03)
-    patch = fx.Patch("bar", nodes, at=at, weights=1.0 + np.arange(nodes.size))
-    machine = fx.joined({"bar": model}, fx.Joint(patch, stiffness=[1e5] * 3 + [1e3] * 3))
+    patch = fx.joining.Patch("bar", nodes, at=at, weights=1.0 + np.arange(nodes.size))
+    machine = fx.joined({"bar": model}, fx.joining.Joint(patch, stiffness=[1e5] * 3 + [1e3] * 3))
     motions = machine.rigid_motions(about=at)
     np.testing.assert_allclose(
         motions.T @ (machine.K - model.K) @ motions, np.diag([1e5] * 3 + [1e3] * 3), atol=1e-6
     )
     assert machine.joining.n_rigid == 0
-    line = fx.Patch("bar", box=[(0.2, 0, 0), (0.2, 9, 0)])
+    line = fx.joining.Patch("bar", box=[(0.2, 0, 0), (0.2, 9, 0)])
     with pytest.raises(LabelError, match="has no axis 'ry'"):
-        fx.joined({"bar": model}, fx.Joint(line, axes=["ry"], stiffness=1.0))
+        fx.joined({"bar": model}, fx.joining.Joint(line, axes=["ry"], stiffness=1.0))
     with pytest.raises(LabelError, match=r"nodes=.* or box="):
-        fx.Patch("bar")
+        fx.joining.Patch("bar")
     with pytest.raises(ModelError, match="must be positive"):
-        fx.Patch("bar", [1, 2], weights=[1.0, 0.0])
+        fx.joining.Patch("bar", [1, 2], weights=[1.0, 0.0])
 
 
 def test_a_component_of_rigid_body_modes_alone_has_no_compliance():
@@ -93,10 +93,10 @@ def test_a_component_of_rigid_body_modes_alone_has_no_compliance():
     size, steel = (0.2, 0.2), {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
     plate = fx.kirchhoff_plate(size=size, thickness=0.01, elements=(2, 2), **steel)
     rigid = fx.reduce(fx.solve_modes(plate, count=3), fx.reduction.ModalTruncation(3))
-    foot = fx.Patch("lower", box=[(0.0, 0.0, 0.0), (*size, 0.0)])
+    foot = fx.joining.Patch("lower", box=[(0.0, 0.0, 0.0), (*size, 0.0)])
     with pytest.warns(fx.errors.FlexplantWarning, match="no static shape"):
         machine = fx.joined(
-            {"lower": rigid, "upper": plate}, fx.Joint(foot, "upper/5:z", stiffness=1e6)
+            {"lower": rigid, "upper": plate}, fx.joining.Joint(foot, "upper/5:z", stiffness=1e6)
         )
     assert np.isnan(list(machine.joining.patches.values())).all()
     assert machine.joining.mass == pytest.approx(2 * plate.mass, rel=1e-9)

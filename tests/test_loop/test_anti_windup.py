@@ -76,7 +76,7 @@ def test_nothing_moves_where_nothing_is_slow():
 def test_a_saturated_pi_loop_is_that_of_back_calculation(recovery):
     """2 / (5 s + 1), a PI of gain 3 and 5 s, limit 0.6, step 1; sample by sample."""
     dt, gain, integral = 0.05, 3.0, 5.0
-    plant = fx.discretized(fx.lti.tf([2.0], [5.0, 1.0]), 1 / dt)
+    plant = fx.lti.discretized(fx.lti.tf([2.0], [5.0, 1.0]), 1 / dt)
     law = fx.StateSpace(
         [[1.0]], [[dt, -dt]], [[gain / integral]], [[gain, -gain]], dt,
         inputs=["r", "y"], outputs=["u"],

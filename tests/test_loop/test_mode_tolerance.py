@@ -331,7 +331,7 @@ def test_positions_and_speeds_measured_together_a_fraction_of_a_sample_late():
 
 
 LATE = {
-    "a filter": [{"dynamics": fx.lowpass(2400.0)}],
+    "a filter": [{"dynamics": fx.lti.low_pass_filter(2400.0)}],
     "a latency": [{"latency": 1e-6}],
     "more than a sample": [{"latency": 3.4e-4}],
     "one of two": [{}, {"latency": 3e-5}],

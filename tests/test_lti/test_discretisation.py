@@ -14,7 +14,7 @@ from flexplant.lti import (
     append,
     discretized,
     frequency_response,
-    lowpass,
+    low_pass_filter,
     series,
     tustin,
 )
@@ -279,7 +279,7 @@ def test_a_series_of_filters_and_modes_keeps_its_blocks(count, push, delay):
     def filters(inputs, outputs):
         parts = []
         for name, to, order in zip(inputs, outputs, (1, 2, 2), strict=True):
-            lag = lowpass(10.0 ** rng.uniform(0, 3.5), order=order)
+            lag = low_pass_filter(10.0 ** rng.uniform(0, 3.5), order=order)
             parts.append(lag.renamed(inputs={lag.inputs[0]: name}, outputs={lag.outputs[0]: to}))
         return append(*parts)
 

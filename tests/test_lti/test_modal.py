@@ -184,7 +184,7 @@ def test_split_of_nothing():
     split = split_stable(static)
     assert (split.stable.D, split.rest.D) == (2.0, 0.0)
     assert split_stable(system(1)).rest.n_states == 0
-    assert repr(split) == "<Split: 0 stable states, 0 others, separation 0.0e+00>"
+    assert repr(split) == "<StableSplit: 0 stable states, 0 others, separation 0.0e+00>"
     with pytest.raises(ModelError, match="StateSpace"):
         split_stable(3 + 1j)
 

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from flexplant.errors import ModelError, ShapeError
 from flexplant.lti import (
     frequency_response,
-    highpass,
+    high_pass_filter,
     inverse_sensitivity,
-    leadlag,
-    lowpass,
-    notch,
+    lead_lag_filter,
+    low_pass_filter,
+    notch_filter,
     series,
     tustin,
 )
@@ -26,7 +26,7 @@ def size(sys, *freq):
 
 @given(FREQS, st.sampled_from([1, 2]), st.floats(0.01, 100.0))
 def test_corners_are_at_minus_3_db(freq, order, gain):
-    low, high = (make(freq, order=order, gain=gain) for make in (lowpass, highpass))
+    low, high = (make(freq, order=order, gain=gain) for make in (low_pass_filter, high_pass_filter))
     for sys in (low, high):
         np.testing.assert_allclose(size(sys, freq), gain / np.sqrt(2), rtol=1e-12)
         assert sys.is_stable
@@ -41,7 +41,7 @@ def test_corners_are_at_minus_3_db(freq, order, gain):
 
 @given(FREQS, st.floats(0.0, 1.0), st.floats(0.01, 2.0))
 def test_notch(freq, depth, width):
-    sys = notch(freq, depth=depth, width=width)
+    sys = notch_filter(freq, depth=depth, width=width)
     p = 1j * 1.3
     wanted = abs((p**2 + 2 * depth * width * p + 1) / (p**2 + 2 * width * p + 1))
     np.testing.assert_allclose(size(sys, freq, 1.3 * freq), [depth, wanted], rtol=1e-9, atol=1e-12)
@@ -51,7 +51,7 @@ def test_notch(freq, depth, width):
 
 @given(FREQS, FREQS, st.floats(0.01, 10.0))
 def test_leadlag(zero, pole, gain):
-    sys = leadlag(zero, pole, gain=gain)
+    sys = lead_lag_filter(zero, pole, gain=gain)
     f = np.sqrt(zero * pole)
     wanted = [gain, gain * abs((1j * f / zero + 1) / (1j * f / pole + 1))]
     np.testing.assert_allclose(size(sys, 0.0, f), wanted, rtol=1e-9)
@@ -80,24 +80,24 @@ def test_the_slope_is_that_asked_for():
 
 
 def test_sampled_they_keep_the_gain_at_the_prewarped_frequency():
-    sys = tustin(notch(300.0), 2000.0, prewarp=300.0)
+    sys = tustin(notch_filter(300.0), 2000.0, prewarp=300.0)
     np.testing.assert_allclose(size(sys, 300.0), 0.05, rtol=1e-9)
 
 
 def test_filters_chain():
-    both = series(lowpass(10.0), notch(30.0).renamed(inputs={"in": "mid"}))
+    both = series(low_pass_filter(10.0), notch_filter(30.0).renamed(inputs={"in": "mid"}))
     np.testing.assert_allclose(size(both, 30.0), 0.05 / np.sqrt(10), rtol=1e-9)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf, "fast", [1.0, 2.0]])
 def test_bad_frequencies(bad):
     for make in (
-        lambda: lowpass(bad),
-        lambda: highpass(bad, order=2),
-        lambda: notch(bad),
-        lambda: notch(10.0, width=bad),
-        lambda: leadlag(bad, 10.0),
-        lambda: leadlag(10.0, bad),
+        lambda: low_pass_filter(bad),
+        lambda: high_pass_filter(bad, order=2),
+        lambda: notch_filter(bad),
+        lambda: notch_filter(10.0, width=bad),
+        lambda: lead_lag_filter(bad, 10.0),
+        lambda: lead_lag_filter(10.0, bad),
         lambda: inverse_sensitivity(bad),
     ):
         with pytest.raises((ModelError, ShapeError), match=r"must|has a NaN"):
@@ -105,11 +105,11 @@ def test_bad_frequencies(bad):
 
 
 def test_bad_shapes_of_filters():
-    for make in (lowpass, highpass):
+    for make in (low_pass_filter, high_pass_filter):
         with pytest.raises(ModelError, match=r"order must be 1 or 2, got 3.*in series"):
             make(10.0, order=3)
     with pytest.raises(ModelError, match="depth"):
-        notch(10.0, depth=-0.1)
+        notch_filter(10.0, depth=-0.1)
     with pytest.raises(ModelError, match="slope must be a whole number from 1 to 2"):
         inverse_sensitivity(10.0, slope=3)
     for numbers in ({"floor": 1.0}, {"peak": 0.9}):
@@ -118,6 +118,6 @@ def test_bad_shapes_of_filters():
     for numbers in ({"floor": 0.0}, {"peak": np.nan}):
         with pytest.raises(ModelError, match=f"{next(iter(numbers))} (must be pos|has a NaN)"):
             inverse_sensitivity(10.0, **numbers)
-    for make in (lowpass, highpass, leadlag):
+    for make in (low_pass_filter, high_pass_filter, lead_lag_filter):
         with pytest.raises(ModelError, match="gain"):
-            make(10.0, gain=np.nan) if make is not leadlag else make(1.0, 2.0, gain=np.nan)
+            make(10.0, gain=np.nan) if make is not lead_lag_filter else make(1.0, 2.0, gain=np.nan)

@@ -19,14 +19,16 @@ def machine(region):
     upper = fx.kirchhoff_plate(size=(0.6, 0.5), elements=(4, 4), **PLATE)
     rates = (0.0, 0.0, 0.0) if region else (200.0, 50.0, 300.0)
     if region:
-        upper = upper.with_damping(fx.Rayleigh(0.0, 2e-6))
-        lower = lower.with_damping(fx.Rayleigh(0.0, 2e-7))
+        upper = upper.with_damping(fx.structure.Rayleigh(0.0, 2e-6))
+        lower = lower.with_damping(fx.structure.Rayleigh(0.0, 2e-7))
     feet = [(0.1, 0.1), (0.5, 0.1), (0.3, 0.4)]
     joints = [
-        fx.Joint(("up", (x, y, 0.1)), ("low", (x, y, 0.0)), axes=["z"], stiffness=2e6, rate=c)
+        fx.joining.Joint(
+            ("up", (x, y, 0.1)), ("low", (x, y, 0.0)), axes=["z"], stiffness=2e6, rate=c
+        )
         for (x, y), c in zip(feet, rates, strict=True)
     ]
-    placed = {"up": fx.Pose((0.0, 0.0, 0.1))}
+    placed = {"up": fx.joining.Pose((0.0, 0.0, 0.1))}
     return fx.joined({"low": lower, "up": upper}, joints, placed=placed)
 
 
@@ -53,10 +55,10 @@ def halves(rate):
     """A plate of two halves, held at one end, on springs and dampers between all nodes."""
     half = fx.kirchhoff_plate(size=(0.3, 0.6), elements=(3, 4), **PLATE)
     edge = half.dofs.where(box=[(0, 0, 0), (0, 1, 0)]).labels
-    models, placed = {"a": half.fixed(edge), "b": half}, {"b": fx.Pose((0.3, 0.0, 0.0))}
+    models, placed = {"a": half.fixed(edge), "b": half}, {"b": fx.joining.Pose((0.3, 0.0, 0.0))}
     rates, springs = rate * np.array([1, 0.01, 0.01]), [1e7, 1e5, 1e5]
     joints = [
-        fx.Joint(joint.first, joint.second, axes=joint.axes, stiffness=springs, rate=rates)
+        fx.joining.Joint(joint.first, joint.second, axes=joint.axes, stiffness=springs, rate=rates)
         for joint in fx.joining.coincident_joints(models, placed=placed)
     ]
     return fx.joined(models, joints, placed=placed)
@@ -73,7 +75,7 @@ def test_overdamped_motions_are_set_apart(rate, slow, monkeypatch):
     assert still.size > 10
     among = np.count_nonzero(np.abs(still) < np.abs(swing[-1]))
     at_dampers = model.dofs.where(box=[(0.29, -1, -1), (0.31, 1, 1)]).labels
-    rom = fx.reduce(model, fx.CraigBampton(at_dampers, 30))
+    rom = fx.reduce(model, fx.reduction.CraigBampton(at_dampers, 30))
     for is_large in (False, True):
         monkeypatch.setattr(solve, "is_large", lambda model, large=is_large: large)
         with warnings.catch_warnings(record=True) as said:

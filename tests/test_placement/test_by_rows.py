@@ -8,10 +8,10 @@ import pytest
 from flexplant.errors import ModelError
 from flexplant.placement import (
     BranchAndBound,
-    ByRows,
     Exchange,
     ModeInformation,
     Problem,
+    RowSelection,
     place_sensors,
 )
 from flexplant.placement.constraints import LinearRows
@@ -42,7 +42,7 @@ def test_identities_of_effective_independence_are_exact():
 def test_searches_by_rows_differ_and_are_bounded(make):
     plant, sensors, _ = make(42, count=14)
     goal = ModeInformation()
-    searches = (ByRows(), ByRows(driving_point=True), ByRows(PivotedQr()))
+    searches = (RowSelection(), RowSelection(driving_point=True), RowSelection(PivotedQr()))
     found = [place_sensors(plant, sensors, 9, goal, method=m) for m in searches]
     assert len({one.chosen for one in found}) == 3
     best = place_sensors(plant, sensors, 9, goal, method=BranchAndBound())
@@ -51,12 +51,14 @@ def test_searches_by_rows_differ_and_are_bounded(make):
     assert swapped.chosen == best.chosen
     for one in found:
         assert one.bound <= best.value <= one.value
-    kept = place_sensors(plant, sensors, 9, goal, method=ByRows(PivotedQr()), required=["s0", "s2"])
+    kept = place_sensors(
+        plant, sensors, 9, goal, method=RowSelection(PivotedQr()), required=["s0", "s2"]
+    )
     assert {"s0", "s2"} <= set(kept.chosen)
     fewer = place_sensors(plant, sensors, 10, ModeInformation(elastic=True), method=searches[0])
     assert len(fewer.chosen) == 10
     with pytest.raises(ModelError, match=r"has none\. Pass criterion=placement\.ModeInformation"):
-        place_sensors(plant, sensors, 9, method=ByRows(PivotedQr()))
+        place_sensors(plant, sensors, 9, method=RowSelection(PivotedQr()))
 
 
 def test_pivots_are_those_of_gram_and_schmidt(make):
@@ -69,7 +71,7 @@ def test_pivots_are_those_of_gram_and_schmidt(make):
         expected.append(f"s{pick}")
         unit = left[pick] / np.linalg.norm(left[pick])
         left = left - np.outer(left @ unit, unit)
-    found = ByRows(PivotedQr()).search(_problem(rows, 5), Work())
+    found = RowSelection(PivotedQr()).search(_problem(rows, 5), Work())
     assert {f"s{i}" for i in found.chosen} == set(expected)
 
 

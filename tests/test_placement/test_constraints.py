@@ -8,19 +8,19 @@ import pytest
 from flexplant import load
 from flexplant.errors import InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
-    Among,
     BranchAndBound,
     Budget,
+    CountLimits,
     Exchange,
     Excluded,
     Exhaustive,
+    JointGroups,
     MinimumDistance,
     Mirrored,
     OffPoi,
     PoiLqr,
     PoiVariance,
-    Together,
-    Within,
+    ZoneLimits,
     place_actuators,
     place_sensors,
     sensor_map,
@@ -47,9 +47,9 @@ CASES = {
         lambda s: not s & {0, 11},
     ),
     "off the die": (OffPoi(0.16), lambda s: all(np.hypot(*(XY[i] - (0.2, 0.0))) > 0.16 for i in s)),
-    "within": (Within(Rectangle((-1, -1), (0.45, 1))), lambda s: not s & {9, 10, 11}),
+    "within": (ZoneLimits(Rectangle((-1, -1), (0.45, 1))), lambda s: not s & {9, 10, 11}),
     "few in a zone": (
-        Within([Disc((0, 0), 0.01), Disc((0.5, 0), 0.01)], at_most=1, at_least=1),
+        ZoneLimits([Disc((0, 0), 0.01), Disc((0.5, 0), 0.01)], at_most=1, at_least=1),
         lambda s: len(s & {0, 9}) == 1,
     ),
     "apart": (
@@ -57,12 +57,12 @@ CASES = {
         lambda s: all(np.hypot(*(XY[i] - XY[j])) >= 0.25 for i, j in combinations(s, 2)),
     ),
     "together": (
-        Together([("c0", "c11"), ("c2", "c9", "c5")]),
+        JointGroups([("c0", "c11"), ("c2", "c9", "c5")]),
         lambda s: len(s & {0, 11}) != 1 and len(s & {2, 9, 5}) in (0, 3),
     ),
     "mirrored": (Mirrored("x", 0.25), lambda s: {image(i) for i in s} == s),
     "one type at a place": (
-        Among(["c0", "c1", "c2"], at_most=1),
+        CountLimits(["c0", "c1", "c2"], at_most=1),
         lambda s: len(s & {0, 1, 2}) <= 1,
     ),
     "budget": (
@@ -131,7 +131,7 @@ def test_several_at_once_and_required(machine):
     with pytest.raises(InfeasibleError, match=r"MinimumDistance.*Relax one"):
         place_sensors(plant, sensors, 4, constraints=[MinimumDistance(0.5)])
     # three in a row are apart and cheap, but miss a rotation
-    row = [Within(Rectangle((-1, -0.1), (1, 0.1)))]
+    row = [ZoneLimits(Rectangle((-1, -0.1), (1, 0.1)))]
     with pytest.raises(InfeasibleError, match="rigid-body"):
         place_sensors(plant, sensors, 3, constraints=[*row, OffPoi(-1)])
 
@@ -161,8 +161,8 @@ def test_several_types_of_devices_at_one_place(machine):
         for kind, (asd, order) in types.items()
         for i, p in enumerate(places)
     ]
-    one_each = [Among([f"{kind}{i}" for kind in types], at_most=1) for i in range(5)]
-    few_good = Among([f"good{i}" for i in range(5)], at_most=2)
+    one_each = [CountLimits([f"{kind}{i}" for kind in types], at_most=1) for i in range(5)]
+    few_good = CountLimits([f"good{i}" for i in range(5)], at_most=2)
     price = {p.name: {"c": 1.0, "g": 5.0, "s": 2.0}[p.name[0]] for p in given}
     limits = [*one_each, few_good, Budget(13.0, price)]
     search = Exchange(starts=4)
@@ -178,7 +178,7 @@ def test_several_types_of_devices_at_one_place(machine):
         for i in (0, 11)
         for axis in ("z", "rx")
     ]
-    groups = Together([("u0z", "u0rx"), ("u11z", "u11rx")])
+    groups = JointGroups([("u0z", "u0rx"), ("u11z", "u11rx")])
     both = place_sensors(
         plant, [*sensors[:3], *unit], 4, constraints=[groups], method=search, rng=0
     )
@@ -212,15 +212,15 @@ def test_constraints_are_values_and_refuse_what_they_are_not(machine, tmp_path):
     with pytest.raises(ModelError, match="a Rectangle or a Disc, got"):
         Excluded([(0.3, 0.3)])
     with pytest.raises(ModelError, match="at_least 3 is above at_most 2"):
-        Within(Disc((0, 0), 1), at_least=3, at_most=2)
+        ZoneLimits(Disc((0, 0), 1), at_least=3, at_most=2)
     with pytest.raises(ModelError, match="distance must be positive"):
         MinimumDistance(0.0)
     with pytest.raises(LabelError, match="fewer than two"):
-        Together([("a",)])
+        JointGroups([("a",)])
     with pytest.raises(LabelError, match="candidate of a group 'a'"):
-        place_sensors(plant, sensors, 4, constraints=[Together([("a", "c1")])])
+        place_sensors(plant, sensors, 4, constraints=[JointGroups([("a", "c1")])])
     with pytest.raises(LabelError, match="candidate among others 'a'"):
-        place_sensors(plant, sensors, 4, constraints=[Among(["a"], at_most=1)])
+        place_sensors(plant, sensors, 4, constraints=[CountLimits(["a"], at_most=1)])
     with pytest.raises(LabelError, match="candidate with a cost 'a'"):
         place_sensors(plant, sensors, 4, constraints=[Budget(1.0, {"a": 2.0})])
     for bad in ("none", [3], Disc((0, 0), 1), 3.0):

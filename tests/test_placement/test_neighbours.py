@@ -12,9 +12,9 @@ from flexplant.estimation import FixedLag, Predictor, Smoother, design_kalman
 from flexplant.modes import solve_modes
 from flexplant.placement import (
     ActuatorIndices,
-    AfterLoss,
     AutoMac,
     ClosedLoopH2,
+    DeviceLoss,
     Exchange,
     HinfLevel,
     KineticEnergy,
@@ -51,8 +51,12 @@ SENSORS = {
         PoiVariance("die", lag=Predictor()),
         PoiVariance("die", lag=FixedLag(20)),
     ),
-    "loss": (48, PoiVariance("die"), AfterLoss(PoiVariance("die"))),
-    "mean loss": (48, AfterLoss(PoiVariance("die"), measure="mean"), AfterLoss(PoiVariance("die"))),
+    "loss": (48, PoiVariance("die"), DeviceLoss(PoiVariance("die"))),
+    "mean loss": (
+        48,
+        DeviceLoss(PoiVariance("die"), measure="mean"),
+        DeviceLoss(PoiVariance("die")),
+    ),
     "loop": (41, PoiVariance("die", ALL), ClosedLoopH2("die", effort=1e-8)),
     "trace": (41, ModalObservability("trace"), ModalObservability("log det")),
     "least": (41, ModalObservability("least"), ModalObservability("log det")),
@@ -165,13 +169,13 @@ def test_over_machines(make):
 def test_after_the_loss_of_one_the_others_suffice(make):
     plant, sensors, actuators = make(48)
     layout = [s.name for s in sensors[:4]]
-    found = score_sensors(plant, [layout], AfterLoss(PoiVariance("die")), candidates=sensors)
+    found = score_sensors(plant, [layout], DeviceLoss(PoiVariance("die")), candidates=sensors)
     less = [list(part) for part in combinations(layout, 3)]
     singles = score_sensors(plant, less, PoiVariance("die"), candidates=sensors)
     assert found.values[0] == pytest.approx(singles.values[-1], rel=1e-9, abs=0.0)
-    three = score_sensors(plant, [layout[:3]], AfterLoss(PoiVariance("die")), candidates=sensors)
+    three = score_sensors(plant, [layout[:3]], DeviceLoss(PoiVariance("die")), candidates=sensors)
     assert np.isinf(three.values[0])
-    lost = AfterLoss(PoiLqr("die", effort=1e-8), of="actuators")
+    lost = DeviceLoss(PoiLqr("die", effort=1e-8), of="actuators")
     best = place_actuators(plant, actuators, 4, lost)
     assert best.value > place_actuators(plant, actuators, 4, lost.criterion).value
 
@@ -218,13 +222,13 @@ def test_what_wrappers_refuse(make):
     with pytest.raises(ModelError, match="at least one plant"):
         OverMachines(PoiVariance("die"), [])
     with pytest.raises(ModelError, match="does not depend on actuators"):
-        place_actuators(plant, actuators, 4, AfterLoss(PoiVariance("die"), of="actuators"))
+        place_actuators(plant, actuators, 4, DeviceLoss(PoiVariance("die"), of="actuators"))
     with pytest.raises(ModelError, match="no mass matrix"):
         place_sensors(plant, sensors, 4, KineticEnergy())
     mixed = [sensors[0].replace(asd=0.0), *sensors[1:]]
     for criterion in (ModalObservability(), SensorIndices()):
         with pytest.raises(AssumptionError, match="s0 have no noise"):
             place_sensors(plant, mixed, 4, criterion)
-    for wrong in (lambda: AfterLoss("die"), lambda: Penalised(PoiVariance(), 3.0)):
+    for wrong in (lambda: DeviceLoss("die"), lambda: Penalised(PoiVariance(), 3.0)):
         with pytest.raises(ModelError, match="must be a function"):
             wrong()

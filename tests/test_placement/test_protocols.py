@@ -11,9 +11,9 @@ from flexplant.errors import ModelError
 from flexplant.placement import (
     Criterion,
     Exchange,
-    Found,
     Scorer,
     Search,
+    SearchResult,
     place_actuators,
     place_sensors,
     score_sensors,
@@ -69,7 +69,7 @@ class Drawn(Search):
         values = problem.layouts.scores(sets, work)
         best = int(np.argmin(values))
         value = float(values[best])
-        return Found(sets[best], value, problem.bound(), len(sets), ((value,),))
+        return SearchResult(sets[best], value, problem.bound(), len(sets), ((value,),))
 
 
 def test_a_criterion_with_a_scorer_of_its_own(make):

@@ -17,7 +17,7 @@ import pytest
 import flexplant.parallel
 from flexplant.errors import ModelError, SolverError
 from flexplant.estimation import FixedLag
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.modes import Modes
 from flexplant.parallel import mapped
 from flexplant.placement import (
@@ -225,7 +225,7 @@ WAYS = {
     ("use", "way", "shape"),
     [
         *((use, way, None) for use in USES for way in ("usual", "own")),
-        *((use, "usual", lowpass(60.0)) for use in ("place_both", "sensor_map")),
+        *((use, "usual", low_pass_filter(60.0)) for use in ("place_both", "sensor_map")),
         ("sensor_map", "judged", None),
     ],
 )
@@ -265,8 +265,8 @@ def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
     [
         (None, 1.0, (Reference("die"),)),
         (None, 1.5, ()),
-        (lowpass(60.0), 1.0, ()),
-        (lowpass(60.0), 1.5, (Reference("die"),)),
+        (low_pass_filter(60.0), 1.0, ()),
+        (low_pass_filter(60.0), 1.5, (Reference("die"),)),
     ],
 )
 def test_on_a_shaken_floor_fast_scores_are_those_of_the_criteria(shape, delay, references):

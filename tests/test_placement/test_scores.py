@@ -10,7 +10,7 @@ import pytest
 from flexplant import load
 from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, SolverError
 from flexplant.estimation import design_kalman
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.placement import PoiLqr, PoiVariance, convex, score_actuators, score_sensors
 from flexplant.placement.convex import Quadratic
 from flexplant.placement.problem import layouts_of
@@ -136,7 +136,7 @@ def test_ports_with_filters_take_the_slow_way(make):
     plant, sensors, _ = make(4)
     if "dynamics" not in {field.name for field in fields(Sensor)}:
         pytest.skip("sensors have no dynamics yet")
-    slow = [s.replace(dynamics=lowpass(300.0)) for s in sensors[:3]]
+    slow = [s.replace(dynamics=low_pass_filter(300.0)) for s in sensors[:3]]
     assert not isinstance(layouts_of(plant, "y", slow, PoiVariance()).scorer, Quadratic)
     assert isinstance(layouts_of(plant, "y", sensors[:3], PoiVariance()).scorer, Quadratic)
     value = score_sensors(plant, [slow]).values[0]

@@ -5,7 +5,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.lti import highpass, lowpass
+from flexplant.lti import high_pass_filter, low_pass_filter
 from flexplant.plant import BaseAcceleration, GroundSpring, Poi, Ports, Sensor, suspend
 from flexplant.structure import FEModel
 from oracles_ports import chain, on_a_heavy_base, transmitted
@@ -56,13 +56,13 @@ def test_an_accelerometer_on_a_free_body_does_not_move_with_the_floor():
 
 def test_inertial_sensors_and_pois_of_a_suspended_structure():
     """Every kind of integral: by the sensor's zeros, the floor's, or one of each."""
-    geophone, shape = highpass(GEOPHONE, order=2), highpass(FLOOR, order=2)
+    geophone, shape = high_pass_filter(GEOPHONE, order=2), high_pass_filter(FLOOR, order=2)
     sensors = [
         Sensor("acc", at="3:x", quantity="acceleration"),
         Sensor("geo", at="3:x", quantity="velocity", absolute=True, dynamics=geophone),
         Sensor("bare", at="3:x", quantity="velocity", absolute=True),
-        Sensor("place", at="3:x", absolute=True, dynamics=highpass(GEOPHONE)),
-        Sensor("gap", at={"3:x": 1.0, "1:x": -1.0}, absolute=True, dynamics=lowpass(400.0)),
+        Sensor("place", at="3:x", absolute=True, dynamics=high_pass_filter(GEOPHONE)),
+        Sensor("gap", at={"3:x": 1.0, "1:x": -1.0}, absolute=True, dynamics=low_pass_filter(400.0)),
         Sensor("relative", at="3:x"),
     ]
     pois = [Poi("die", at="5:x", axes=("x",), absolute=True), Poi("own", at="5:x", axes=("x",))]
@@ -120,10 +120,10 @@ def test_what_would_grow_without_bound_is_refused():
     with pytest.raises(ModelError, match=r"'geo' is an absolute velocity.*'floor' has none"):
         plant([geo], [floor()])
     with pytest.raises(ModelError, match=r"need 1 zero .*highpass\(0.1, order=1\)"):
-        plant([geo.replace(dynamics=lowpass(100.0))], [floor(shape=lowpass(100.0))])
+        plant([geo.replace(dynamics=low_pass_filter(100.0))], [floor(shape=low_pass_filter(100.0))])
     pois = [Poi("die", at="5:x", axes=("x",), absolute=True)]
     with pytest.raises(ModelError, match=r"'die:x' is an absolute displacement.*has 1"):
-        plant([geo], [floor(shape=highpass(0.1))], pois)
+        plant([geo], [floor(shape=high_pass_filter(0.1))], pois)
     with pytest.raises(ModelError, match="absolute of 'y' is True"):
         Sensor("y", at="3:x", absolute="yes")
 
@@ -134,7 +134,7 @@ def test_a_tilting_floor_under_a_plate_of_modes():
     corners = [(x, y, 0.0) for x in (0.0, 0.6) for y in (0.0, 0.6)]
     springs = [GroundSpring(at, 900.0, 0.5) for at in corners]
     about = (0.1, 0.2, 0.0)
-    w = [BaseAcceleration("tilt", "rx", about=about, shape=highpass(FLOOR, order=2))]
+    w = [BaseAcceleration("tilt", "rx", about=about, shape=high_pass_filter(FLOOR, order=2))]
     place = (0.33, 0.47, 0.0)
     ports = Ports(
         w=w,
@@ -174,7 +174,7 @@ def test_skyhook_damping_on_a_geophone():
         u=[fx.Actuator("u", at="1:x", direction="x")],
         z=[Poi("die", at="1:x", axes=("x",))],
         y=[Sensor("geo", at="1:x", quantity="velocity", absolute=True, asd=1e-9,
-                  dynamics=highpass(0.01, order=2)),
+                  dynamics=high_pass_filter(0.01, order=2)),
            Sensor("acc", at="1:x", quantity="acceleration")],
     )  # fmt: skip
     found = fx.assemble_plant(body, ports)
@@ -193,7 +193,7 @@ def test_skyhook_damping_on_a_geophone():
 
 def test_held_models_feel_the_mass_that_couples_them_to_their_supports():
     """A clamped plate against one on a heavy base; without the coupling it is 3 per cent off."""
-    plate = make_plate(elements=(2, 2)).with_damping(fx.Rayleigh(0.0, 1e-6))
+    plate = make_plate(elements=(2, 2)).with_damping(fx.structure.Rayleigh(0.0, 1e-6))
     edge = plate.dofs.where(box=[(0, 0, 0), (0, 0.6, 0)])
     held = plate.fixed(edge)
     again = plate.fixed(list(edge)[:4]).fixed(list(edge)[4:])

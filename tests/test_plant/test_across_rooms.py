@@ -11,7 +11,7 @@ from stages import CORNERS, INSET, NOISE, RATE, Z8, L, ports, reduced, some_mode
 
 @pytest.fixture(scope="module")
 def filtered():
-    shaped = fx.lowpass(3000.0)
+    shaped = fx.lti.low_pass_filter(3000.0)
     sensors = [
         fx.Sensor(f"y{i}", at=p, asd=NOISE, dynamics=shaped) for i, p in enumerate(CORNERS, 1)
     ]
@@ -35,7 +35,7 @@ def test_a_servo_on_filtered_sensors_is_stable(filtered):
 
 
 def test_a_filtered_candidate_is_scored_by_its_own_filter(filtered):
-    slow = fx.Sensor("slow", at=(0.3, 0.3, 0.0), asd=NOISE, dynamics=fx.lowpass(50.0))
+    slow = fx.Sensor("slow", at=(0.3, 0.3, 0.0), asd=NOISE, dynamics=fx.lti.low_pass_filter(50.0))
     fast = fx.Sensor("fast", at=(0.3, 0.3, 0.0), asd=NOISE)
     layouts = [["y1", "y2", "y3", name] for name in ("fast", "slow")]
     own = filtered.assembled.ports

@@ -5,12 +5,12 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, LabelError, ModelError
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.placement import PoiLqr, score_actuators
 from flexplant.plant import Actuator, Disturbance, Sensor
 from stages import CORNERS, INSET, RATE, ports, reduced, some_modes
 
-AMP = lowpass(800.0, order=2)
+AMP = low_pass_filter(800.0, order=2)
 ASD = 2e-3
 
 

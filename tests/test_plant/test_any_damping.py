@@ -17,7 +17,7 @@ import flexplant as fx
 import oracles_damping as oracle
 from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, ModelError
-from flexplant.lti import frequency_response, lowpass
+from flexplant.lti import frequency_response, low_pass_filter
 from flexplant.modes import normal_form, solve_modes
 from flexplant.modes.normal_form import modal, real_form
 from flexplant.plant import (
@@ -191,7 +191,7 @@ def test_noise_of_a_sample_is_exact_and_a_covariance(case):
 
 def test_the_same_noise_with_a_filter_and_a_late_sensor():
     # an anti-alias filter and a delay go through the dense exponential of the whole
-    slow = lowpass(400.0, order=2)
+    slow = low_pass_filter(400.0, order=2)
     given = channels(y=[Sensor("y", at="3:z", dynamics=slow, latency=1.7 / RATE, asd=1e-11)])
     plant = quietly(model_of(*chain("held overdamped")), given).discretized(RATE, delay=0.4)
     M, D, K = chain("held overdamped")

@@ -8,7 +8,7 @@ import pytest
 from flexplant import DofSet
 from flexplant.errors import AssumptionError, LabelError
 from flexplant.estimation import design_kalman
-from flexplant.lti import StateSpace, lowpass
+from flexplant.lti import StateSpace, low_pass_filter
 from flexplant.lti.joining import axis_zeros
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, StandardPlant, assemble_plant
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
@@ -139,10 +139,13 @@ def test_what_a_sensor_measures_does_not_change_how_well_it_sees(quantity):
 def test_dynamics_of_ports_count_at_the_mode():
     """An actuator and a sensor that roll off reach and see a mode by their gain at its pole."""
     modes = some_modes()
-    u, y = ports().u[0].replace(dynamics=lowpass(300.0)), ports().y[0].replace(dynamics=lag(500.0))
+    u, y = (
+        ports().u[0].replace(dynamics=low_pass_filter(300.0)),
+        ports().y[0].replace(dynamics=lag(500.0)),
+    )
     plant = assemble_plant(modes, ports(u=[u], y=[y]))
     poles = modes.poles[3:]
-    H = {"u": lowpass(300.0), "y": lag(500.0)}
+    H = {"u": low_pass_filter(300.0), "y": lag(500.0)}
     for side, port in (("u", u), ("y", y)):
         gain = [abs(H[side].evaluated(pole)[0, 0]) for pole in poles]
         share = np.abs(modes.at(port.at)[3:]) * gain
@@ -150,7 +153,7 @@ def test_dynamics_of_ports_count_at_the_mode():
         np.testing.assert_allclose(found, share / share.max(), rtol=1e-6, atol=1e-9)
     assert not plant.check()["detectable"].holds  # one sensor, three rigid-body modes
     assert "rotation rx" in plant.check()["detectable"].finding
-    both = ports(u=[p.replace(dynamics=lowpass(300.0)) for p in ports().u],
+    both = ports(u=[p.replace(dynamics=low_pass_filter(300.0)) for p in ports().u],
                  y=[p.replace(dynamics=lag(500.0)) for p in ports().y])  # fmt: skip
     full = assemble_plant(modes, both).check()
     assert all(full[key].holds for key in KEYS[:4])
@@ -340,7 +343,7 @@ def test_a_filter_of_large_rows_hides_no_rigid_body(quantity, where):
 
     The plate is free, its four corners push and measure: everything is reached and seen.
     """
-    lag = lowpass(2000.0, order=2)
+    lag = low_pass_filter(2000.0, order=2)
     own = ports()
     at_y = lag if where != "actuator" else None
     at_u = lag if where != "sensor" else None

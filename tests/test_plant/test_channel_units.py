@@ -15,7 +15,7 @@ def every_kind():
             fx.Disturbance("push", at="1:z", asd=1.0),
             fx.Disturbance("twist", at=(0, 0, 0), direction="rx"),
             fx.BaseAcceleration("floor"),
-            fx.OutputDisturbance("drift", sensor="tilt"),
+            fx.plant.OutputDisturbance("drift", sensor="tilt"),
             fx.Disturbance("mixed", at={"1:z": 1.0, "1:rx": 2.0}),
         ],
         u=[fx.Actuator("u1", at=(0, 0, 0)), fx.Actuator("m1", at="1:ry")],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
-from flexplant.lti import StateSpace, lowpass
+from flexplant.lti import StateSpace, low_pass_filter
 from flexplant.plant import (
     Actuator,
     GroundSpring,
@@ -125,7 +125,7 @@ def test_refusals():
     with pytest.raises(AssumptionError, match="actuators"):
         gravity_axes(assemble_plant(some_modes(), ports(u=[Actuator("u", at=Z8)])))
     with pytest.raises(ModelError, match="assembled from a structure"):
-        gravity_axes(StandardPlant.from_statespace(lowpass(3.0), u=["in"], y=["out"]))
+        gravity_axes(StandardPlant.from_statespace(low_pass_filter(3.0), u=["in"], y=["out"]))
     assert repr(gravity_axes(plant)).startswith(
         "<GravityAxes z, rx, ry at (0.3, 0.3, 0) m: 4 actua"
     )

@@ -5,7 +5,15 @@ import pytest
 
 from flexplant import design_hinf
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, highpass, inverse_sensitivity, lft, lowpass, tf, tustin
+from flexplant.lti import (
+    StateSpace,
+    high_pass_filter,
+    inverse_sensitivity,
+    lft,
+    low_pass_filter,
+    tf,
+    tustin,
+)
 from flexplant.plant import mixed_sensitivity
 
 LAG = tf([200.0], [1.0, 10.1, 1.0]).replace(inputs=["force"], outputs=["x"])
@@ -18,7 +26,7 @@ def test_it_is_the_stacked_loop(rate):
                    np.zeros((2, 2)))  # fmt: skip
     G = tustin(G, rate) if rate else G
     K = StateSpace([], [], [], [[0.4, 0.1], [0.0, 0.7]], dt)
-    W_S, W_T = inverse_sensitivity(2.0), highpass(5.0)
+    W_S, W_T = inverse_sensitivity(2.0), high_pass_filter(5.0)
     P = mixed_sensitivity(G, S=W_S, KS=0.1, T=W_T)
     assert P.z == ("S:y1", "S:y2", "KS:u1", "KS:u2", "T:y1", "T:y2")
     closed = lft(P.system, K.replace(inputs=P.y, outputs=P.u))
@@ -49,4 +57,4 @@ def test_refusals():
     with pytest.raises(ModelError, match=r"weight S must be one by one or 1 by 1"):
         mixed_sensitivity(LAG, S=np.eye(2))
     with pytest.raises(ModelError, match=r"has dt 0.1 s, the plant 0 s"):
-        mixed_sensitivity(LAG, S=tustin(lowpass(1.0), 10.0))
+        mixed_sensitivity(LAG, S=tustin(low_pass_filter(1.0), 10.0))

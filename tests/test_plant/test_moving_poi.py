@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.lti import lowpass
+from flexplant.lti import low_pass_filter
 from flexplant.plant import Actuator, Feedthrough, Poi, Sensor, assemble_plant
 from oracles_plant import motion_row, receptance, z_row
 from stages import AXES, CORNERS, INSET, OFF_NODE, RATE, Z8, L, full, ports, reduced, some_modes
@@ -121,7 +121,7 @@ def test_refusals():
         plant.discretized(RATE, delay=1).along("u1", PATH)
     with pytest.raises(ModelError, match="is a Sensor"):
         plant.along("y1", PATH)
-    slow = ports(u=[Actuator("u1", at=Z8, dynamics=lowpass(100.0))])
+    slow = ports(u=[Actuator("u1", at=Z8, dynamics=low_pass_filter(100.0))])
     with pytest.raises(ModelError, match="acts through a filter"):
         assemble_plant(some_modes(), slow).along("u1", PATH)
     twice = ports(z=[Poi("die", at=Z8), Poi("edge", at=OFF_NODE)], references=[])

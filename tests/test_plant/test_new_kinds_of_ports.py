@@ -11,9 +11,9 @@ from flexplant.errors import ModelError
 from flexplant.estimation import design_kalman
 from flexplant.labels import Place
 from flexplant.loop import close_loop
-from flexplant.lti import StateSpace, h2_norm, lowpass
+from flexplant.lti import StateSpace, h2_norm, low_pass_filter
 from flexplant.placement import PoiVariance, score_sensors
-from flexplant.plant import ForcePort, NarrowBand, Seen, Sensor, SensorPort, assemble_plant
+from flexplant.plant import ForcePort, MeasuredRow, NarrowBand, Sensor, SensorPort, assemble_plant
 from flexplant.reduction import ModalTruncation, reduce
 from flexplant.simulation import simulate
 from flexplant.synthesis import design_servo
@@ -56,7 +56,7 @@ class Led(SensorPort):
     def see(self, realisation):
         """Return a row q and a row of T dq/dt."""
         row = self.row(realisation)
-        return Seen(
+        return MeasuredRow(
             realisation.motion(row, 0) + self.lead * realisation.motion(row, 1),
             realisation.at_once(row),
         )
@@ -147,7 +147,7 @@ def test_velocity_and_acceleration():
 @pytest.mark.slow
 def test_sampled_estimated_simulated_saved(tmp_path):
     """A filter, a latency, a Kalman filter and a run: those of the same sum of displacements."""
-    filtered = {"asd": NOISE, "dynamics": lowpass(2e3), "latency": 1.3 / RATE}
+    filtered = {"asd": NOISE, "dynamics": low_pass_filter(2e3), "latency": 1.3 / RATE}
     own = Stretch("s", CORNERS[3], CORNERS[0], **filtered)
     same = Sensor("s", at={CORNERS[3]: 1.0, CORNERS[0]: -1.0}, **filtered)
     plants = [sampled(reduced(), with_sensor(sensor)) for sensor in (own, same)]

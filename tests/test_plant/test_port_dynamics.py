@@ -7,7 +7,7 @@ import scipy.linalg as la
 from flexplant import DofSet, load
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
-from flexplant.lti import StateSpace, discretized, frequency_response, lowpass, pade, tf
+from flexplant.lti import StateSpace, discretized, frequency_response, low_pass_filter, pade, tf
 from flexplant.lti.equations import state_scale
 from flexplant.lti.sampling import Flow, held_exactly, sample_and_hold
 from flexplant.plant import (
@@ -346,8 +346,8 @@ def plate_with_filters(**changes):
     """The paper's plate, a filter on each sensor (states before the modes) and each actuator."""
     base = ports(**changes)
     return base.replace(
-        y=[s.replace(dynamics=lowpass(3e3, order=2), latency=3e-5) for s in base.y],
-        u=[a.replace(dynamics=lowpass(4e3)) for a in base.u],
+        y=[s.replace(dynamics=low_pass_filter(3e3, order=2), latency=3e-5) for s in base.y],
+        u=[a.replace(dynamics=low_pass_filter(4e3)) for a in base.u],
     )
 
 

@@ -30,7 +30,7 @@ def ports(x=None, y=None, **more):
             *(fx.Sensor(f"y{i}", at=place(p), asd=1e-12, **moves) for i, p in enumerate(CORNERS)),
             fx.Sensor(
                 "acc", at={place((0.2, 0.3)): 0.5, place((0.4, 0.3)): -0.5},
-                quantity="acceleration", dynamics=fx.lowpass(3e3), asd=1e-6, **moves,
+                quantity="acceleration", dynamics=fx.lti.low_pass_filter(3e3), asd=1e-6, **moves,
             ),
             fx.Sensor("fixed", at=(0.1, 0.1, 0.0), asd=1e-12),
         ],
@@ -85,7 +85,9 @@ def test_weights_blocks_reduction_and_files_go_along(modes, tmp_path):
     weights = fx.stage_weights(plant, 40.0)
     moving, there = plant.weighted(weights), plant.at(x=0.05)
     same(moving.at(x=0.05), there.weighted(weights))
-    filtered = fx.lti.append(*[fx.lowpass(2e3).replace(inputs=[n], outputs=[n]) for n in ("y0",)])
+    filtered = fx.lti.append(
+        *[fx.lti.low_pass_filter(2e3).replace(inputs=[n], outputs=[n]) for n in ("y0",)]
+    )
     filtered = fx.lti.tustin(filtered, 1e4)
     both = plant.through(filtered).weighted(z={"die:error": 2.0}, w={"amp": None})
     wanted = there.through(filtered).weighted(z={"die:error": 2.0}, w={"amp": None})

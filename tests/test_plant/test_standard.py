@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flexplant import load
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.lti import StateSpace, frequency_response, highpass, lowpass
+from flexplant.lti import StateSpace, frequency_response, high_pass_filter, low_pass_filter
 from flexplant.plant import (
     Actuator,
     BaseAcceleration,
@@ -328,7 +328,7 @@ class TestWhereItCameFrom:
         assert plant.check().assumptions is plant.check().assumptions
 
 
-DYNAMIC = lowpass(2e3, order=2)
+DYNAMIC = low_pass_filter(2e3, order=2)
 
 
 @pytest.mark.slow
@@ -338,7 +338,7 @@ DYNAMIC = lowpass(2e3, order=2)
 def test_some_of_a_plants_ports_are_rows_and_columns_of_it(monkeypatch, part, late, delay):
     """What is left out takes its filters and delay lines along; nothing is assembled again."""
     usual = ports()
-    floor = BaseAcceleration("floor", "z", asd=1e-5, shape=highpass(1.0, order=2))
+    floor = BaseAcceleration("floor", "z", asd=1e-5, shape=high_pass_filter(1.0, order=2))
     y = [
         Sensor("y1", at=Z8, asd=1e-11, dynamics=part, latency=late),
         Sensor("y2", at=(0.1, 0.1, 0.0), asd=1e-11, absolute=True),

@@ -280,8 +280,12 @@ def test_the_gain_of_an_actuator_behind_its_own_filter(rate, amplifier):
 
     def made(gain):
         own = fx.Ports(
-            u=[fx.Actuator("u1", at="1:x", dynamics=gain * fx.lowpass(500.0), asd=amplifier)],
-            y=[fx.Sensor("y1", at="2:x", asd=1e-10, dynamics=fx.lowpass(900.0))],
+            u=[
+                fx.Actuator(
+                    "u1", at="1:x", dynamics=gain * fx.lti.low_pass_filter(500.0), asd=amplifier
+                )
+            ],
+            y=[fx.Sensor("y1", at="2:x", asd=1e-10, dynamics=fx.lti.low_pass_filter(900.0))],
         )
         plant = fx.assemble_plant(modes, own)
         return plant.discretized(rate, delay=1.0) if rate else plant

@@ -62,12 +62,16 @@ def test_every_damping_beside_dense_solutions(plate):
     part = padded.K.toarray() - K
     free = M - M @ R @ R.T @ M
     for model, law, damping_at in (
-        (plate, fx.Hysteretic(2e-3), lambda omega: 2e-3j * K),
-        (plate, fx.Rayleigh(3.0, 1e-7), lambda omega: 1j * omega * (3.0 * free + 1e-7 * K)),
+        (plate, fx.structure.Hysteretic(2e-3), lambda omega: 2e-3j * K),
+        (
+            plate,
+            fx.structure.Rayleigh(3.0, 1e-7),
+            lambda omega: 1j * omega * (3.0 * free + 1e-7 * K),
+        ),
         (damped, None, lambda omega: 1j * omega * damped.D.toarray()),
         (
             padded,
-            fx.Hysteretic(2e-3, regions={"pad": (0.3, pad)}),
+            fx.structure.Hysteretic(2e-3, regions={"pad": (0.3, pad)}),
             lambda omega: 2e-3j * K + (1 + 0.3j) * part,
         ),
     ):
@@ -94,12 +98,12 @@ def test_without_damping_there_is_no_response_at_a_resonance(plate):
 
 @pytest.mark.slow
 def test_all_kinds_of_ports_as_in_a_plant(plate):
-    lowpass = fx.lowpass(500.0, order=2)
+    lowpass = fx.lti.low_pass_filter(500.0, order=2)
     ports = fx.Ports(
         w=[
             fx.Disturbance("d", (0.11, 0.22, 0)),
             fx.BaseAcceleration("floor"),
-            fx.OutputDisturbance("o", "a"),
+            fx.plant.OutputDisturbance("o", "a"),
             RigidForce("turn", "rx"),
         ],
         u=[fx.Actuator("u1", "1:z", dynamics=lowpass), fx.Actuator("u2", (0.3, 0.3, 0), "rx")],
@@ -110,10 +114,14 @@ def test_all_kinds_of_ports_as_in_a_plant(plate):
             fx.Sensor("sum", {"1:z": 1.0, "3:z": -1.0}),
         ],
     )
-    damped = plate.with_damping(fx.Rayleigh(1.0, 1e-7))
+    damped = plate.with_damping(fx.structure.Rayleigh(1.0, 1e-7))
     modes = fx.solve_modes(plate, count=20, damping=fx.ModalDamping(0.01), compliance_at=["1:z"])
     kept = ["1:z", "7:z", "43:z", "49:z", "15:z"]
-    for model in (damped, modes, fx.reduce(plate, fx.Guyan(kept, damping=fx.ModalDamping(0.01)))):
+    for model in (
+        damped,
+        modes,
+        fx.reduce(plate, fx.reduction.Guyan(kept, damping=fx.ModalDamping(0.01))),
+    ):
         found = fx.frequency_response(model, ports, FREQ)
         plant = fx.assemble_plant(model, ports)
         wanted = fx.frequency_response(plant.system.select(found.outputs, found.inputs), FREQ)
@@ -160,7 +168,7 @@ def test_the_check_sees_a_wrong_basis_and_mends_a_poor_one(plate, monkeypatch):
 
 
 def test_modes_in_use_are_not_solved_again(plate, monkeypatch):
-    model = plate.with_damping(fx.Rayleigh(0.0, 1e-7))
+    model = plate.with_damping(fx.structure.Rayleigh(0.0, 1e-7))
     modes = fx.solve_modes(model, count=30)
     monkeypatch.setattr(solving, "solve_modes", None)
     found = fx.frequency_response(model, PLAIN, FREQ)
@@ -173,7 +181,7 @@ def test_modes_in_use_are_not_solved_again(plate, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
-    [fx.ModalDamping(0.01), fx.Hysteretic(0.02), fx.Rayleigh(2.0, 1e-6), None],
+    [fx.ModalDamping(0.01), fx.structure.Hysteretic(0.02), fx.structure.Rayleigh(2.0, 1e-6), None],
     ids=["modal", "hysteretic", "rayleigh", "dampers"],
 )
 @pytest.mark.parametrize("lost", [0, 2])
@@ -213,7 +221,7 @@ def test_a_large_model_by_fronts():
     at = plate.dofs.indices
     row = plate.row("30:z") - plate.row("300:z")
     part = sp.csc_array(1e5 * np.outer(row, row))
-    by_region = fx.Hysteretic(2e-3, regions={"pad": (0.3, sp.csc_array(part))})
+    by_region = fx.structure.Hysteretic(2e-3, regions={"pad": (0.3, sp.csc_array(part))})
     for law, more in ((by_region, 0.298), (fx.ModalDamping(1e-3), 0.0)):
         found = fx.frequency_response(plate, PLAIN, FREQ, damping=law)
         assert found.error.max() < 1e-4
@@ -222,7 +230,7 @@ def test_a_large_model_by_fronts():
             lu = dynamic_lu(plate.K + 1j * loss - (2 * np.pi * f) ** 2 * plate.M)
             wanted = lu.solve(np.eye(plate.n_dof, dtype=complex)[:, at(FORCED)])[at(SEEN)]
             # away from resonance a loss factor and its viscous equivalent differ by their size
-            limit = 1e-4 if isinstance(law, fx.Hysteretic) else 5e-3
+            limit = 1e-4 if isinstance(law, fx.structure.Hysteretic) else 5e-3
             assert np.abs(data - wanted).max() < limit * np.abs(wanted).max()
 
 

@@ -13,7 +13,7 @@ import scipy.optimize
 import oracles_uncertainty as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
-from flexplant.lti import StateSpace, frequency_response, lft, lowpass
+from flexplant.lti import StateSpace, frequency_response, lft, low_pass_filter
 from flexplant.plant import (
     BaseAcceleration,
     Fit,
@@ -459,7 +459,7 @@ def test_accelerations_of_complex_modes_repeat_the_deltas(filtered):
     """Exact: as the changed plant, and s^2 times what displacement sensors of it show."""
     fit = fitted(0.5)[0]
     damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
-    dynamics = lowpass(900.0, order=2) if filtered else None
+    dynamics = low_pass_filter(900.0, order=2) if filtered else None
     y = [Sensor(f"y{i}", at=p, quantity="acceleration", dynamics=dynamics)
          for i, p in enumerate(CORNERS, 1)]  # fmt: skip
     plant = assemble_plant(damped.model, ports(y=y))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.lti import StateSpace, frequency_response, highpass, lowpass, tustin
+from flexplant.lti import StateSpace, frequency_response, high_pass_filter, low_pass_filter, tustin
 from flexplant.plant import StandardPlant, assemble_plant, standard_plant
 from stages import RATE, ports, some_modes
 
@@ -19,7 +19,7 @@ def gain_of(sys):
 @pytest.mark.parametrize("rate", [0.0, RATE])
 def test_the_transfer_is_wz_p_ww(rate):
     plant = assemble_plant(some_modes(), ports())
-    low, high = lowpass(100.0, order=2, gain=1e9), highpass(20.0, gain=3.0)
+    low, high = low_pass_filter(100.0, order=2, gain=1e9), high_pass_filter(20.0, gain=3.0)
     if rate:
         plant, low, high = plant.discretized(rate, delay=1), tustin(low, rate), tustin(high, rate)
     heavy = plant.weighted(
@@ -53,8 +53,9 @@ def test_nothing_named_changes_nothing():
 
 def test_a_continuous_weight_is_sampled_at_the_plants_rate():
     plant = assemble_plant(some_modes(), ports()).discretized(RATE)
+    slow = low_pass_filter(10.0)
     heavy, wanted = (plant.weighted(z={"die:z": weight})
-                     for weight in (lowpass(10.0), tustin(lowpass(10.0), RATE)))  # fmt: skip
+                     for weight in (slow, tustin(slow, RATE)))  # fmt: skip
     np.testing.assert_array_equal(heavy.system.A, wanted.system.A)
     np.testing.assert_array_equal(heavy.system.C, wanted.system.C)
 
@@ -69,7 +70,7 @@ def test_weights_of_python_control():
 
 def test_check_looks_at_the_machine_behind_the_weights():
     plant = assemble_plant(some_modes(), ports())
-    heavy = plant.weighted(z={"die:z": lowpass(10.0)})
+    heavy = plant.weighted(z={"die:z": low_pass_filter(10.0)})
     assert heavy.check()["excited"].holds
     assert heavy.check().ok
 
@@ -93,7 +94,7 @@ def test_a_plant_says_what_was_done_to_it():
     np.testing.assert_allclose(sampled.sensor_noise, [[0.5 * alone]], rtol=1e-12)
     np.testing.assert_array_equal(sampled.process_noise, sampled.unweighted.process_noise)
     slow = plant.discretized(RATE, delay=1).through(
-        tustin(lowpass(100.0), RATE).replace(inputs=["y1"], outputs=["slow"])
+        tustin(low_pass_filter(100.0), RATE).replace(inputs=["y1"], outputs=["slow"])
     )
     with pytest.raises(ModelError, match=r"block .* has 1 states"):
         _ = slow.sensor_noise
@@ -106,7 +107,7 @@ def test_refusals():
     with pytest.raises(LabelError, match="no channel of w 'amp9'"):
         plant.weighted(w={"amp9": 1.0})
     with pytest.raises(ModelError, match=r"has dt 0.01 s, the plant 0.0001 s.*continuous system"):
-        plant.weighted(z={"die:z": tustin(lowpass(10.0), 100.0)})
+        plant.weighted(z={"die:z": tustin(low_pass_filter(10.0), 100.0)})
     with pytest.raises(ModelError, match=r"one input and one output.*Select a channel"):
         plant.weighted(z={"die:z": StateSpace([], [], [], np.eye(2))})
     with pytest.raises(ModelError, match="left out: keep at least one"):
@@ -124,7 +125,7 @@ def test_refusals():
 STEPS = {
     "discretized": lambda plant: plant.discretized(4e3, delay=1.0),
     "at": lambda plant: plant.at((0.15, 0.3, 0.0)),
-    "weighted": lambda plant: plant.weighted(z={"die:z": lowpass(100.0)}, w={"amp1": 3.0}),
+    "weighted": lambda plant: plant.weighted(z={"die:z": low_pass_filter(100.0)}, w={"amp1": 3.0}),
     "through": lambda plant: plant.through(
         StateSpace([], [], [], [[0.5, 0.5]], inputs=["y1", "y2"], outputs=["mean"])
     ),

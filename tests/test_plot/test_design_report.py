@@ -175,7 +175,9 @@ def test_what_is_no_report(tmp_path):
     with pytest.raises(ModelError, match="holds values of flexplant, got 3"):
         fx.plot.report(tmp_path / "x", 3)
     with pytest.raises(ModelError, match="two parts of the report are named 'a'"):
-        fx.plot.report(tmp_path / "x", {"a": fx.lowpass(1.0)}, {"a": fx.lowpass(2.0)})
+        fx.plot.report(
+            tmp_path / "x", {"a": fx.lti.low_pass_filter(1.0)}, {"a": fx.lti.low_pass_filter(2.0)}
+        )
     assert not list(tmp_path.iterdir())
 
 

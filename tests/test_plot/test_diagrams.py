@@ -132,7 +132,7 @@ def test_systems_may_stand_in_a_list():
 @pytest.mark.parametrize("rate", [0.0, 1e4])
 def test_poles_by_frequency_and_damping(rate):
     g = machine(n_rigid=1, n_elastic=4, m=1, p=1)
-    ax = fx.plot.pole_map({"stage": fx.discretized(g, rate) if rate else g}, zeros=True)
+    ax = fx.plot.pole_map({"stage": fx.lti.discretized(g, rate) if rate else g}, zeros=True)
     poles, wrong = ax.get_lines()[:2]
     np.testing.assert_allclose(np.sort(poles.get_xdata()), np.linspace(245.0, 3700.0, 4), rtol=1e-6)
     np.testing.assert_allclose(poles.get_ydata(), 1e-3, rtol=1e-5)

@@ -39,7 +39,7 @@ def test_lines_differ_without_colour():
 
 
 def test_the_same_thing_looks_the_same_everywhere():
-    g = fx.lowpass(10.0)
+    g = fx.lti.low_pass_filter(10.0)
     freq = np.geomspace(1.0, 100.0, 30)
     clean = fx.frequency_response(g, freq)
     noisy = clean.replace(variance=np.full(clean.data.shape, 1e-6))
@@ -91,12 +91,16 @@ def test_prefixes(size, unit, shown):
 
 def test_a_band_is_drawn_to_its_own_scale():
     freq = np.geomspace(0.1, 1e4, 400)
-    ax = fx.plot.frf({"model": fx.lowpass(10.0)}, "out", "in", freq=freq, band=(100.0, 1e3))
+    ax = fx.plot.frf(
+        {"model": fx.lti.low_pass_filter(10.0)}, "out", "in", freq=freq, band=(100.0, 1e3)
+    )
     line = ax.get_lines()[0]
     assert min(line.get_xdata()) >= 100.0 and max(line.get_xdata()) <= 1e3
     assert -45.0 < ax.get_ylim()[0] < -40.0 and -20.0 < ax.get_ylim()[1] < -15.0
     with pytest.raises(ModelError, match=r"no frequency from 20000 to 30000 Hz"):
-        fx.plot.frf({"model": fx.lowpass(10.0)}, "out", "in", freq=freq, band=(2e4, 3e4))
+        fx.plot.frf(
+            {"model": fx.lti.low_pass_filter(10.0)}, "out", "in", freq=freq, band=(2e4, 3e4)
+        )
 
 
 def size_of(response):

@@ -20,7 +20,7 @@ def run_of(names, unit="N"):
 
 
 def systems(count):
-    return {f"case {k}": fx.lowpass(10.0 * 1.4**k) for k in range(1, count + 1)}
+    return {f"case {k}": fx.lti.low_pass_filter(10.0 * 1.4**k) for k in range(1, count + 1)}
 
 
 def test_six_forces_are_all_seen():
@@ -77,7 +77,11 @@ def test_more_lines_than_looks_are_named_at_their_ends():
 def test_a_phase_within_half_a_turn():
     """As an analyser draws it, whatever has been wound up; the line is broken at the jumps."""
     freq = np.geomspace(1.0, 1e3, 500)
-    g = fx.lowpass(30.0, order=2) * fx.lowpass(20.0, order=2) * fx.lowpass(10.0)
+    g = (
+        fx.lti.low_pass_filter(30.0, order=2)
+        * fx.lti.low_pass_filter(20.0, order=2)
+        * fx.lti.low_pass_filter(10.0)
+    )
     response = fx.frequency_response(g, freq)["out", "in"]
     _, phase = fx.plot.bode(g, freq=freq, wrap=True).figure.axes
     drawn = phase.get_lines()[0].get_ydata()
@@ -90,7 +94,7 @@ def test_a_phase_within_half_a_turn():
 
 def test_phase_coherence_and_deviation_beside_a_magnitude():
     freq = np.geomspace(1.0, 1e3, 60)
-    clean = fx.frequency_response(fx.lowpass(30.0), freq)
+    clean = fx.frequency_response(fx.lti.low_pass_filter(30.0), freq)
     frf = clean.replace(
         coherence=np.linspace(0.2, 1.0, 60)[None, None], variance=np.full((1, 1, 60), 1e-6)
     )

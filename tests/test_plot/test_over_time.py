@@ -17,7 +17,7 @@ LAG = tf([9.0], [1.0, 0.6, 9.0])
 
 def test_a_step_is_the_textbooks():
     """1 - e^(-zeta w t) (cos w_d t + zeta w / w_d sin w_d t), until 1 % is left of it."""
-    ax = fx.plot.step({"lag": LAG, "held": fx.discretized(LAG, 5.0)})
+    ax = fx.plot.step({"lag": LAG, "held": fx.lti.discretized(LAG, 5.0)})
     exact, held = ax.get_lines()
     time = np.asarray(exact.get_xdata())
     assert ax.get_xlabel() == "time [s]"
@@ -34,9 +34,9 @@ def test_a_step_is_the_textbooks():
 
 
 def test_steps_of_several_channels():
-    g = fx.lti.append(LAG, fx.lowpass(100.0).replace(inputs=["r"], outputs=["y"])).replace(
-        inputs=["f", "r"], outputs=["x", "y"], units={"f": "N", "x": "m"}
-    )
+    g = fx.lti.append(
+        LAG, fx.lti.low_pass_filter(100.0).replace(inputs=["r"], outputs=["y"])
+    ).replace(inputs=["f", "r"], outputs=["x", "y"], units={"f": "N", "x": "m"})
     ax = fx.plot.step(1e-6 * g, duration=0.05)
     labels = [panel.get_ylabel() for panel in ax.figure.axes]
     assert (labels[0], labels[3]) == ("x [nm]", "y")

@@ -49,7 +49,7 @@ def test_modes_and_reduced_models_are_updated_as_the_drawing_is():
     drawing = bare().with_damping(LAW)
     every = fx.solve_modes(drawing)
     with_vector = fx.solve_modes(bare(), count=3, damping=LAW, compliance_at="3:x")
-    rom = fx.reduce(every, fx.ModalTruncation(2))
+    rom = fx.reduce(every, fx.reduction.ModalTruncation(2))
     expected = pipeline()(machine(0.1), 1)
     assert expected["mass at 3:x"] == pytest.approx(0.1, rel=0.1)
     assert expected["stable"]
@@ -66,7 +66,7 @@ def test_the_report_holds_the_run_against_the_model():
     assert "The run beside the model\n  not judged: " in repr(short)
     assert longer.agreement.holds
     assert set(longer.agreement.spectra) == {2, 3}
-    assert "The run beside the model\n  <Consistency at 95 %" in repr(longer)
+    assert "The run beside the model\n  <ConsistencyReport at 95 %" in repr(longer)
 
 
 @pytest.mark.slow

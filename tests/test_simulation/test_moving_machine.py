@@ -169,7 +169,9 @@ def test_refusals(modes, loop):
         fx.simulate(loop, duration=0.01, moving={"x": np.linspace(0, 0.2, 100)})
     with pytest.raises(ModelError, match="without finer samples"):
         fx.simulate(loop, duration=0.01, moving={"x": np.zeros(100)}, finer=2)
-    plant = fx.assemble_plant(modes, ports(dynamics=fx.lowpass(4e3))).discretized(1 / H, delay=1)
+    plant = fx.assemble_plant(modes, ports(dynamics=fx.lti.low_pass_filter(4e3))).discretized(
+        1 / H, delay=1
+    )
     observer = fx.design_kalman(plant)
     servo = fx.design_servo(plant, bandwidth=40.0, observer=observer)
     other = fx.close_loop(plant, observer, servo)

@@ -207,7 +207,7 @@ def test_rest_shifts_the_motion():
     assert later.duration == pytest.approx(move.duration + 0.25)
     t = np.linspace(0, 1.2, 50)
     np.testing.assert_allclose(later.at(t + 0.25).position, move.at(t).position, atol=1e-13)
-    assert repr(move).startswith("<SetPoint 0 -> 1 m or rad in 1.25 s, order 3")
+    assert repr(move).startswith("<SetPointProfile 0 -> 1 m or rad in 1.25 s, order 3")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def line(report, subject):
 
 
 def matrices(model, K=None, M=None, **changes):
-    return fx.FEMatrices(
+    return fx.structure.FEMatrices(
         model.K if K is None else K,
         model.M if M is None else M,
         dofs=model.dofs.replace(interpolation=None, **changes),
@@ -110,12 +110,14 @@ def test_k_and_m_swapped(model, held):
         model = model.fixed(
             [name for name in model.dofs.labels if model.dofs.location(name)[0] == 0]
         )
-    given = fx.FEMatrices(model.M, model.K, dofs=model.dofs)
+    given = fx.structure.FEMatrices(model.M, model.K, dofs=model.dofs)
     report = fx.check(given)
     assert [*report.of("fail"), *report.of("note")] == ["order of K and M"]  # nothing beside it
     assert "FEModel(M, K)" in line(report, "order of K and M")[3]
     for massless in ("refuse", "condense"):
-        with pytest.raises(ModelError, match=r"swapped\? .* The order is FEMatrices\(K, M\)"):
+        with pytest.raises(
+            ModelError, match=r"swapped\? .* The order is fx\.structure\.FEMatrices\(K, M\)"
+        ):
             given.model(massless=massless)
 
 

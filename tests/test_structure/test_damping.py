@@ -241,9 +241,12 @@ def test_loss_factors_by_region():
     # the same ratios in time, by D, and in reduced models
     damped = solve_modes(model.with_damping(law), count=9)
     np.testing.assert_allclose(damped.zeta, modes.zeta, rtol=1e-6)
-    for method in (fx.Rubin(["1:z"], 9, damping=law), fx.ModalTruncation(9, damping=law)):
+    for method in (
+        fx.reduction.Rubin(["1:z"], 9, damping=law),
+        fx.reduction.ModalTruncation(9, damping=law),
+    ):
         np.testing.assert_allclose(fx.reduce(model, method).modes().zeta[:9], modes.zeta, rtol=1e-6)
-    boxed = fx.reduce(model, fx.CraigBampton(["1:z", "12:z"], 25, damping=law))
+    boxed = fx.reduce(model, fx.reduction.CraigBampton(["1:z", "12:z"], 25, damping=law))
     np.testing.assert_allclose(boxed.modes().zeta[:6], modes.zeta[:6], rtol=0.01)
     # modes of near frequencies are coupled most
     square = fx.chain(masses=[1.0, 1.0], stiffnesses=[1.0], ground=[1e5, 1e5])

@@ -58,7 +58,7 @@ def test_a_plate_whose_rows_are_shuffled(held):
     rng = np.random.default_rng(3)
     rows = rng.permutation(plate.n_dof)[: plate.n_dof - 40 * held]
     K, M = (sp.csc_array(sp.csc_array(A)[rows][:, rows]) for A in (plate.K, plate.M))
-    freq = fx.FEMatrices(K, M).frequencies(12)
+    freq = fx.structure.FEMatrices(K, M).frequencies(12)
     rigid = 0 if held else 3
     np.testing.assert_array_equal(freq[:rigid], 0.0)
     values = spla.eigsh(K, 12, M, sigma=-10.0, return_eigenvectors=False)
@@ -69,7 +69,7 @@ def test_a_plate_whose_rows_are_shuffled(held):
 def test_rows_without_mass_have_no_frequency():
     K, M = springs(np.random.default_rng(1), 9, free=False, spread=2)
     M[[2, 5]] = 0.0
-    freq = fx.FEMatrices(K, M).frequencies(20)
+    freq = fx.structure.FEMatrices(K, M).frequencies(20)
     rest = np.setdiff1d(np.arange(9), [2, 5])
     out = np.array([2, 5])
     inner = np.linalg.solve(K[np.ix_(out, out)], K[np.ix_(out, rest)])
@@ -81,16 +81,16 @@ def test_rows_without_mass_have_no_frequency():
 def test_what_has_no_frequencies_is_said():
     K, M = springs(np.random.default_rng(1), 5, free=False, spread=2)
     with pytest.raises(ModelError, match="no M"):
-        fx.FEMatrices(K).frequencies()
+        fx.structure.FEMatrices(K).frequencies()
     with pytest.raises(ModelError, match="negative energy"):
-        fx.FEMatrices(K - 2 * np.diag(np.diag(K)), M).frequencies()
+        fx.structure.FEMatrices(K - 2 * np.diag(np.diag(K)), M).frequencies()
     skew = K.copy()
     skew[0, 1] += 1.0
     with pytest.raises(ModelError, match="K is not symmetric"):
-        fx.FEMatrices(skew, M).frequencies()
+        fx.structure.FEMatrices(skew, M).frequencies()
     for count in (0, 61, 2.5):
         with pytest.raises(ModelError, match="count"):
-            fx.FEMatrices(K, M).frequencies(count)
+            fx.structure.FEMatrices(K, M).frequencies(count)
     for refused in (lambda found: found.model(), lambda found: fx.solve_modes(found)):
         with pytest.raises(ModelError, match=r"frequencies\("):
-            refused(fx.FEMatrices(K, M))
+            refused(fx.structure.FEMatrices(K, M))

@@ -85,7 +85,7 @@ def test_both_triangles_are_left_for_the_check():
 
 def test_a_good_pair_is_a_model():
     K, M, dofs = chain(4)
-    model = fx.FEMatrices(K, M, dofs=dofs).model(name="chain")
+    model = fx.structure.FEMatrices(K, M, dofs=dofs).model(name="chain")
     np.testing.assert_array_equal(model.K.toarray(), K)
     assert model.name == "chain"
     assert model.rigid_body.shape == (4, 1)
@@ -93,7 +93,7 @@ def test_a_good_pair_is_a_model():
 
 def test_massless_dofs_are_named_and_condensed_exactly():
     K, M, dofs = chain(6, masses=[1, 0, 2, 0, 0, 3], ground=50.0)
-    found = fx.FEMatrices(K, M, dofs=dofs)
+    found = fx.structure.FEMatrices(K, M, dofs=dofs)
     assert found.massless == ("2:x", "4:x", "5:x")
     with pytest.raises(ModelError, match=r"'2:x', '4:x', '5:x'.*condense"):
         found.model()
@@ -111,22 +111,22 @@ def test_massless_dofs_are_named_and_condensed_exactly():
 def test_damping_between_dofs_with_mass_survives_condensation():
     K, M, dofs = chain(3, masses=[1, 0, 2], ground=50.0)
     D = np.diag([0.7, 0, 0])
-    model = fx.FEMatrices(K, M, D, dofs=dofs).model(massless="condense")
+    model = fx.structure.FEMatrices(K, M, D, dofs=dofs).model(massless="condense")
     np.testing.assert_array_equal(model.D.toarray(), np.diag([0.7, 0]))
     with pytest.raises(ModelError, match=r"damping.*2:x"):
-        fx.FEMatrices(K, M, np.diag([0, 1.0, 0]), dofs=dofs).model(massless="condense")
+        fx.structure.FEMatrices(K, M, np.diag([0, 1.0, 0]), dofs=dofs).model(massless="condense")
 
 
 def test_massless_dofs_that_do_not_follow_are_refused():
     K, M, dofs = chain(4, masses=[1, 1, 0, 0])
     K[1:3, 1:3] -= 1000.0 * np.array([[1, -1], [-1, 1]])  # 3 and 4 hang together in mid air
     with pytest.raises(ModelError, match="motion without stiffness"):
-        fx.FEMatrices(K, M, dofs=dofs).model(massless="condense")
+        fx.structure.FEMatrices(K, M, dofs=dofs).model(massless="condense")
 
 
 def test_an_offset_mass_without_rotary_inertia_is_condensed_exactly():
     K, M, dofs = beam_with_offset_mass()
-    found = fx.FEMatrices(K, M, dofs=dofs)
+    found = fx.structure.FEMatrices(K, M, dofs=dofs)
     with pytest.raises(ModelError, match=r"3 motions without inertia, turning .*2:"):
         found.model()
     model = found.model(massless="condense")
@@ -146,14 +146,14 @@ def test_an_offset_mass_without_rotary_inertia_is_condensed_exactly():
 
 def test_an_offset_mass_with_rotary_inertia_needs_nothing():
     K, M, dofs = beam_with_offset_mass(rotary=0.01)
-    assert fx.FEMatrices(K, M, dofs=dofs).model().n_dof == 12
+    assert fx.structure.FEMatrices(K, M, dofs=dofs).model().n_dof == 12
 
 
 def test_an_indefinite_mass_is_refused():
     K, M, dofs = chain(3, ground=1.0)
     M[0, 1] = M[1, 0] = 1.5
     with pytest.raises(ModelError, match="indefinite"):
-        fx.FEMatrices(K, M, dofs=dofs).model(massless="condense")
+        fx.structure.FEMatrices(K, M, dofs=dofs).model(massless="condense")
 
 
 @pytest.mark.parametrize(
@@ -163,17 +163,19 @@ def test_an_indefinite_mass_is_refused():
 def test_what_is_missing_is_said(change, match):
     K, M, dofs = chain(3)
     with pytest.raises(ModelError, match=match):
-        fx.FEMatrices(K, M, dofs=dofs).replace(**change).model()
+        fx.structure.FEMatrices(K, M, dofs=dofs).replace(**change).model()
 
 
 def test_unlocated_matrices_make_held_models_only():
     K, M, dofs = chain(3)
     zero = fx.DofSet(dofs.nodes, dofs.directions, np.zeros((3, 3)))
     with pytest.raises(ModelError, match="free to move"):
-        fx.FEMatrices(K, M, dofs=zero, located=False).model()
-    held = fx.FEMatrices(K + np.diag([5.0, 0, 0]), M, dofs=zero, located=False)
+        fx.structure.FEMatrices(K, M, dofs=zero, located=False).model()
+    held = fx.structure.FEMatrices(K + np.diag([5.0, 0, 0]), M, dofs=zero, located=False)
     assert held.model().n_dof == 3
-    free = fx.FEMatrices(K, M, dofs=zero, located=False).located_at([3, 2, 1], dofs.xyz[::-1])
+    free = fx.structure.FEMatrices(K, M, dofs=zero, located=False).located_at(
+        [3, 2, 1], dofs.xyz[::-1]
+    )
     np.testing.assert_array_equal(free.dofs.xyz, dofs.xyz)
     assert free.model().rigid_body.shape == (3, 1)
     with pytest.raises(LabelError, match=r"\[3\]"):
@@ -183,17 +185,21 @@ def test_unlocated_matrices_make_held_models_only():
 @pytest.mark.parametrize(
     ("make", "error", "match"),
     [
-        (lambda: fx.FEMatrices(np.ones((2, 3))), ShapeError, "square"),
-        (lambda: fx.FEMatrices(np.eye(2), np.eye(3)), ShapeError, "like K"),
-        (lambda: fx.FEMatrices(np.eye(2), dofs=chain(3)[2]), ShapeError, "3 DOFs"),
-        (lambda: fx.FEMatrices([[np.nan]]), ModelError, "NaN"),
-        (lambda: fx.FEMatrices([[1j]]), ModelError, "real"),
-        (lambda: fx.FEMatrices(sp.csc_array([[np.inf]])), ModelError, "infinite"),
-        (lambda: fx.FEMatrices([[1.0]], digits=0), ModelError, "digits"),
-        (lambda: fx.FEMatrices([[1.0]], dofs="x"), ModelError, "DofSet"),
-        (lambda: fx.FEMatrices([[1.0]]).model(massless="drop"), ModelError, "refuse"),
-        (lambda: fx.FEMatrices([[1.0]]).without(["1:x"]), LabelError, "no names"),
-        (lambda: fx.FEMatrices([[1.0]]).converted(length="mm"), LabelError, "no names yet"),
+        (lambda: fx.structure.FEMatrices(np.ones((2, 3))), ShapeError, "square"),
+        (lambda: fx.structure.FEMatrices(np.eye(2), np.eye(3)), ShapeError, "like K"),
+        (lambda: fx.structure.FEMatrices(np.eye(2), dofs=chain(3)[2]), ShapeError, "3 DOFs"),
+        (lambda: fx.structure.FEMatrices([[np.nan]]), ModelError, "NaN"),
+        (lambda: fx.structure.FEMatrices([[1j]]), ModelError, "real"),
+        (lambda: fx.structure.FEMatrices(sp.csc_array([[np.inf]])), ModelError, "infinite"),
+        (lambda: fx.structure.FEMatrices([[1.0]], digits=0), ModelError, "digits"),
+        (lambda: fx.structure.FEMatrices([[1.0]], dofs="x"), ModelError, "DofSet"),
+        (lambda: fx.structure.FEMatrices([[1.0]]).model(massless="drop"), ModelError, "refuse"),
+        (lambda: fx.structure.FEMatrices([[1.0]]).without(["1:x"]), LabelError, "no names"),
+        (
+            lambda: fx.structure.FEMatrices([[1.0]]).converted(length="mm"),
+            LabelError,
+            "no names yet",
+        ),
     ],
 )
 def test_bad_input_is_refused(make, error, match):
@@ -209,7 +215,7 @@ def test_rows_that_a_solver_left_for_held_dofs_are_dropped():
     for held, diagonal in ((0, 0.0), (3, 1.0)):
         K[held], K[:, held], M[held] = 0, 0, 0
         K[held, held] = diagonal
-    left = fx.FEMatrices(K, M, dofs=dofs).trimmed()
+    left = fx.structure.FEMatrices(K, M, dofs=dofs).trimmed()
     assert left.constrained == ("1:x", "4:x")
     assert left.dofs.labels == ("2:x", "3:x", "5:x")
     assert "2 rows" in left.notes[-1]
@@ -219,7 +225,7 @@ def test_rows_that_a_solver_left_for_held_dofs_are_dropped():
 def test_a_penalty_is_named_by_the_check_and_dropped_on_demand():
     K, M, dofs = chain(5)
     K[0, 0] += 1e14
-    found = fx.FEMatrices(K, M, dofs=dofs)
+    found = fx.structure.FEMatrices(K, M, dofs=dofs)
     assert "penalties" in fx.check(found).of("note")
     held = found.without(["1:x"])
     assert held.constrained == ("1:x",)
@@ -235,7 +241,7 @@ def test_a_penalty_is_named_by_the_check_and_dropped_on_demand():
 
 def test_units_of_matrices_and_coordinates():
     K, M, dofs = chain(3)
-    mm = fx.FEMatrices(K, M, 2 * M, dofs=dofs.replace(xyz=1000 * dofs.xyz))
+    mm = fx.structure.FEMatrices(K, M, 2 * M, dofs=dofs.replace(xyz=1000 * dofs.xyz))
     si = mm.converted(length="mm", mass="t")
     np.testing.assert_allclose(si.K.toarray(), 1e3 * K, rtol=1e-14)
     np.testing.assert_allclose(si.M.toarray(), 1e3 * M, rtol=1e-14)
@@ -249,13 +255,13 @@ def test_local_coordinate_systems_are_turned():
     C = la.qr(rng.standard_normal((3, 3)))[0]
     C *= np.sign(np.linalg.det(C))
     turn = la.block_diag(np.eye(6), C, C)  # q_local = turn q_global
-    local = fx.FEMatrices(turn @ K @ turn.T, turn @ M @ turn.T, dofs=dofs)
+    local = fx.structure.FEMatrices(turn @ K @ turn.T, turn @ M @ turn.T, dofs=dofs)
     back = local.rotated({2: C})
     np.testing.assert_allclose(back.K.toarray(), K, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(back.M.toarray(), M, rtol=1e-10, atol=1e-12)
     # the order of the rows does not matter
     order = rng.permutation(12)
-    mixed = fx.FEMatrices(
+    mixed = fx.structure.FEMatrices(
         local.K.toarray()[np.ix_(order, order)],
         dofs=fx.DofSet(dofs.nodes[order], [dofs.directions[i] for i in order], dofs.xyz),
     ).rotated({2: C})
@@ -265,11 +271,11 @@ def test_local_coordinate_systems_are_turned():
 def test_a_partly_held_node_with_a_local_system_is_refused():
     K, M, dofs = chain(3)
     with pytest.raises(ModelError, match="only 1 of three"):
-        fx.FEMatrices(K, M, dofs=dofs).rotated({2: np.eye(3)})
+        fx.structure.FEMatrices(K, M, dofs=dofs).rotated({2: np.eye(3)})
     with pytest.raises(LabelError, match="node 9"):
-        fx.FEMatrices(K, M, dofs=dofs).rotated({9: np.eye(3)})
+        fx.structure.FEMatrices(K, M, dofs=dofs).rotated({9: np.eye(3)})
     with pytest.raises(ModelError, match="orthogonal"):
-        fx.FEMatrices(K, M, dofs=dofs).rotated({2: np.ones((3, 3))})
+        fx.structure.FEMatrices(K, M, dofs=dofs).rotated({2: np.ones((3, 3))})
 
 
 # digits
@@ -283,9 +289,9 @@ def plate(digits):
     )  # fmt: skip
     K, M = fe.K.toarray(), fe.M.toarray()
     if digits is None:
-        return fx.FEMatrices(K, M, dofs=fe.dofs), fe
+        return fx.structure.FEMatrices(K, M, dofs=fe.dofs), fe
     printed = np.vectorize(lambda value: float(f"{value:.{digits - 1}e}"))
-    return fx.FEMatrices(printed(K), printed(M), dofs=fe.dofs, digits=digits), fe
+    return fx.structure.FEMatrices(printed(K), printed(M), dofs=fe.dofs, digits=digits), fe
 
 
 @pytest.mark.slow
@@ -316,7 +322,7 @@ def test_freed_rigid_body_motions_leave_the_elastic_modes():
     )  # fmt: skip
     printed = np.vectorize(lambda value: float(f"{value:.7e}"))
     K, M = printed(fe.K.toarray()), printed(fe.M.toarray())
-    text = fx.FEMatrices(K, M, dofs=fe.dofs, digits=8)
+    text = fx.structure.FEMatrices(K, M, dofs=fe.dofs, digits=8)
     with pytest.warns(FlexplantWarning, match=r"free=True"):
         text.model()
     free = text.freed()
@@ -326,7 +332,7 @@ def test_freed_rigid_body_motions_leave_the_elastic_modes():
     np.testing.assert_allclose(
         fx.solve_modes(model, count=8).omega[3:], fx.solve_modes(fe, count=8).omega[3:], rtol=1e-6
     )
-    held = fx.FEMatrices(K + np.eye(len(K)) * K.max(), M, dofs=fe.dofs, digits=8)
+    held = fx.structure.FEMatrices(K + np.eye(len(K)) * K.max(), M, dofs=fe.dofs, digits=8)
     with pytest.raises(ModelError, match="held"):
         held.freed()
 

@@ -28,7 +28,7 @@ def truss(points=POINTS, bars=None, masses=None, scale=1.0):
     dofs = fx.DofSet(
         np.repeat(np.arange(1, n + 1), 3), ("x", "y", "z") * n, scale * np.repeat(points, 3, axis=0)
     )
-    return fx.FEMatrices(K, np.diag(np.repeat(m, 3)), dofs=dofs, source="truss")
+    return fx.structure.FEMatrices(K, np.diag(np.repeat(m, 3)), dofs=dofs, source="truss")
 
 
 def beam(n=4, length=2.0, scale=1.0):
@@ -48,7 +48,7 @@ def beam(n=4, length=2.0, scale=1.0):
         M[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += m
     xyz = np.repeat(np.column_stack([np.arange(n + 1) * h, *2 * [np.zeros(n + 1)]]), 2, axis=0)
     dofs = fx.DofSet(np.repeat(np.arange(1, n + 2), 2), ("y", "rz") * (n + 1), scale * xyz)
-    return fx.FEMatrices(K, M, dofs=dofs)
+    return fx.structure.FEMatrices(K, M, dofs=dofs)
 
 
 def line(report, subject):
@@ -188,7 +188,7 @@ def test_pieces_that_nothing_joins():
         np.r_[one.dofs.nodes, one.dofs.nodes + 10], one.dofs.directions * 2,
         np.r_[one.dofs.xyz, one.dofs.xyz + np.array([9.0, 0, 0])],
     )  # fmt: skip
-    report = fx.check(fx.FEMatrices(K, M, dofs=dofs))
+    report = fx.check(fx.structure.FEMatrices(K, M, dofs=dofs))
     assert report.n_pieces == 2
     assert (report.n_zero, report.n_rigid, report.mechanisms) == (12, 12, ())
     assert "2 bodies, each with its own motions" in line(report, "rigid body")[2]
@@ -204,7 +204,7 @@ def test_a_solver_diagonal_is_noticed():
         np.r_[found.dofs.nodes, 3 * [5]], (*found.dofs.directions, "x", "y", "z"),
         np.r_[found.dofs.xyz, np.zeros((3, 3))],
     )  # fmt: skip
-    report = fx.check(fx.FEMatrices(K, M, dofs=dofs))
+    report = fx.check(fx.structure.FEMatrices(K, M, dofs=dofs))
     assert "5:x, 5:y, 5:z" in line(report, "uncoupled rows")[2]
 
 
@@ -244,9 +244,9 @@ def test_something_else_is_refused(wrong):
     "K", [np.zeros((3, 3)), [[1.0, 2.0], [2.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]], [[-1.0]], [[1.0]]]
 )
 def test_hopeless_matrices_get_a_report_too(K):
-    report = fx.check(fx.FEMatrices(K))
+    report = fx.check(fx.structure.FEMatrices(K))
     assert not report.ok
-    assert fx.check(fx.FEMatrices(K, np.zeros_like(K))).of("fail")
+    assert fx.check(fx.structure.FEMatrices(K, np.zeros_like(K))).of("fail")
 
 
 @pytest.mark.slow
@@ -277,7 +277,7 @@ def magnets(n, pull, bends=False):
     if bends:
         K[0, 0] += 1e9
     dofs = fx.DofSet(np.arange(1, n + 1), ["x"] * n, np.arange(3 * n).reshape(n, 3) * [1.0, 0, 0])
-    return fx.FEMatrices(sp.csc_array(K), sp.eye_array(n, format="csc"), dofs=dofs)
+    return fx.structure.FEMatrices(sp.csc_array(K), sp.eye_array(n, format="csc"), dofs=dofs)
 
 
 def beside_a_mass(directions):
@@ -288,7 +288,7 @@ def beside_a_mass(directions):
         [*one.dofs.nodes, *[99] * m], [*one.dofs.directions, *directions],
         np.vstack([one.dofs.xyz, np.full((m, 3), 7.0)]),
     )  # fmt: skip
-    return fx.FEMatrices(K, M, dofs=dofs)
+    return fx.structure.FEMatrices(K, M, dofs=dofs)
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ def modes():
 
 @cache
 def rom():
-    return fx.reduce(plate(), fx.Guyan(["1:z", "5:z", "21:z", "25:z"]))
+    return fx.reduce(plate(), fx.reduction.Guyan(["1:z", "5:z", "21:z", "25:z"]))
 
 
 def of_plate(**options):
@@ -91,18 +91,26 @@ CALLS = [
     ("check", lambda x: fx.check(x), ()),
     ("ModalDamping", lambda x: fx.ModalDamping(x), ()),
     ("ModalDamping rigid", lambda x: fx.ModalDamping(0.01, rigid=x), ("fraction",)),
-    ("Rayleigh", lambda x: fx.Rayleigh(x, 0.0), ("fraction",)),
-    ("Rayleigh rigid", lambda x: fx.Rayleigh(1.0, 0.0, rigid=x), ("bool",)),
-    ("Hysteretic", lambda x: fx.Hysteretic(x), ()),
-    ("reduce", lambda x: fx.reduce(x, fx.Guyan(["1:z"])), ()),
+    ("Rayleigh", lambda x: fx.structure.Rayleigh(x, 0.0), ("fraction",)),
+    ("Rayleigh rigid", lambda x: fx.structure.Rayleigh(1.0, 0.0, rigid=x), ("bool",)),
+    ("Hysteretic", lambda x: fx.structure.Hysteretic(x), ()),
+    ("reduce", lambda x: fx.reduce(x, fx.reduction.Guyan(["1:z"])), ()),
     ("reduce method", lambda x: fx.reduce(plate(), x), ()),
-    ("Guyan", lambda x: fx.reduce(plate(), fx.Guyan(x)), ()),
+    ("Guyan", lambda x: fx.reduce(plate(), fx.reduction.Guyan(x)), ()),
     ("DesiredDofs", lambda x: fx.reduce(modes(), fx.DesiredDofs(x)), ()),
-    ("CraigBampton modes", lambda x: fx.CraigBampton(["1:z"], x), ()),
-    ("CraigBampton below", lambda x: fx.CraigBampton(["1:z"], below=x), ("none", "fraction")),
-    ("Rubin modes", lambda x: fx.Rubin(["1:z"], x), ()),
-    ("Krylov freq", lambda x: fx.reduce(plate(), fx.Krylov(["1:z"], freq=x)), ("fraction", "bool")),
-    ("ModalTruncation", lambda x: fx.ModalTruncation(x), ()),
+    ("CraigBampton modes", lambda x: fx.reduction.CraigBampton(["1:z"], x), ()),
+    (
+        "CraigBampton below",
+        lambda x: fx.reduction.CraigBampton(["1:z"], below=x),
+        ("none", "fraction"),
+    ),
+    ("Rubin modes", lambda x: fx.reduction.Rubin(["1:z"], x), ()),
+    (
+        "Krylov freq",
+        lambda x: fx.reduce(plate(), fx.reduction.Krylov(["1:z"], freq=x)),
+        ("fraction", "bool"),
+    ),
+    ("ModalTruncation", lambda x: fx.reduction.ModalTruncation(x), ()),
     ("quality", lambda x: rom().quality(x, band=(10, 100)), ()),
     ("quality band", lambda x: rom().quality(plate(), band=x), ()),
     ("select_dofs", lambda x: fx.select_dofs(x, 5), ()),
@@ -114,7 +122,7 @@ CALLS = [
     ("where box", lambda x: plate().dofs.where(box=x), ("none",)),
     ("nearest", lambda x: plate().dofs.nearest(x), ()),
     ("dofs.row", lambda x: plate().dofs.row(x), ()),
-    ("rank_modes", lambda x: fx.rank_modes(x, inputs="1:z"), ()),
+    ("rank_modes", lambda x: fx.reduction.rank_modes(x, inputs="1:z"), ()),
     *(
         (name, getattr(io, name), ("text",))
         for name in sorted(vars(io))

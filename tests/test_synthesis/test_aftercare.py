@@ -39,7 +39,7 @@ def plant(sampled=True, count=4):
 def designed(sampled=True):
     """H-infinity with a slow weight on the tip and a roll-off on the force: 11 states or so."""
     given = plant(sampled)
-    slow = fx.lowpass(0.2) * 300.0
+    slow = fx.lti.low_pass_filter(0.2) * 300.0
     slow = tustin(slow, RATE) if sampled else slow
     weighted = given.weighted(z={"tip:x": slow, "f:effort": 0.02}, w={"s:noise": 1e-2})
     return weighted, fx.design_hinf(weighted)

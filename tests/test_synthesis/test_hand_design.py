@@ -63,7 +63,7 @@ def test_a_block_is_what_it_was_continuous_and_sampled():
     np.testing.assert_allclose(
         response(FixedBlock(own).sampled(2e3)), (a + 200.0) / (a**2 + 30.0 * a + 1e5), rtol=1e-9
     )
-    sampled = fx.discretized(own, 2e3)
+    sampled = fx.lti.discretized(own, 2e3)
     block = FixedBlock.of(sampled, label="filter")
     assert block.own_rate == 2e3
     np.testing.assert_allclose(response(block), fx.frequency_response(sampled, FREQ).data[0, 0])

@@ -158,7 +158,7 @@ def test_refusals():
 def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
     """mu falls below one, and so does the weighted gain of all corners, where LQG-like did not."""
     deltas = uncertain(sampled, std=0.03)
-    slow = fx.lowpass(0.5) * 40.0
+    slow = fx.lti.low_pass_filter(0.5) * 40.0
     z = {"tip:x": tustin(slow, RATE) if sampled else slow, "f:effort": 0.03}
     w = {"d": 1.0, "s:noise": 0.01}
     found = design_mu(deltas, w=w, z=z)
@@ -176,7 +176,7 @@ def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
 def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
     """Only frequencies are uncertain: mu is that of the machines, and of the general search."""
     deltas = plant(True).uncertain(frequency=0.03)
-    z = {"tip:x": tustin(fx.lowpass(0.5) * 40.0, RATE), "f:effort": 0.03}
+    z = {"tip:x": tustin(fx.lti.low_pass_filter(0.5) * 40.0, RATE), "f:effort": 0.03}
     w = {"d": 1.0, "s:noise": 0.01}
     found = design_mu(deltas, w=w, z=z)
     assert "one channel a mode" in found.method

@@ -92,7 +92,7 @@ def test_a_mass_rides_on_all_translations_as_a_point_mass_does():
     for axis in "xyz":
         moved = np.array([float(d == axis) for d in block.dofs.directions])
         assert moved @ dM @ moved == pytest.approx(1.0)
-    rom = fx.reduce(fx.solve_modes(block, count=12), fx.ModalTruncation(count=12))
+    rom = fx.reduce(fx.solve_modes(block, count=12), fx.reduction.ModalTruncation(count=12))
     reduced = added.matrices(rom)[0]
     assert np.linalg.matrix_rank(reduced) == 3
     np.testing.assert_allclose(reduced, rom.T.T @ dM @ rom.T, atol=1e-12)
@@ -114,7 +114,7 @@ def test_a_mass_in_three_directions_is_found():
     numbers = [7, 8, 9, 10, 11]
     poles = [1j * truth.omega[k - 1] for k in numbers]
     measured = fx.Eigenvalues(fx.MeasuredModes(poles=poles, modes=numbers))
-    rom = fx.reduce(fx.solve_modes(block, count=40), fx.ModalTruncation(count=40))
+    rom = fx.reduce(fx.solve_modes(block, count=40), fx.reduction.ModalTruncation(count=40))
     fits = {
         d: fx.update(rom, [AddedMass(place, direction=d)], [measured], full=block)
         for d in ("xyz", "z")

@@ -481,7 +481,7 @@ def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
         monkeypatch.setitem(sys.modules, name, shell)
     bundle, _ = bench._repr_mimebundle_()
     assert "text/html" in bundle
-    assert repr(bench).startswith("<Workbench of Frf: u1 -> y1")
+    assert repr(bench).startswith("<WorkbenchServer of Frf: u1 -> y1")
 
 
 def test_wrong_options_are_refused(frf):

@@ -31,7 +31,7 @@ Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 """
 
 from ..rooms import public_names as _public_names
-from .consistency import Consistency as Consistency
+from .consistency import ConsistencyReport as ConsistencyReport
 from .consistency import consistency as consistency
 from .error import MachineTable as MachineTable
 from .error import errors_on_machines as errors_on_machines
@@ -40,7 +40,7 @@ from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
 from .filter_model import KalmanCertificate as KalmanCertificate
 from .filter_model import check_gain as check_gain
-from .invertibility import Invertibility as Invertibility
+from .invertibility import InvertibilityReport as InvertibilityReport
 from .invertibility import check_bias as check_bias
 from .invertibility import invertibility as invertibility
 from .kalman import design_kalman as design_kalman

@@ -65,7 +65,7 @@ _HALF_WIDTHS, _BESIDE = 3.0, 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Consistency(Value):
+class ConsistencyReport(Value):
     """Tests of the innovations of an estimator: level, whiteness, spectrum and likely cause.
 
     Parameters
@@ -114,8 +114,9 @@ class Consistency(Value):
     def __repr__(self) -> str:
         nees = "".join(f", NEES {name} {m:.3g}" for name, (m, _, _) in self.nees.items())
         return (
-            f"<Consistency at {100 * self.level:g} %: NIS {self.nis:.4g} (p {self.nis_p:.2g}), "
-            f"Ljung-Box p {self.whiteness_p:.2g}, periodogram p {self.periodogram_p:.2g}{nees};\n"
+            f"<ConsistencyReport at {100 * self.level:g} %: NIS {self.nis:.4g} "
+            f"(p {self.nis_p:.2g}), Ljung-Box p {self.whiteness_p:.2g}, "
+            f"periodogram p {self.periodogram_p:.2g}{nees};\n"
             f"  {self.text}{self._off()}>"
         )
 
@@ -144,7 +145,7 @@ def consistency(
     *,
     truth: Any = None,
     level: float = 0.95,
-) -> Consistency:
+) -> ConsistencyReport:
     """Return whether a record agrees with the model of its estimator, and if not, why.
 
     With a right model the whitened innovations are white noise of unit variance. Five tests share
@@ -187,7 +188,7 @@ def consistency(
 
     Returns
     -------
-    Consistency
+    ConsistencyReport
 
     Raises
     ------
@@ -258,7 +259,7 @@ def consistency(
     without = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
     rate = 1.0 / observer.plant.dt
     capital = (one.text[:1].upper() + one.text[1:] for one in said[1:])
-    return Consistency(
+    return ConsistencyReport(
         *raw.nis,
         raw.box.p_value,
         raw.bartlett.p_value,

@@ -36,7 +36,7 @@ class InputEntry(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Invertibility(Value):
+class InvertibilityReport(Value):
     """Whether sensors determine unknown inputs d held over each sample, and how late.
 
     Parameters
@@ -67,7 +67,7 @@ class Invertibility(Value):
 
     def __repr__(self) -> str:
         holds = "holds" if self.holds else "does not hold"
-        return f"<Invertibility {holds}: {self.text}>"
+        return f"<InvertibilityReport {holds}: {self.text}>"
 
     @property
     def holds(self) -> bool:
@@ -110,7 +110,7 @@ class Invertibility(Value):
         return f"a force of {freq:.4g} Hz{grows}"
 
 
-def invertibility(plant: AnyPlant | System, inputs: Sequence[str]) -> Invertibility:
+def invertibility(plant: AnyPlant | System, inputs: Sequence[str]) -> InvertibilityReport:
     """Return whether the sensors determine disturbances that nothing is assumed of.
 
     With d held over each sample, ``x+ = A x + G d``, ``y = C x + H d``, an unbiased filter with
@@ -132,7 +132,7 @@ def invertibility(plant: AnyPlant | System, inputs: Sequence[str]) -> Invertibil
 
     Returns
     -------
-    Invertibility
+    InvertibilityReport
 
     Raises
     ------
@@ -175,7 +175,9 @@ def input_entry(plant: AnyPlant, names: Sequence[str]) -> InputEntry:
     return InputEntry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
 
 
-def ranks_and_zeros(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
+def ranks_and_zeros(
+    model: FilterModel, d: InputEntry, names: tuple[str, ...]
+) -> InvertibilityReport:
     """Return ranks and zeros; see `invertibility`."""
     out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), TINY))[:, None]
     C, H = out * model.C2, out * d.H
@@ -184,7 +186,7 @@ def ranks_and_zeros(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -
     zeros = np.zeros(0, dtype=np.complex128)
     if delay is not None:
         zeros = _zeros(model.A, d.G, C, H if delay == 0 else C @ d.G, delay)
-    return Invertibility(names, model.sensors, direct, delayed, delay, zeros, model.dt)
+    return InvertibilityReport(names, model.sensors, direct, delayed, delay, zeros, model.dt)
 
 
 def _rank(matrix: FloatArray) -> int:

@@ -193,7 +193,7 @@ class FixedLag(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.FixedLag(5)
+    >>> fx.estimation.FixedLag(5)
     FixedLag(samples=5)
     """
 
@@ -214,7 +214,8 @@ class Smoother(Value):
     >>> import numpy as np
     >>> observer = fx.design_kalman(fx.testbeds.three_masses())
     >>> records = {"y1": np.zeros(50), "y2": np.zeros(50), "u1": np.zeros(50)}
-    >>> lags = (fx.estimation.Predictor(), fx.estimation.Filter(), fx.FixedLag(5), fx.Smoother())
+    >>> from flexplant.estimation import Filter, FixedLag, Predictor, Smoother
+    >>> lags = (Predictor(), Filter(), FixedLag(5), Smoother())
     >>> found = [observer.estimate(records, lag).deviation("die:hat")[25] for lag in lags]
     >>> found == sorted(found, reverse=True)
     True

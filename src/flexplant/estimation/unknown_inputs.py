@@ -29,7 +29,13 @@ from .filter_model import (
     noise_root,
     weigh,
 )
-from .invertibility import InputEntry, Invertibility, input_entry, ranks_and_zeros, unknown_names
+from .invertibility import (
+    InputEntry,
+    InvertibilityReport,
+    input_entry,
+    ranks_and_zeros,
+    unknown_names,
+)
 from .kalman import filter_design
 from .noise_from_records import with_densities
 
@@ -179,7 +185,7 @@ def design_input_estimator(
     )
 
 
-def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _InputDesign:
+def _unbiased(model: FilterModel, d: InputEntry, found: InvertibilityReport) -> _InputDesign:
     if not found.holds:
         raise AssumptionError(
             f"the unknown inputs are not determined by the sensors: {found.text}. Add a sensor, or "
@@ -263,7 +269,7 @@ def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
 
 
 def _augmented(
-    method: Augmented, m: FilterModel, d: InputEntry, found: Invertibility
+    method: Augmented, m: FilterModel, d: InputEntry, found: InvertibilityReport
 ) -> _InputDesign:
     """Return the Kalman filter of the plant with the inputs as states."""
     n, k = d.G.shape
@@ -396,7 +402,7 @@ class InputEstimator(Value):
         Of the errors at the POIs.
     input_variances : (m,) array [N^2 or (N m)^2]
         Of the errors of the inputs.
-    invertibility : Invertibility
+    invertibility : InvertibilityReport
         Whether the sensors determine the inputs without any assumption of them.
     certificate : InputCertificate
     """
@@ -407,7 +413,7 @@ class InputEstimator(Value):
     delay: int
     variances: FloatArray
     input_variances: FloatArray
-    invertibility: Invertibility
+    invertibility: InvertibilityReport
     certificate: InputCertificate
 
     def __repr__(self) -> str:

@@ -239,7 +239,7 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     --------
     >>> import flexplant as fx
     >>> runs = [fx.Frf([10.0, 20.0], [[[1.0 - e, 2.0 + e]]]) for e in (-0.1, 0.1)]
-    >>> mean = fx.average_frfs(runs)
+    >>> mean = fx.identification.average_frfs(runs)
     >>> mean.data.real
     array([[[1., 2.]]])
     >>> mean.variance.round(4)

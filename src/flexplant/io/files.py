@@ -151,7 +151,7 @@ def file_path(path: Any, name: str = "path") -> Path:
     if not isinstance(path, str | Path):
         raise FlexplantError(
             f"{name} must name a file, got {short(path)}. Pass matrices that are in memory already "
-            "to FEModel(M, K, dofs=...) or FEMatrices(K, M, dofs=...)."
+            "to FEModel(M, K, dofs=...) or fx.structure.FEMatrices(K, M, dofs=...)."
         )
     if Path(path).is_dir():
         raise FlexplantError(f"{str(path)!r} is a folder. Name the file in it.")

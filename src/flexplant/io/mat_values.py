@@ -64,7 +64,8 @@ def write_mat(
     >>> import os, tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = os.path.join(folder, "filters.mat")
-    ...     fx.io.write_mat(path, {"slow": fx.lowpass(10.0), "fast": fx.lowpass(100.0)})
+    ...     slow, fast = fx.lti.low_pass_filter(10.0), fx.lti.low_pass_filter(100.0)
+    ...     fx.io.write_mat(path, {"slow": slow, "fast": fast})
     ...     fx.io.read_mat(path, "fast")
     <StateSpace: 1 state, continuous, in -> out>
     """
@@ -151,7 +152,8 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
     >>> import os, tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = os.path.join(folder, "filters.mat")
-    ...     fx.io.write_mat(path, {"slow": fx.lowpass(10.0), "fast": fx.lowpass(100.0)})
+    ...     slow, fast = fx.lti.low_pass_filter(10.0), fx.lti.low_pass_filter(100.0)
+    ...     fx.io.write_mat(path, {"slow": slow, "fast": fast})
     ...     list(fx.io.read_mat_values(path))
     ['slow', 'fast']
     """

@@ -9,7 +9,7 @@
 >>> import flexplant as fx
 >>> stage = fx.chain(masses=[2.0, 1.0], stiffnesses=[1e5])
 >>> frame = fx.chain(masses=[10.0, 5.0], stiffnesses=[1e6])
->>> joint = fx.Joint("frame/2:x", "stage/1:x", stiffness=1e4)
+>>> joint = fx.joining.Joint("frame/2:x", "stage/1:x", stiffness=1e4)
 >>> machine = fx.joined({"stage": stage, "frame": frame}, [joint])
 >>> fx.solve_modes(machine).freq.round(1)
 array([ 0. , 10. , 62. , 87.4])

@@ -162,7 +162,8 @@ class PlacedShape(Interpolation):
     >>> import flexplant as fx
     >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
-    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> joint = fx.joining.Joint("left/3:z", "right/1:z")
+    >>> shift = fx.joining.Pose(shift=(0.2, 0.0, 0.0))
     >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
     >>> machine.dofs.interpolation.parts[1].interpolation.own
     BeamShape(length=0.2, elements=2)
@@ -226,7 +227,8 @@ class JoinedShape(Interpolation):
     >>> import flexplant as fx
     >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
-    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> joint = fx.joining.Joint("left/3:z", "right/1:z")
+    >>> shift = fx.joining.Pose(shift=(0.2, 0.0, 0.0))
     >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
     >>> machine.dofs.interpolation.names, machine.dofs.nearest((0.4, 0.0, 0.0), "z")
     (('left', 'right'), 'right/3:z')

@@ -53,13 +53,13 @@ def frf_links(joint: Joint, parts: Sequence[Channels]) -> list[FrfLink]:
         if isinstance(end, tuple):
             raise ModelError(
                 f"{joint!r} is between points, whose motion no channel is. Join channels, "
-                "Joint('stage/41:z', 'frame/7:z'), or a Patch of nodes around the point."
+                "fx.joining.Joint('stage/41:z', 'frame/7:z'), or a Patch of nodes around the point."
             )
         if (isinstance(end, Patch) or joint.point is not None) and not owner.is_placed:
             raise ModelError(
                 f"{joint!r} needs the places of the channels of {owner.name!r} for its lever "
                 f"arms: pass dofs={{{owner.name!r}: DofSet(...)}}, or join channels, "
-                "Joint('stage/41:z', 'frame/7:z')."
+                "fx.joining.Joint('stage/41:z', 'frame/7:z')."
             )
     seen, pushed = ([_end(parts, end, side) for end in given] for side in ("outputs", "inputs"))
     axes = joint_axes(joint, seen[0], seen[-1] if len(seen) > 1 else None)

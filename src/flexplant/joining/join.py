@@ -209,8 +209,8 @@ class JoinedMachine:
             raise ModelError(
                 f"a machine with reduced components has full matrices: {self.done.kept.size} "
                 f"coordinates are too many (limit {_LARGEST}). Reduce the large components first, "
-                "by CraigBampton(boundary=[...]) at their joints, or join models and reduce the "
-                "machine."
+                "by fx.reduction.CraigBampton(boundary=[...]) at their joints, or join models and "
+                "reduce the machine."
             )
         bare = [part.name for part in self.parts if not part.is_damped]
         damped = len(bare) < len(self.parts)
@@ -514,7 +514,7 @@ class JoiningCertificate(Value):
     --------
     >>> import flexplant as fx
     >>> parts = {n: fx.chain(masses=[1.0, 2.0], stiffnesses=[5e5]) for n in ("stage", "frame")}
-    >>> found = fx.joined(parts, fx.Joint("stage/1:x", "frame/1:x")).joining
+    >>> found = fx.joined(parts, fx.joining.Joint("stage/1:x", "frame/1:x")).joining
     >>> found.n_rigid, found.mass, found.gap < 1e-12
     (1, 6.0, True)
     """

@@ -189,8 +189,8 @@ class Patch(Value):
     >>> size, mesh = {"size": (0.2, 0.2), "thickness": 0.01}, {"elements": (2, 2)}
     >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
     >>> plate = fx.kirchhoff_plate(**size, **mesh, **steel)
-    >>> foot = fx.Patch("lower", box=[(0.0, 0.0, 0.0), (0.2, 0.2, 0.0)])
-    >>> joint = fx.Joint(foot, "upper/5:z", stiffness=1e6)
+    >>> foot = fx.joining.Patch("lower", box=[(0.0, 0.0, 0.0), (0.2, 0.2, 0.0)])
+    >>> joint = fx.joining.Joint(foot, "upper/5:z", stiffness=1e6)
     >>> foot, fx.joined({"lower": plate, "upper": plate}, joint)
     (<Patch of lower, in a box>, <FEModel: 54 DOFs, sparse, 5 rigid-body motions, D not given>)
     """
@@ -233,7 +233,8 @@ class Patch(Value):
         if self.nodes is not None and dofs.components and not inner:
             raise LabelError(
                 f"{self!r} names nodes by numbers, which {', '.join(dofs.components)} may share. "
-                f"Say whose: Patch('{self.component}/{dofs.components[0]}', nodes), or give box=."
+                f"Say whose: fx.joining.Patch('{self.component}/{dofs.components[0]}', nodes), "
+                "or give box=."
             )
         own = max(inner, key=len, default=None)
         chosen = dofs.where(nodes=self.nodes, box=self.box, component=own)

@@ -18,10 +18,10 @@ weight is made of is one.
 (50.0, 0.1591)
 >>> round(abs(g(1.0j)), 6)
 50.0
->>> sampled = fx.discretized(g, 10.0, delay=1.3)
+>>> sampled = fx.lti.discretized(g, 10.0, delay=1.3)
 >>> sampled.n_states, sampled.is_stable
 (4, True)
->>> print(fx.lti.feedback(g, 0.5 * fx.lowpass(2.0)))
+>>> print(fx.lti.feedback(g, 0.5 * fx.lti.low_pass_filter(2.0)))
 <StateSpace: 3 states, continuous, in -> out>
 
 **From MATLAB and python-control.** Their systems are taken wherever a system is; `to_control()`
@@ -37,7 +37,7 @@ goes back. Their names (``fx.c2d``) raise an error that says ours.
 | ``freqresp`` | `fx.frequency_response` |
 | ``bode``, ``sigma`` | `fx.plot.bode`, `fx.plot.singular_values` |
 | ``nyquist``, ``pzmap``, ``step`` | `fx.plot.nyquist`, `fx.plot.pole_map`, `fx.plot.step` |
-| ``c2d`` | `fx.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
+| ``c2d`` | `fx.lti.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
 | ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm` |
 | ``getPeakGain`` | `fx.peak_gain` |
 | ``minreal``, ``balred``, ``canon(sys, "modal")`` | `fx.minimal`, `fx.balanced`, `fx.modal_form` |
@@ -54,12 +54,12 @@ from .balancing import hankel_norm as hankel_norm
 from .balancing import hankel_values as hankel_values
 from .balancing import norm_report as norm_report
 from .discretisation import tustin as tustin
-from .filters import highpass as highpass
+from .filters import high_pass_filter as high_pass_filter
 from .filters import inverse_sensitivity as inverse_sensitivity
-from .filters import leadlag as leadlag
-from .filters import lowpass as lowpass
+from .filters import lead_lag_filter as lead_lag_filter
+from .filters import low_pass_filter as low_pass_filter
 from .filters import matched as matched
-from .filters import notch as notch
+from .filters import notch_filter as notch_filter
 from .filters import pade as pade
 from .filters import tf as tf
 from .filters import zpk as zpk
@@ -78,7 +78,7 @@ from .lyapunov import solve_lyapunov as solve_lyapunov
 from .lyapunov import solve_stein as solve_stein
 from .minimal import minimal as minimal
 from .modal import ModalForm as ModalForm
-from .modal import Split as Split
+from .modal import StableSplit as StableSplit
 from .modal import modal_form as modal_form
 from .modal import split_stable as split_stable
 from .norms import h2_norm as h2_norm

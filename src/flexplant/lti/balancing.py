@@ -11,7 +11,7 @@ from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from .interconnection import parallel, series
 from .lyapunov import compressed, controllability_factor, observability_factor
-from .modal import Split, split_stable
+from .modal import StableSplit, split_stable
 from .norms import axis_peak, h2_norm, obstacle, peak_gain
 from .statespace import StateSpace, System, as_statespace
 
@@ -42,7 +42,7 @@ class BalancedReduction(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> found = fx.balanced(fx.lowpass(1.0) * fx.lowpass(100.0), order=1)
+    >>> found = fx.balanced(fx.lti.low_pass_filter(1.0) * fx.lti.low_pass_filter(100.0), order=1)
     >>> found.hankel.round(4), bool(found.error < 1.001 * found.bound)
     (array([0.5049, 0.0049]), True)
     """
@@ -110,7 +110,7 @@ def balanced(
     Examples
     --------
     >>> import flexplant as fx
-    >>> found = fx.balanced(fx.lowpass(1.0) * fx.lowpass(100.0), order=1)
+    >>> found = fx.balanced(fx.lti.low_pass_filter(1.0) * fx.lti.low_pass_filter(100.0), order=1)
     >>> found.system.n_states, bool(found.error < 1.001 * found.bound)
     (1, True)
     """
@@ -173,7 +173,7 @@ def _project(g: StateSpace, W: FloatArray, T: FloatArray, r: int, *, residual: b
     return g.replace(A=A[:r, :r], B=B[:r], C=C[:, :r], D=D, states=(), blocks=None)
 
 
-def _rejoined(g: StateSpace, split: Split, reduced: StateSpace) -> StateSpace:
+def _rejoined(g: StateSpace, split: StableSplit, reduced: StateSpace) -> StateSpace:
     names = [f"balanced{i}" for i in range(1, reduced.n_states + 1)]
     both = parallel(reduced, split.rest) if split.rest.n_states else reduced
     kept = [f"kept{i}" for i in range(1, split.rest.n_states + 1)]

@@ -169,7 +169,7 @@ def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> 
     )
 
 
-def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
+def low_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     """Return a low-pass filter, Butterworth for order 2.
 
     Parameters
@@ -194,13 +194,13 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     Examples
     --------
     >>> import flexplant as fx
-    >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
+    >>> round(abs(fx.lti.low_pass_filter(100.0)(2j * 3.141592653589793 * 100.0)), 4)
     0.7071
     """
     return _butterworth(freq, order, 0.0, number(gain, "gain"))
 
 
-def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
+def high_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     """Return a high-pass filter, Butterworth for order 2.
 
     ``gain (s/w) / (s/w + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, p = s / w.
@@ -208,17 +208,17 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     Parameters
     ----------
     freq, order, gain
-        As for `lowpass`: order is the slope at low frequencies, gain that at high ones.
+        As for `low_pass_filter`: order is the slope at low frequencies, gain that at high ones.
 
     Raises
     ------
     ModelError
-        As for `lowpass`.
+        As for `low_pass_filter`.
 
     Examples
     --------
     >>> import flexplant as fx
-    >>> high = fx.lti.highpass(10.0)
+    >>> high = fx.lti.high_pass_filter(10.0)
     >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
     (0.7071, 0.0)
     """
@@ -236,7 +236,7 @@ def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace
     raise ModelError(f"order must be 1 or 2, got {order!r}. Put filters in series for more.")
 
 
-def notch(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace:
+def notch_filter(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace:
     """Return a notch filter.
 
     Parameters
@@ -261,7 +261,7 @@ def notch(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace
     Examples
     --------
     >>> import flexplant as fx
-    >>> round(abs(fx.lti.notch(100.0, depth=0.1)(2j * np.pi * 100.0)), 4)
+    >>> round(abs(fx.lti.notch_filter(100.0, depth=0.1)(2j * np.pi * 100.0)), 4)
     0.1
     """
     omega = 2.0 * np.pi * positive(freq, "freq")
@@ -269,7 +269,7 @@ def notch(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace
     return second_order(1.0, 2.0 * positive(depth, "depth", zero=True) * zeta, 1.0, omega, zeta)
 
 
-def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
+def lead_lag_filter(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     """Return a lead (zero below pole) or lag filter.
 
     Parameters
@@ -292,7 +292,7 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     Examples
     --------
     >>> import flexplant as fx
-    >>> lead = fx.lti.leadlag(10.0, 90.0)
+    >>> lead = fx.lti.lead_lag_filter(10.0, 90.0)
     >>> round(float(np.angle(lead(2j * np.pi * 30.0), deg=True)), 1)
     53.1
     """

@@ -216,7 +216,7 @@ def _balance(B: FloatArray, C: FloatArray, blocks: list[int]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Split(Value):
+class StableSplit(Value):
     """``sys = stable + rest``: add the two (`parallel`) to have the system back.
 
     Parameters
@@ -235,13 +235,13 @@ class Split(Value):
 
     def __repr__(self) -> str:
         return (
-            f"<Split: {counted(self.stable.n_states, 'stable state')}, "
+            f"<StableSplit: {counted(self.stable.n_states, 'stable state')}, "
             f"{counted(self.rest.n_states, 'other')}, "
             f"separation {self.separation:.1e}>"
         )
 
 
-def split_stable(sys: System) -> Split:
+def split_stable(sys: System) -> StableSplit:
     """Return the additive decomposition into a stable part and the rest.
 
     Where A is block diagonal and no block has poles of both kinds, its blocks are sorted, exactly.
@@ -257,7 +257,7 @@ def split_stable(sys: System) -> Split:
 
     Returns
     -------
-    Split
+    StableSplit
         Both parts with all channels and their names.
 
     Raises
@@ -274,7 +274,7 @@ def split_stable(sys: System) -> Split:
     """
     g = as_statespace(sys)
     if not g.n_states:
-        return Split(g, g.replace(D=0 * g.D), 0.0)
+        return StableSplit(g, g.replace(D=0 * g.D), 0.0)
     found = _by_blocks(g) if is_block_diagonal(g) else None
     if found is not None:
         return found
@@ -293,9 +293,9 @@ def split_stable(sys: System) -> Split:
     except la.LinAlgError as error:  # poles at the edge, which rounding moves across it
         raise _inseparable(g) from error
     if k == g.n_states:
-        return Split(g, part_of(g, np.zeros(k, dtype=bool)).replace(D=0 * g.D), 0.0)
+        return StableSplit(g, part_of(g, np.zeros(k, dtype=bool)).replace(D=0 * g.D), 0.0)
     if not k:
-        return Split(part_of(g, np.zeros(g.n_states, dtype=bool)), g.replace(D=0 * g.D), 0.0)
+        return StableSplit(part_of(g, np.zeros(g.n_states, dtype=bool)), g.replace(D=0 * g.D), 0.0)
     X, scale, info = la.lapack.dtrsyl(T[:k, :k], T[k:, k:], -T[:k, k:], isgn=-1)
     if info or not np.isfinite(X).all():
         raise _inseparable(g)
@@ -303,7 +303,7 @@ def split_stable(sys: System) -> Split:
     turned, seen = Z.T @ B, C @ Z
     stable = _part(g, T[:k, :k], turned[:k] - X @ turned[k:], seen[:, :k], g.D)
     rest = _part(g, T[k:, k:], turned[k:], seen[:, :k] @ X + seen[:, k:], 0 * g.D)
-    return Split(stable, rest, float(np.linalg.norm(X, 2)))
+    return StableSplit(stable, rest, float(np.linalg.norm(X, 2)))
 
 
 def _inseparable(g: StateSpace) -> SolverError:
@@ -313,7 +313,7 @@ def _inseparable(g: StateSpace) -> SolverError:
     )
 
 
-def _by_blocks(g: StateSpace) -> Split | None:
+def _by_blocks(g: StateSpace) -> StableSplit | None:
     """Return the system with its blocks sorted, or None where one has poles of both kinds."""
     sizes = np.asarray(g.blocks)
     poles = block_eigenvalues(g.A, g.blocks or ())
@@ -322,7 +322,7 @@ def _by_blocks(g: StateSpace) -> Split | None:
     stable = np.bincount(owner, ~inside)[owner] == 0
     if np.any(inside & ~stable):
         return None
-    return Split(part_of(g, stable), part_of(g, ~stable).replace(D=0 * g.D), 0.0)
+    return StableSplit(part_of(g, stable), part_of(g, ~stable).replace(D=0 * g.D), 0.0)
 
 
 def part_of(g: StateSpace, kept: np.typing.NDArray[np.bool_]) -> StateSpace:

@@ -61,7 +61,7 @@ def discretized(
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.discretized(fx.lti.tf([1.0], [1.0, 1.0]), rate=10.0).poles().real.round(6)  # exp(-0.1)
+    >>> fx.lti.discretized(fx.lti.tf([1.0], [1.0, 1.0]), rate=10.0).poles().real.round(6)
     array([0.904837])
     """
     g = as_statespace(sys)

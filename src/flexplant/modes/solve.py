@@ -366,7 +366,7 @@ def check_modes(
                 f"rigid-body motion {i + 1} leaves a force (of {size[i]:.2g}, limit "
                 f"{limit[i]:.2g}): the entries of K carry too few digits. check(model) says how "
                 "many; export in double precision, or take "
-                "FEMatrices(K, M, dofs=dofs).model(free=True)."
+                "fx.structure.FEMatrices(K, M, dofs=dofs).model(free=True)."
             )
         raise SolverError(
             f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "

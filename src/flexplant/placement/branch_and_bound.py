@@ -16,7 +16,7 @@ from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..work import Work
 from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
-from .problem import ADVICE, Found, Problem, Search, layouts_of
+from .problem import ADVICE, Problem, Search, SearchResult, layouts_of
 
 #: from so many trials on a lower bound shows first which of them could be better
 _MANY = 24
@@ -48,14 +48,14 @@ class Exchange(Search):
 
     starts: int = field(default=10, metadata=checked(whole))
 
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best of all starts, bounded by relaxation; see `Search.search`."""
         relaxed = problem.relaxed()
         chosen, history, evaluations = best_start(problem, self.starts, relaxed, work)
         value = min(steps[-1] for steps in history)
         bound = relaxed[0] if relaxed else problem.bound()
         bound = min(bound, value) if np.isfinite(value) else -np.inf
-        return Found(chosen, value, bound, evaluations, history)
+        return SearchResult(chosen, value, bound, evaluations, history)
 
 
 def best_start(
@@ -205,7 +205,7 @@ class Screened(Search):
     keep: int = field(default=40, kw_only=True, metadata=checked(whole))
     starts: int = field(default=6, kw_only=True, metadata=checked(whole))
 
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best of the first few, bounded by relaxation; see `Search.search`."""
         own = problem.layouts
         fast = layouts_of(own.plant, own.side, own.candidates, self.by)
@@ -214,7 +214,7 @@ class Screened(Search):
         best = int(np.argmin(values))
         value = float(values[best])
         bound = min(problem.bound(), value) if np.isfinite(value) else -np.inf
-        return Found(ranked[best], value, bound, len(ranked), ((value,),))
+        return SearchResult(ranked[best], value, bound, len(ranked), ((value,),))
 
     def _ranked(self, problem: Problem, work: Work) -> list[tuple[int, ...]]:
         """Return the first few choices by the fast criterion."""
@@ -279,7 +279,7 @@ class BranchAndBound(Search):
     branches: int = field(default=20_000, metadata=checked(whole, minimum=0))
     starts: int = field(default=4, metadata=checked(whole))
 
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best choice and the bound that was proven; see `Search.search`."""
         scorer = problem.layouts.scorer
         if not isinstance(scorer, Convex):
@@ -314,7 +314,7 @@ class BranchAndBound(Search):
                 "branches, or accept a larger gap."
             )
         evaluations += tree.evaluations
-        return Found(tree.chosen, tree.value, bound, evaluations, history, stopped)
+        return SearchResult(tree.chosen, tree.value, bound, evaluations, history, stopped)
 
 
 class _Node(NamedTuple):

@@ -187,7 +187,7 @@ def check_limits(low: int | None, high: int | None) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Together(Constraint):
+class JointGroups(Constraint):
     """Groups of candidates of which all or none are chosen: symmetric sets, multi-axis units.
 
     Parameters
@@ -199,7 +199,7 @@ class Together(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> pair = fx.placement.Together([["y1", "y2"]])
+    >>> pair = fx.placement.JointGroups([["y1", "y2"]])
     >>> fx.place_sensors(plant, ["y1", "y2"], 2, constraints=pair).chosen
     ('y1', 'y2')
     """
@@ -273,7 +273,7 @@ def _largest_distance(points: FloatArray, others: FloatArray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Among(Constraint):
+class CountLimits(Constraint):
     """Limits on how many of some named candidates are chosen, such as two accelerometers at most.
 
     Parameters
@@ -286,7 +286,7 @@ class Among(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> last = fx.placement.Among(["y2"], at_least=1)
+    >>> last = fx.placement.CountLimits(["y2"], at_least=1)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=last).chosen
     ('y2',)
     """
@@ -352,7 +352,7 @@ def _checked_zones(given: Any, name: str) -> tuple[Zone, ...]:
         if not isinstance(zone, Zone):
             raise ModelError(
                 f"{name} is a Rectangle or a Disc, got {short(zone)}. Type "
-                "Disc((0.3, 0.3), radius=0.05)."
+                "fx.structure.Disc((0.3, 0.3), radius=0.05)."
             )
     if not listed:
         raise ModelError(f"there is no zone: {name} is a Rectangle or a Disc. Give one.")
@@ -372,7 +372,8 @@ class Excluded(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> off = fx.placement.Excluded(fx.Disc((0.0, 0.0), radius=0.5))  # where the first mass is
+    >>> first_mass = fx.structure.Disc((0.0, 0.0), radius=0.5)
+    >>> off = fx.placement.Excluded(first_mass)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=off).chosen
     ('y2',)
     """
@@ -431,7 +432,7 @@ class OffPoi(Constraint):
 
 
 @dataclass(frozen=True, eq=False)
-class Within(Constraint):
+class ZoneLimits(Constraint):
     """Limits on how many chosen candidates lie in zones, seen from above; by default all do.
 
     Parameters
@@ -445,7 +446,7 @@ class Within(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> right = fx.placement.Within(fx.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
+    >>> right = fx.placement.ZoneLimits(fx.structure.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=right).chosen
     ('y2',)
     """

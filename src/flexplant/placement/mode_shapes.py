@@ -20,7 +20,7 @@ from ..work import Work
 from .candidates import Port
 from .criterion import Criterion, Scorer, by_size
 from .gramian import LogDetOfSum, SummedWorth, noise_sizes
-from .problem import Found, Problem, Search
+from .problem import Problem, Search, SearchResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,10 +257,11 @@ class ModeInformation(ByShapes):
     """Minus log det of the Fisher information of mode amplitudes, ``sum_i phi_i phi_i' / asd_i^2``.
 
     One snapshot of the sensors, no dynamics, no disturbances: choices that distinguish the shapes
-    best. `ByRows` searches for it by effective independence or pivoted QR, and it has a bound.
-    Fewer sensors than modes have none. It says next to nothing of a POI: rankings of layouts by
-    classical criteria (this one, Gramians, indices, energy, MAC) had a Spearman correlation of
-    -0.45 to 0.56 with that by the exact variance, on plates. Where the POI matters, use
+    best. `RowSelection` searches for it by effective independence or pivoted QR, and it has a
+    bound. With fewer sensors than modes there is no information on all of them. It says next to
+    nothing of a POI: rankings of layouts by classical criteria (this one, Gramians, indices,
+    energy, MAC) had a Spearman correlation of -0.45 to 0.56 with that by the exact variance, on
+    plates. Where the POI matters, use
     `PoiVariance`.
 
     Parameters
@@ -293,7 +294,7 @@ class ModeInformation(ByShapes):
 
 
 @dataclass(frozen=True, eq=False)
-class ByRows(Search):
+class RowSelection(Search):
     """Selection of rows of mode shapes by the methods of `select_dofs`, for `ModeInformation`.
 
     Parameters
@@ -316,7 +317,7 @@ class ByRows(Search):
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
     >>> goal = fx.placement.ModeInformation(elastic=True)
-    >>> fx.place_sensors(plant, ["y1", "y2"], 2, goal, method=fx.placement.ByRows()).chosen
+    >>> fx.place_sensors(plant, ["y1", "y2"], 2, goal, method=fx.placement.RowSelection()).chosen
     ('y1', 'y2')
     """
 
@@ -333,7 +334,7 @@ class ByRows(Search):
                 "driving_point weights reduction.EffectiveIndependence(): leave one out."
             )
 
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random."""
         scorer = problem.layouts.scorer
         if not isinstance(scorer, ModeRows):
@@ -361,7 +362,7 @@ class ByRows(Search):
                 "candidates one by one. Use placement.Exchange(), which satisfies all of them."
             )
         value = float(problem.score([found])[0])
-        return Found(found, value, min(problem.bound(), value), 1, ((value,),))
+        return SearchResult(found, value, min(problem.bound(), value), 1, ((value,),))
 
 
 def _by_driving_point(

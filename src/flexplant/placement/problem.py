@@ -412,7 +412,7 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """The result of a search: chosen names, value, bound, evaluations.
 
     Parameters
@@ -425,7 +425,7 @@ class Found:
     Examples
     --------
     >>> import flexplant as fx
-    >>> found = fx.placement.Found(("s1",), 2.0, 1.5, 7, (3.0, 2.0))
+    >>> found = fx.placement.SearchResult(("s1",), 2.0, 1.5, 7, (3.0, 2.0))
     >>> found.value - found.bound
     0.5
     """
@@ -449,7 +449,7 @@ class Search(Value):
     """
 
     @abstractmethod
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best choice that was found.
 
         The problem has `score(sets)`, `bound()`, `choices()` and a `start`. With the work's

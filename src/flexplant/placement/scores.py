@@ -181,7 +181,7 @@ def score_actuators(
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
     >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
-    >>> scores = fx.score_actuators(plant, [["a1"], ["a2"]], candidates=candidates)
+    >>> scores = fx.placement.score_actuators(plant, [["a1"], ["a2"]], candidates=candidates)
     >>> scores.best
     ('a2',)
     """
@@ -423,7 +423,7 @@ def sensor_map(
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> found = fx.sensor_map(plant, [(0, 0, 0), (1, 0, 0)], asd=1e-10, direction="x")
+    >>> found = fx.placement.sensor_map(plant, [(0, 0, 0), (1, 0, 0)], asd=1e-10, direction="x")
     >>> found.best
     array([0., 0., 0.])
     """

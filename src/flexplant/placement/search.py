@@ -20,7 +20,7 @@ from .candidates import Places, Port, candidate_places, known_candidates, sample
 from .closed_loop_h2 import Separation
 from .constraints import Budget, Constraint, LinearRows, constraint_rows, constraints_in_words
 from .criterion import Criterion, in_words
-from .problem import Found, Placement, Problem, Search, layouts_of
+from .problem import Placement, Problem, Search, SearchResult, layouts_of
 
 #: up to here every subset is scored when no method is given: it takes seconds, and proves it
 _FEW = 1500
@@ -197,7 +197,7 @@ def place_both(
     >>> plant = fx.testbeds.three_masses()
     >>> sensors = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
     >>> actuators = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2)]
-    >>> found = fx.place_both(plant, sensors, actuators, (1, 1))
+    >>> found = fx.placement.place_both(plant, sensors, actuators, (1, 1))
     >>> len(found.sensors), len(found.actuators)
     (1, 1)
     """
@@ -265,7 +265,7 @@ class Exhaustive(Search):
 
     limit: int = field(default=200_000, metadata=checked(whole))
 
-    def search(self, problem: Problem, work: Work) -> Found:
+    def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best of all subsets; see `Search.search`. Nothing is random."""
         if problem.subsets > self.limit:
             raise ModelError(
@@ -277,7 +277,7 @@ class Exhaustive(Search):
         values = problem.layouts.scores(sets, work, "every subset")
         best = int(np.argmin(values))
         value = float(values[best])
-        return Found(sets[best], value, value, len(sets), ((value,),))
+        return SearchResult(sets[best], value, value, len(sets), ((value,),))
 
 
 def problem_of(

@@ -457,7 +457,7 @@ class LossScores(Scorer):
 
 
 @dataclass(frozen=True, eq=False)
-class AfterLoss(Wrapping):
+class DeviceLoss(Wrapping):
     """The worst or the mean of a criterion after the loss of any one device.
 
     Infinite where the others do not suffice: choose one more than the least number.
@@ -473,7 +473,7 @@ class AfterLoss(Wrapping):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> one_may_fail = fx.placement.AfterLoss(fx.PoiVariance("die"))
+    >>> one_may_fail = fx.placement.DeviceLoss(fx.PoiVariance("die"))
     >>> one_may_fail(plant) > fx.PoiVariance("die")(plant)
     True
     """

@@ -38,7 +38,8 @@ White noise has the intensity asd^2 / 2, a sensor's sample the variance asd^2 ra
 sample: measure, update, control, hold.
 
 **Weights of a stage.** ``plant.weighted(...)`` takes those of `stage_weights`, or weights of one's
-own: numbers, `fx.lowpass`, `fx.lti.inverse_sensitivity`, any system with one input and one output.
+own: numbers, `fx.lti.low_pass_filter`, `fx.lti.inverse_sensitivity`, any system with one input
+and one output.
 
 What its numbers do, with the plate of ``examples/wafer_stage.py`` at 0.1 % damping, 10 kHz, 1.3
 samples late: designed on a reduced model with measured poles, with ``uncertainty`` for the
@@ -87,12 +88,12 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
-from .moving import Along as Along
+from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled
 from .origins import Foreign as Foreign
 from .port import ForcePort as ForcePort
-from .port import Seen as Seen
+from .port import MeasuredRow as MeasuredRow
 from .port import SensorPort as SensorPort
 from .ports import Poi as Poi
 from .ports import Ports as Ports
@@ -103,7 +104,7 @@ from .realisation import FastStates as FastStates
 from .realisation import Feedthrough as Feedthrough
 from .rigid_motion import GravityAxes as GravityAxes
 from .rigid_motion import gravity_axes as gravity_axes
-from .scheduling import Moves as Moves
+from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
 from .standard import AnyPlant as AnyPlant

@@ -27,7 +27,7 @@ from ..tolerances import ROUNDING, SAME
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
 from .partition import Partition
-from .port import QUANTITIES, ForcePort, Seen, SensorPort
+from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, natural
 
@@ -39,7 +39,7 @@ class PortRows(NamedTuple):
     outputs: list[str]
     push: FloatArray  # (m, n) loads over the DOFs
     ground: FloatArray  # (m, 6) rigid-body motions of the ground
-    seen: list[Seen]
+    seen: list[MeasuredRow]
     orders: list[int]  # time derivatives that are seen
     added: FloatArray  # (p, m) what is added to a sensor
 
@@ -121,7 +121,7 @@ _ZERO = 1e-9
 
 
 def direct_effect(
-    model: Structure, one: Seen, order: int, push: FloatArray, ground: FloatArray
+    model: Structure, one: MeasuredRow, order: int, push: FloatArray, ground: FloatArray
 ) -> FloatArray:
     """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
     direct = push @ one.direct

@@ -104,7 +104,7 @@ class BaseAcceleration(ForcePort):
     Examples
     --------
     >>> import flexplant as fx
-    >>> floor = fx.BaseAcceleration("floor", "z", asd=2e-5, shape=fx.lowpass(60.0))
+    >>> floor = fx.BaseAcceleration("floor", "z", asd=2e-5, shape=fx.lti.low_pass_filter(60.0))
     >>> floor.unit
     'm/s^2'
     """
@@ -155,7 +155,7 @@ class OutputDisturbance(ForcePort):
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.OutputDisturbance("cable", sensor="y1", asd=1e-12)
+    >>> fx.plant.OutputDisturbance("cable", sensor="y1", asd=1e-12)
     OutputDisturbance(name='cable', sensor='y1', asd=1e-12, shape=None)
     """
 
@@ -201,7 +201,8 @@ class Actuator(_PlacedForce):
     Examples
     --------
     >>> import flexplant as fx
-    >>> motor = fx.Actuator("u1", at=(0.1, 0.2, 0.0), dynamics=fx.lowpass(4e3), asd=1e-4)
+    >>> slow = fx.lti.low_pass_filter(4e3)
+    >>> motor = fx.Actuator("u1", at=(0.1, 0.2, 0.0), dynamics=slow, asd=1e-4)
     >>> motor.unit, motor.direction
     ('N', 'z')
     """

@@ -24,7 +24,7 @@ from .scheduling import values_over
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Along(Value):
+class PortPath(Value):
     """What depends on the place of one port, at many points: rows of C and D, or a column of B.
 
     Parameters
@@ -117,7 +117,7 @@ def _is_row(port: Any) -> bool:
     return is_sensor and port.filter is None and not port.latency
 
 
-def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
+def along(plant: Partition, name: str, points: npt.ArrayLike) -> PortPath:
     """Return what depends on the place of a POI or a force, at many points at once."""
     places = real_array(points, "points", (None, 3))
     port = _port(plant.assembled.ports, name)
@@ -146,7 +146,7 @@ def _port(ports: Ports, name: str) -> Any:
     return found[0]
 
 
-def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
+def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> PortPath:
     g, realisation = plant.system, plant.assembled.realisation
     tracked = [axis for own, axis in plant.assembled.ports.followed if own.name == poi.name]
     channels = [poi.channel(axis) for axis in poi.axes]
@@ -166,10 +166,10 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
             C[:, k, plant.modal_states] = realisation.motion(rows, 0)
         for k, axis in enumerate(tracked, len(channels)):
             C[:, k] = -C[:, list(poi.axes).index(axis)]
-    return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
+    return PortPath(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
 
 
-def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatArray) -> Along:
+def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatArray) -> PortPath:
     if plant.dt or port.filter is not None:
         raise ModelError(
             f"the place of {port.name!r} acts through a filter, a hold or a delay, so that more "
@@ -186,7 +186,9 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
     if at_once or realisation.static_inputs.size:
         for k, point in enumerate(points):
             D[k] = _elsewhere(plant, port.name, point).system.D[:, i : i + 1]
-    return Along(port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B)
+    return PortPath(
+        port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B
+    )
 
 
 def _elsewhere(plant: Partition, name: str, point: FloatArray) -> Partition:

@@ -20,7 +20,7 @@ Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
 QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
 
 
-class Seen(NamedTuple):
+class MeasuredRow(NamedTuple):
     """What a channel measures: ``row x + direct f + carried g``.
 
     Parameters
@@ -36,7 +36,7 @@ class Seen(NamedTuple):
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.plant.Seen(row=np.ones((1, 3)), direct=np.zeros((1, 2))).row.shape
+    >>> fx.plant.MeasuredRow(row=np.ones((1, 3)), direct=np.zeros((1, 2))).row.shape
     (1, 3)
     """
 
@@ -50,16 +50,16 @@ def observed(
     row: FloatArray,
     order: int = 0,
     carried: FloatArray | None = None,
-) -> Seen:
+) -> MeasuredRow:
     """Return how the time derivative of some order of a displacement (a row over DOFs) is seen."""
     # against the ground, or with its motion `carried` (6,) along
     along = np.zeros(6) if carried is None else carried
     if order == 0:
-        return Seen(realisation.motion(row, 0), realisation.at_once(row), along)
+        return MeasuredRow(realisation.motion(row, 0), realisation.at_once(row), along)
     direct = np.zeros(row.size)
     if order == 2:  # an acceleration follows a force at once: d2q/dt2 = S A A x + S A N' f
         direct = realisation.inputs @ realisation.motion(row, 1)
-    return Seen(realisation.motion(row, order), direct, along)
+    return MeasuredRow(realisation.motion(row, order), direct, along)
 
 
 class ForcePort(Value):
@@ -188,7 +188,7 @@ class SensorPort(Value):
         """Return what the channel shows of displacements (n,) at rest: 0 of other quantities."""
         return (static_gain(self.filter) if self.order == 0 else 0.0) * self.row(realisation)
 
-    def see(self, realisation: ModalRealisation) -> Seen:
+    def see(self, realisation: ModalRealisation) -> MeasuredRow:
         """Return what it measures of the states, and of forces at once."""
         along = self.carried(realisation) if self.inertial else None
         return observed(realisation, self.row(realisation), self.order, along)

@@ -14,7 +14,7 @@ from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
 from ..structure.rigid import place_motion
 from .forces import Actuator
-from .port import ForcePort, Quantity, Seen, SensorPort, checked_port, motion_unit, observed
+from .port import ForcePort, MeasuredRow, Quantity, SensorPort, checked_port, motion_unit, observed
 from .realisation import ModalRealisation
 from .scheduling import Position, port_at, require_positions
 
@@ -159,7 +159,7 @@ class Poi(Value):
                 f"label's direction: {error} Name those that are there, axes=(...)."
             ) from error
 
-    def see(self, realisation: ModalRealisation, axis: str) -> Seen:
+    def see(self, realisation: ModalRealisation, axis: str) -> MeasuredRow:
         """Return what an axis shows of the states, and of forces at once."""
         along = None
         if self.absolute:

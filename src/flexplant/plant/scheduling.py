@@ -148,7 +148,7 @@ class PlaceTable(Value):
 
 
 @dataclass(frozen=True, eq=False)
-class Moves(Value):
+class PlaceMotion(Value):
     """How a place follows positions: ``start + sum_i along_i value_i``, or a table.
 
     Made from what is given as `moves` of a port: the mapping {position: direction}, or a table.
@@ -202,7 +202,7 @@ class Moves(Value):
         terms = self.start if isinstance(self.start, Mapping) else {self.start: 1.0}
         return [(weight, np.asarray(point) + shift) for point, weight in terms.items()]
 
-    def starting(self, place: Place, values: Mapping[str, float]) -> Moves:
+    def starting(self, place: Place, values: Mapping[str, float]) -> PlaceMotion:
         """Return the same motion of a port that stands elsewhere at some values."""
         if isinstance(self.along, PlaceTable):
             raise LabelError(
@@ -222,9 +222,9 @@ def shifted(place: Place, shift: FloatArray) -> Place:
     return tuple((np.asarray(place) + shift).tolist())
 
 
-def checked_moves(name: str, at: Any, moves: Any) -> Moves | None:
+def checked_moves(name: str, at: Any, moves: Any) -> PlaceMotion | None:
     """Return how a port's place follows positions; None where it stays."""
-    if moves is None or isinstance(moves, Moves):
+    if moves is None or isinstance(moves, PlaceMotion):
         return moves
     if not isinstance(moves, Mapping | PlaceTable) or not getattr(moves, "grid", moves):
         raise ModelError(
@@ -240,12 +240,12 @@ def checked_moves(name: str, at: Any, moves: Any) -> Moves | None:
     if isinstance(moves, PlaceTable):
         if isinstance(at, Mapping):
             raise LabelError(f"{name!r} is a sum of points, which a PlaceTable does not move.")
-        return Moves(at, moves)
+        return PlaceMotion(at, moves)
     along = {
         str(key): tuple(real_array(step, f"moves of {name!r} with {key!r}", (3,)).tolist())
         for key, step in moves.items()
     }
-    return Moves(at, along)
+    return PlaceMotion(at, along)
 
 
 def port_at(port: Any, values: Mapping[str, float]) -> Any:

@@ -17,7 +17,7 @@ from .building import continuous_plant, rebuilt, sampled
 from .evaluation_model import EvaluationModel
 from .evaluation_plants import check_channels, evaluation_plant, own_plant
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
-from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
+from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
@@ -227,7 +227,7 @@ class StandardPlant(Partition):
         """
         return position_map(self, judge, points)
 
-    def along(self, name: str, points: npt.ArrayLike) -> Along:
+    def along(self, name: str, points: npt.ArrayLike) -> PortPath:
         """Return the rows of a POI (or the columns of a force) at many points at once.
 
         All that depends on where a POI is are its rows of C, and of D where the plant has a

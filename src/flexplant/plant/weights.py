@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import Value, positive
 from ..errors import AssumptionError, ModelError, require_known
 from ..lti.discretisation import tustin
-from ..lti.filters import inverse_sensitivity, leadlag
+from ..lti.filters import inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import divisor
@@ -209,7 +209,7 @@ def stage_weights(
             z[error if error in plant.z else channel] = _at_plant_rate(weight, plant)
             w |= {ref: 1.0 / sizes.axes[channel]} if ref in plant.w else {}
     for name, force in sizes.forces.items():
-        rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
+        rolloff = lead_lag_filter(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
         z[f"{name}:effort"] = _at_plant_rate(rolloff, plant)
     noisy = [port.name for port in ports.u if port.asd > 0]
     for port in ports.w:

@@ -73,7 +73,7 @@ def bode(
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.plot.bode(fx.lowpass(10.0)).get_ylabel()
+    >>> fx.plot.bode(fx.lti.low_pass_filter(10.0)).get_ylabel()
     '|out / in| [dB, 0 dB = 1]'
     """
     drawn = curves(systems, freq)

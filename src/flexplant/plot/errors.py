@@ -193,7 +193,7 @@ def exposures(
     start : float [s]
         Without `exposures`: all after this time is exposed.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPoint.exposures`.
+        Beginning and end of each, such as `SetPointProfile.exposures`.
     ax : Axes, optional
 
     Raises

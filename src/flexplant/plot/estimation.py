@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from ..checks import FloatArray, between, instance, mapping, name_list, positive, real_array
 from ..errors import ModelError, ShapeError
-from ..estimation import Consistency, Estimate, LagReport
+from ..estimation import ConsistencyReport, Estimate, LagReport
 from ..estimation.estimator_channels import row_of
 from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
@@ -253,7 +253,7 @@ _FEWEST = 100
 
 def consistency(
     estimate: Estimate,
-    found: Consistency | None = None,
+    found: ConsistencyReport | None = None,
     *,
     level: float = 0.95,
     ax: Sequence[Axes] | None = None,
@@ -269,7 +269,7 @@ def consistency(
     ----------
     estimate : Estimate
         Of `observer.estimate(records)`.
-    found : Consistency, optional
+    found : ConsistencyReport, optional
         The verdict of `flexplant.estimation.consistency`, as the title.
     level : float
         Of the bounds.
@@ -302,7 +302,7 @@ def consistency(
     'NIS per sensor [-]'
     """
     instance(estimate, Estimate, "estimate", "Pass what observer.estimate returned.")
-    instance(found, Consistency | None, "found", "Pass what consistency returned.")
+    instance(found, ConsistencyReport | None, "found", "Pass what consistency returned.")
     between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     white = estimate.whitened.T
     there = np.all(np.isfinite(white), axis=1)

@@ -43,7 +43,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Parameters
     ----------
     found : SensorMap
-        From `flexplant.sensor_map`.
+        From `flexplant.placement.sensor_map`.
     ports : Ports, optional
         Sensors and actuators that are there already and POIs, where their places are points.
     ax : Axes, optional

@@ -494,7 +494,7 @@ def report(
     --------
     >>> import flexplant as fx, tempfile
     >>> folder = tempfile.mkdtemp()
-    >>> file = fx.plot.report(f"{folder}/filter.html", {"filter": fx.lowpass(10.0)})
+    >>> file = fx.plot.report(f"{folder}/filter.html", {"filter": fx.lti.low_pass_filter(10.0)})
     >>> "filter" in file.read_text(encoding="utf-8")
     True
     """

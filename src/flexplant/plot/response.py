@@ -67,7 +67,7 @@ def response(
     span : (start, end) [s], optional
         The part of the run to draw; all of it when not given. The prefix is chosen for this part.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPoint.exposures`: they are shaded.
+        Beginning and end of each, such as `SetPointProfile.exposures`: they are shaded.
     ax : Axes, optional
         Where to draw channels of one unit.
 
@@ -223,7 +223,7 @@ def step(
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.plot.step(fx.lowpass(10.0)).get_xlabel()
+    >>> fx.plot.step(fx.lti.low_pass_filter(10.0)).get_xlabel()
     'time [ms]'
     """
     given = labelled(systems)

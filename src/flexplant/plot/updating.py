@@ -78,7 +78,7 @@ def localisation(
     >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
     >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
     >>> masses = [fx.AddedMass(place) for place in drawing.dofs.labels]
-    >>> found = fx.localise(drawing, masses, [fx.Eigenvalues(measured)], most=1)
+    >>> found = fx.updating.localise(drawing, masses, [fx.Eigenvalues(measured)], most=1)
     >>> fx.plot.localisation(found).get_xlabel()
     'of the misfit explained alone [%]'
     """

@@ -118,7 +118,7 @@ class Guyan(ReductionMethod):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1e-3, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduce(model, fx.Guyan(["1:x", "3:x"])).K.round(3)
+    >>> fx.reduce(model, fx.reduction.Guyan(["1:x", "3:x"])).K.round(3)
     array([[ 200000., -200000.],
            [-200000.,  200000.]])
     """
@@ -169,7 +169,7 @@ class Irs(ReductionMethod):
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5], ground=1e5)
     >>> exact = fx.solve_modes(model, count=1).freq
-    >>> for method in (fx.Guyan(["1:x", "3:x"]), fx.Irs(["1:x", "3:x"])):
+    >>> for method in (fx.reduction.Guyan(["1:x", "3:x"]), fx.reduction.Irs(["1:x", "3:x"])):
     ...     print((fx.reduce(model, method).modes().freq[:1] / exact - 1).round(6))
     [0.017545]
     [0.000105]
@@ -251,7 +251,7 @@ class Serep(ReductionMethod):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduce(model, fx.Serep(["1:x", "3:x"])).modes().freq.round(2)
+    >>> fx.reduce(model, fx.reduction.Serep(["1:x", "3:x"])).modes().freq.round(2)
     array([  0.  , 100.66])
     """
 
@@ -326,7 +326,7 @@ class CraigBampton(ReductionMethod):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduce(model, fx.CraigBampton(["1:x", "3:x"], modes=1)).modes().freq.round(2)
+    >>> fx.reduce(model, fx.reduction.CraigBampton(["1:x", "3:x"], modes=1)).modes().freq.round(2)
     array([  0.  , 100.66, 174.35])
     """
 
@@ -472,7 +472,7 @@ class Rubin(_FreeInterface):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
-    >>> fx.reduce(model, fx.Rubin(["1:x"], modes=2)).modes().freq[:2].round(2)
+    >>> fx.reduce(model, fx.reduction.Rubin(["1:x"], modes=2)).modes().freq[:2].round(2)
     array([ 0.  , 77.04])
     """
 
@@ -502,7 +502,7 @@ class MacNeal(_FreeInterface):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
-    >>> fx.reduce(model, fx.MacNeal(["1:x"], modes=2)).modes().freq[:2].round(2)
+    >>> fx.reduce(model, fx.reduction.MacNeal(["1:x"], modes=2)).modes().freq[:2].round(2)
     array([ 0.  , 77.04])
     """
 

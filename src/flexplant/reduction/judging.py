@@ -401,7 +401,7 @@ class ReductionQuality(Value):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
-    >>> small = fx.reduce(model, fx.ModalTruncation(3))
+    >>> small = fx.reduce(model, fx.reduction.ModalTruncation(3))
     >>> quality = small.quality(model, band=(10.0, 200.0), inputs=["1:x"], outputs=["1:x"])
     >>> quality.freq_error.round(9), quality.mac.round(6)
     (array([ 0.,  0.,  0., nan]), array([1., 1., 1., 0.]))

@@ -61,7 +61,7 @@ class Krylov(ReductionMethod):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduce(model, fx.Krylov(["1:x"], freq=[50.0, 150.0])).n_dof
+    >>> fx.reduce(model, fx.reduction.Krylov(["1:x"], freq=[50.0, 150.0])).n_dof
     3
     """
 

@@ -180,7 +180,7 @@ class ReductionMethod(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> isinstance(fx.Guyan(["1:x"]), fx.reduction.ReductionMethod)
+    >>> isinstance(fx.reduction.Guyan(["1:x"]), fx.reduction.ReductionMethod)
     True
     """
 
@@ -363,7 +363,7 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
         raise ModelError(
             f"reduce needs an FEModel or Modes and a method, got {type(model).__name__} and "
             f"{type(method).__name__}: call reduce(model, DesiredDofs([...])) or "
-            "reduce(model, Guyan([...]))."
+            "reduce(model, fx.reduction.Guyan([...]))."
         )
     if not isinstance(method, DesiredDofs):
         refuse_unstable(model, f"reduction by {type(method).__name__}")

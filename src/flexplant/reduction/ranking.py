@@ -52,7 +52,8 @@ class ModeRanking(Value):
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
-    >>> fx.rank_modes(modes, inputs=["1:x"], outputs=["2:x"]).order  # mode 2 is still at "2:x"
+    >>> ranking = fx.reduction.rank_modes(modes, inputs=["1:x"], outputs=["2:x"])
+    >>> ranking.order  # mode 2 is still at "2:x"
     array([3, 2])
     """
 
@@ -120,7 +121,7 @@ def rank_modes(
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
-    >>> fx.rank_modes(modes, inputs=["1:x"], outputs=["3:x"]).order
+    >>> fx.reduction.rank_modes(modes, inputs=["1:x"], outputs=["3:x"]).order
     array([2, 3])
     """
     refuse_unstable(modes, "a ranking of modes")
@@ -207,7 +208,7 @@ class ErrorBound(Value):
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> light = fx.ModalDamping(0.01)
-    >>> method = fx.ModalTruncation(2, inputs=["1:x"], outputs=["3:x"], damping=light)
+    >>> method = fx.reduction.ModalTruncation(2, inputs=["1:x"], outputs=["3:x"], damping=light)
     >>> round(fx.reduce(model, method).bound.value, 9)
     6.945e-06
     """

@@ -61,7 +61,7 @@ class ModalTruncation(ReductionMethod):
     --------
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduce(model, fx.ModalTruncation(2)).modes().freq.round(2)
+    >>> fx.reduce(model, fx.reduction.ModalTruncation(2)).modes().freq.round(2)
     array([  0.  , 100.66])
     """
 

@@ -69,8 +69,8 @@ with Client(n_workers=2, threads_per_worker=1, dashboard_address=None) as client
 """
 
 from ..rooms import public_names as _public_names
-from .errors_along import FiltersAlong as FiltersAlong
-from .errors_along import RmsAlong as RmsAlong
+from .errors_along import PathFilters as PathFilters
+from .errors_along import PathRms as PathRms
 from .errors_along import estimate_along as estimate_along
 from .errors_along import filters_along as filters_along
 from .errors_along import rms_along as rms_along
@@ -88,7 +88,7 @@ from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline
 from .machine_pipeline import MachineReport as MachineReport
 from .motion import Motion as Motion
-from .motion import SetPoint as SetPoint
+from .motion import SetPointProfile as SetPointProfile
 from .motion import scan as scan
 from .motion import setpoint as setpoint
 from .nonlinear_elements import Dropout as Dropout

@@ -56,7 +56,7 @@ GAINS = ("exact", "scheduled", "frozen")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RmsAlong(Value):
+class PathRms(Value):
     """Standard deviations of a closed loop's channels along a trajectory; made by `rms_along`.
 
     Parameters
@@ -79,7 +79,7 @@ class RmsAlong(Value):
         largest = dict(zip(self.names, self.rms.max(axis=1).tolist(), strict=True))
         errors = {name: size for name, size in largest.items() if name.endswith(":error")}
         shown = sizes_of(errors or {self.names[0]: largest[self.names[0]]}, self.units)
-        return f"<RmsAlong: {self.time.size} samples; largest {shown}>"
+        return f"<PathRms: {self.time.size} samples; largest {shown}>"
 
     def __getitem__(self, name: str) -> FloatArray:
         """Return the standard deviation (n_time,) of a channel."""
@@ -94,7 +94,7 @@ def rms_along(
     moving: Mapping[str, Any],
     duration: float,
     repeats: bool = False,
-) -> RmsAlong:
+) -> PathRms:
     """Return the standard deviation of every channel of a loop whose machine moves.
 
     ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` of plant and controller together, with the matrices
@@ -115,7 +115,7 @@ def rms_along(
 
     Returns
     -------
-    RmsAlong
+    PathRms
 
     Raises
     ------
@@ -166,7 +166,7 @@ def rms_along(
         rms[:, k] = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, P, C) + np.sum(D**2, axis=1), 0))
         P = A @ P @ A.T + G @ G.T
     names = (*plant.z, *plant.y, *loop.driven, *loop.watched)
-    return RmsAlong(time, rms, names, {n: u for n, u in loop.units.items() if n in names})
+    return PathRms(time, rms, names, {n: u for n, u in loop.units.items() if n in names})
 
 
 def _standing(machine: MovingMachine) -> FloatArray:
@@ -197,7 +197,7 @@ def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FiltersAlong(Value):
+class PathFilters(Value):
     """Errors of estimated POIs along a trajectory; made by `filters_along`.
 
     Parameters
@@ -222,7 +222,7 @@ class FiltersAlong(Value):
 
     def __repr__(self) -> str:
         count = counted(self.time.size, "sample")
-        lines = [f"<FiltersAlong: {count}; rms error, steady gains more"]
+        lines = [f"<PathFilters: {count}; rms error, steady gains more"]
         for i, name in enumerate(self.names):
             unit = self.units.get(name)
             exact, *others = (float(np.sqrt(np.mean(getattr(self, g)[i] ** 2))) for g in GAINS)
@@ -248,7 +248,7 @@ def filters_along(
     duration: float,
     repeats: bool = False,
     positions: int = 9,
-) -> FiltersAlong:
+) -> PathFilters:
     """Return the errors of three Kalman filters along a trajectory of a machine's positions.
 
     ``P+ = A (I - M C) P (I - M C)' A' + A M R M' A' + Q`` with the matrices of each sample; M is
@@ -265,7 +265,7 @@ def filters_along(
 
     Returns
     -------
-    FiltersAlong
+    PathFilters
 
     Raises
     ------
@@ -325,7 +325,7 @@ def filters_along(
         found[name] = rms
     names = tuple(filters.names)
     units = {name: unit for name, unit in plant.units.items() if name in names}
-    return FiltersAlong(filters.time, names, **found, units=units)
+    return PathFilters(filters.time, names, **found, units=units)
 
 
 class _Filters:

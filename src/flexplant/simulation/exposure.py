@@ -90,7 +90,7 @@ def exposure_errors(
     start : float [s]
         Without `exposures`: all after this time is exposed.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPoint.exposures`.
+        Beginning and end of each, such as `SetPointProfile.exposures`.
 
     Returns
     -------

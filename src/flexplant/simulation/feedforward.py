@@ -28,7 +28,7 @@ from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.at_rest import OfS, at_rest, solved
 from ..plant.axes import resting_frequency
 from ..tolerances import divisor
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .move_ranges import warn_beyond_ranges
 from .nonlinear_elements import Acts, split_elements
 from .response import Response
@@ -109,7 +109,7 @@ class Feedforward(Value):
         gains[:, :, _term_index(term) + 1 :] = 0.0
         return self.replace(gains=gains)
 
-    def forces(self, move: SetPoint, time: npt.ArrayLike) -> dict[str, FloatArray]:
+    def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
         """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
 
         As many times as places where the gains depend on the place. A set-point of an order below
@@ -128,7 +128,7 @@ def design_feedforward(
     *,
     reference: str | None = None,
     order: int = 4,
-    move: SetPoint | None = None,
+    move: SetPointProfile | None = None,
     along: npt.ArrayLike | None = None,
     elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
 ) -> Feedforward:
@@ -158,7 +158,7 @@ def design_feedforward(
         The reference's channel; the plant's only one when not given.
     order : int
         Highest derivative, 2 to 4: acceleration, jerk, snap.
-    move : SetPoint, optional
+    move : SetPointProfile, optional
         The move in which a loop is to have the least errors.
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
@@ -306,9 +306,11 @@ def _inverse_of(
     return found
 
 
-def _of_move(empty: Feedforward, loop: ClosedLoop, move: SetPoint, highest: int) -> Feedforward:
+def _of_move(
+    empty: Feedforward, loop: ClosedLoop, move: SetPointProfile, highest: int
+) -> Feedforward:
     """Return the gains by least squares of the errors of a loop in a move."""
-    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
     duration, orders = _AFTER * move.duration, list(range(min(highest, move.order) + 1))
     plant = loop.machine.replace(evaluation=None)
     alone = close_loop(plant.replace(evaluation=None), *loop.blocks, idle=loop.idle)
@@ -328,7 +330,7 @@ def _of_move(empty: Feedforward, loop: ClosedLoop, move: SetPoint, highest: int)
 def gain_effects(
     start: Feedforward,
     loop: ClosedLoop,
-    move: SetPoint,
+    move: SetPointProfile,
     duration: float,
     orders: list[int],
     channels: list[str],
@@ -385,7 +387,7 @@ def term_numbers(terms: Any) -> list[int]:
 
 
 def _check_order(move: Any, gains: FloatArray) -> None:
-    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
     highest = max((m for m in range(5) if np.any(gains[:, :, m])), default=0)
     if move.order < highest:
         raise ModelError(

@@ -14,7 +14,7 @@ from ..plant.axes import resting_frequency
 from ..plant.partitioned import require_sampled
 from ..tolerances import divisor
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .simulate import simulate
 
 #: gradient of what forces minimise, of that without forces; 2e-13 was seen
@@ -25,7 +25,7 @@ _OUTSIDE = 1e-3
 
 def inverse_forces(
     loop: ClosedLoop,
-    move: SetPoint,
+    move: SetPointProfile,
     *,
     duration: float,
     bandwidth: float,
@@ -45,7 +45,7 @@ def inverse_forces(
     ----------
     loop : ClosedLoop
         The controller on a model: a sampled plant, assembled from a free structure.
-    move : SetPoint
+    move : SetPointProfile
         With a rest before it that is long enough for the preview; a warning says when it is not.
     duration : float [s]
         Of the run.
@@ -90,7 +90,7 @@ def inverse_forces(
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     plant, poi, axis, name = tracked(loop.machine, reference)
-    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
     require_sampled(plant, "the inverse is of samples", ModelError)
     steps = round(positive(duration, "duration") / plant.dt)
     reach = 2.0 * np.pi * positive(bandwidth, "bandwidth") * plant.dt
@@ -156,7 +156,7 @@ def _check_minimum(
         )
 
 
-def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) -> FloatArray:
+def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPointProfile, name: str) -> FloatArray:
     """Return what the controller adds (n_time, nu) while these forces move its own plant."""
     plant = loop.machine.replace(evaluation=None)
     names = [force_name(u) for u in plant.u]

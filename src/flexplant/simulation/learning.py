@@ -21,7 +21,7 @@ from ..checks import (
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop
 from .feedforward import Feedforward, gain_effects, run_errors, term_numbers, tracked
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .response import Response
 
 #: condition of the basis (columns scaled to one) beyond which directions are left as they are
@@ -56,7 +56,7 @@ def learn_feedforward(
     start: Feedforward,
     trial: Callable[[Feedforward], Response],
     loop: ClosedLoop,
-    move: SetPoint,
+    move: SetPointProfile,
     *,
     duration: float,
     terms: Sequence[str] = ("acceleration", "jerk", "snap"),
@@ -80,7 +80,7 @@ def learn_feedforward(
         Makes the move with a Feedforward on the machine and returns what was recorded.
     loop : ClosedLoop
         The same controller (without feedforward) on a model of the machine, for Phi.
-    move : SetPoint
+    move : SetPointProfile
     duration : float [s]
         Of each run.
     terms : sequence of str
@@ -160,4 +160,4 @@ def _check_trial(start: object, loop: object, move: object) -> None:
             "design_feedforward(plant)."
         )
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")

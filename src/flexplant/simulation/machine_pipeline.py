@@ -24,7 +24,7 @@ from ..checks import (
     whole,
 )
 from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted
-from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
+from ..estimation import ConsistencyReport, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
@@ -125,7 +125,7 @@ class MachinePipeline(Value):
         A controller for all machines (StateSpaces or Controllers), in place of a design for each.
     specification : Specification, optional
         What the loop that is run is checked against.
-    reference : SetPoint, array or mapping, optional
+    reference : SetPointProfile, array or mapping, optional
         Of the run.
     duration : float [s]
         Of that run.
@@ -397,7 +397,7 @@ class MachineReport(Value):
     warned: tuple[str, ...] = ()
 
     @cached_property
-    def agreement(self) -> Consistency:
+    def agreement(self) -> ConsistencyReport:
         """The run beside the model: which modes are elsewhere on the machine, by how much."""
         return consistency(self.observer, self.run)
 
@@ -426,7 +426,7 @@ class MachineReport(Value):
                 lines += [heading, *(f"  {line}" for line in shown.splitlines()), ""]
         return "\n".join(lines[:-1])
 
-    def _judged(self) -> Consistency | str:
+    def _judged(self) -> ConsistencyReport | str:
         """Return how the run agrees with the model, or why that cannot be said."""
         try:
             return self.agreement

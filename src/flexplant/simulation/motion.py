@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SetPoint(Value):
+class SetPointProfile(Value):
     """A motion from rest to rest along one axis; made by `setpoint`, `scan` and `then`.
 
     Parameters
@@ -85,8 +85,8 @@ class SetPoint(Value):
         windows = f", {counted(len(self.exposures), 'exposure')}" if len(self.exposures) else ""
         grid = f", on a grid of {self.tick:g} s" if self.gridded else ""
         return (
-            f"<SetPoint {self.start:g} -> {self.stop:g} m or rad in {self.duration:.6g} s, order "
-            f"{self.order}, velocity to {peak.velocity:.4g} /s, acceleration to "
+            f"<SetPointProfile {self.start:g} -> {self.stop:g} m or rad in {self.duration:.6g} s, "
+            f"order {self.order}, velocity to {peak.velocity:.4g} /s, acceleration to "
             f"{peak.acceleration:.4g} /s^2{windows}{grid}>"
         )
 
@@ -124,12 +124,14 @@ class SetPoint(Value):
         )
         return Motion(*found)
 
-    def then(self, following: SetPoint) -> SetPoint:
+    def then(self, following: SetPointProfile) -> SetPointProfile:
         """Return this set-point with another one after it, which begins where this one ends.
 
         Order and grid of both are the same; the exposure windows are those of both.
         """
-        other: SetPoint = instance(following, SetPoint, "following", "Use setpoint(...).")
+        other: SetPointProfile = instance(
+            following, SetPointProfile, "following", "Use setpoint(...)."
+        )
         if (other.order, other.tick, other.gridded) != (self.order, self.tick, self.gridded):
             raise ModelError(
                 f"{other!r} cannot follow {self!r}: a chain has one order and one grid. Give both "
@@ -333,7 +335,7 @@ def setpoint(
     settle: float = 0.0,
     exposure: float = 0.0,
     rate: float | None = None,
-) -> SetPoint:
+) -> SetPointProfile:
     """Return the fastest motion from rest to rest within the bounds, in closed form.
 
     Second order (acceleration jumps), third with `jerk` (jerk jumps) or fourth with `snap`. Bounds
@@ -365,7 +367,7 @@ def setpoint(
 
     Returns
     -------
-    SetPoint
+    SetPointProfile
         With `.at(t)`, `.duration`, `.exposures`, and `.then(other)` for chains.
 
     Raises
@@ -411,7 +413,7 @@ def scan(
     start: float = 0.0,
     rest: float = 0.0,
     rate: float | None = None,
-) -> SetPoint:
+) -> SetPointProfile:
     """Return a scan: to constant velocity, settle, expose a length, and back to rest.
 
     Parameters
@@ -430,7 +432,7 @@ def scan(
 
     Returns
     -------
-    SetPoint
+    SetPointProfile
         With one exposure window.
 
     Raises
@@ -504,7 +506,7 @@ def _assembled(
     start: Any,
     order: int,
     moving: bool,
-) -> SetPoint:
+) -> SetPointProfile:
     """Return rest, rise, cruise and fall as one value."""
     # `waits` are rest, settle and exposure; the last two at constant velocity when `moving`
     rest, settle, exposure = waits
@@ -525,7 +527,7 @@ def _assembled(
     states = sign * np.array([row.state for row in rows])
     states[:, 0] += begin
     windows = [[after, after + exposure]] if exposure > 0 else np.zeros((0, 2))
-    return SetPoint(
+    return SetPointProfile(
         edges,
         np.array([row.length for row in rows]),
         np.array([row.from_end for row in rows]),

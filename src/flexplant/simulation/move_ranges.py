@@ -12,7 +12,7 @@ from ..errors import AssumptionError, warn
 from ..plant import StandardPlant, driven_axes
 from ..plant.at_rest import at_rest, followed_at_rest, solved
 from ..plant.axes import complex_gain, resting_frequency
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .nonlinear_elements import Saturation
 
 #: derivatives of a move whose forces are counted: position (springs), velocity, acceleration
@@ -31,7 +31,7 @@ def warn_beyond_ranges(
     SetPoint count as at rest.
     """
     limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
-    moves = {name: move for name, move in signals.items() if isinstance(move, SetPoint)}
+    moves = {name: move for name, move in signals.items() if isinstance(move, SetPointProfile)}
     if not limits or not moves or not plant.is_assembled:
         return
     for name, needed in _needed(plant, moves, list(limits), time).items():
@@ -60,7 +60,7 @@ def _limit(given: Any) -> Saturation | None:
 
 
 def _needed(
-    plant: StandardPlant, moves: Mapping[str, SetPoint], names: list[str], time: FloatArray
+    plant: StandardPlant, moves: Mapping[str, SetPointProfile], names: list[str], time: FloatArray
 ) -> dict[str, FloatArray]:
     """Return what actuators apply and sensors read over time, by name, while moves are followed."""
     found = {name: moves[name].at(time).position for name in names if name in moves}

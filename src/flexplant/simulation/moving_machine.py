@@ -23,7 +23,7 @@ from ..lti.sampling import pair_expm
 from ..plant import Actuator, Poi, StandardPlant
 from ..plant.scheduling import Position
 from ..tolerances import SAME
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .nonlinear_elements import Acting
 from .runs import NO_NOISE
 
@@ -83,7 +83,7 @@ def known_positions(plant: StandardPlant, what: str) -> tuple[Position, ...]:
 
 def _path(name: str, path: Any, time: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Return a position as a function of time; a value a sample is smooth between them."""
-    if isinstance(path, SetPoint):
+    if isinstance(path, SetPointProfile):
         return lambda t: np.asarray(path.at(t).position)
     if callable(path):
         return lambda t: real_array(path(t), f"position {name!r} over time", (t.size,))

@@ -30,7 +30,7 @@ from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
 from ..plant.partitioned import require_sampled
 from ..tolerances import SAME, TYPED
-from .motion import SetPoint
+from .motion import SetPointProfile
 from .move_ranges import warn_beyond_ranges
 from .moving_machine import MovingMachine, trajectory, unscheduled
 from .nonlinear_elements import Acting, Acts, split_elements
@@ -39,7 +39,7 @@ from .response import Response
 from .runs import Conditions, make_runner
 
 #: a signal over time: a set-point, one value per sample, a constant, or a function of time
-Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.ArrayLike]"
+Signal: TypeAlias = "SetPointProfile | npt.ArrayLike | Callable[[FloatArray], npt.ArrayLike]"
 
 
 def simulate(
@@ -351,7 +351,7 @@ def _derivatives(
         if owner not in own or name in reference or owner not in reference:
             continue
         move = reference[owner]
-        if not isinstance(move, SetPoint):
+        if not isinstance(move, SetPointProfile):
             raise ModelError(
                 f"a block reads {name!r}, which follows from a SetPoint only: pass one for "
                 f"{owner!r} (setpoint, scan), or give {name!r} as a reference too."
@@ -368,7 +368,7 @@ def _derivatives(
 
 def _signal_samples(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
     """Return a signal at the sampling instants: a number, (n_time,) or (runs, n_time)."""
-    if isinstance(signal, SetPoint):
+    if isinstance(signal, SetPointProfile):
         _check_setpoint(signal, name, time)
         return signal.at(time).position
     if isinstance(signal, type):
@@ -380,7 +380,7 @@ def _signal_samples(signal: Any, name: str, time: FloatArray, runs: int) -> Floa
     return real_array(values, name, (*each, *time.shape))
 
 
-def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
+def _check_setpoint(move: SetPointProfile, name: str, time: FloatArray) -> None:
     """Warn of a set-point that the run cuts off, or that switches between its samples."""
     dt = float(time[1]) if time.size > 1 else 0.0
     end = float(time[-1]) + dt

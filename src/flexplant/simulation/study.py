@@ -351,7 +351,7 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
     >>> designs = {"static": fx.design_static(plant), "filter": fx.design_kalman(plant)}
-    >>> [output for block in fx.reading_along(designs) for output in block.outputs]
+    >>> [output for block in fx.simulation.reading_along(designs) for output in block.outputs]
     ['static|die:hat', 'filter|die:hat']
     """
     mapping(designs, "designs", "Pass {'updated': design_kalman(plant)}.", least=1, kind=Estimator)
@@ -401,9 +401,9 @@ def compare_estimators(
     >>> plant = fx.testbeds.three_masses()
     >>> designs = {"static": fx.design_static(plant), "filter": fx.design_kalman(plant)}
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=designs["filter"])
-    >>> loop = fx.close_loop(plant, designs["filter"], servo, *fx.reading_along(designs))
+    >>> loop = fx.close_loop(plant, designs["filter"], servo, *fx.simulation.reading_along(designs))
     >>> run = fx.simulate(loop, duration=0.5, rng=1, runs=5)
-    >>> found = fx.compare_estimators(designs, run, "die:x", start=0.2)
+    >>> found = fx.simulation.compare_estimators(designs, run, "die:x", start=0.2)
     >>> bool(found["filter"][1] < found["static"][1])  # measured
     True
     """
@@ -418,7 +418,8 @@ def compare_estimators(
             if wanted not in run:
                 raise LabelError(
                     f"{unknown_label('channel', wanted, list(run))} Estimators read along in a "
-                    "loop as blocks: close_loop(plant, *blocks, *reading_along(designs))."
+                    "loop as blocks: close_loop(plant, *blocks, "
+                    "*fx.simulation.reading_along(designs))."
                 )
         error = run[channel] - run[hat]
         seen = run.replace(data=error[..., None, :], names=["error"], units={})

@@ -49,7 +49,7 @@ class Rectangle(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.Rectangle((0.1, 0.1), (0.2, 0.3)).holds(np.array([[0.15, 0.2], [0.5, 0.5]]))
+    >>> fx.structure.Rectangle((0.1, 0.1), (0.2, 0.3)).holds(np.array([[0.15, 0.2], [0.5, 0.5]]))
     array([ True, False])
     """
 
@@ -83,7 +83,7 @@ class Disc(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.Disc((0.3, 0.3), radius=0.1).holds(np.array([[0.3, 0.35], [0.5, 0.5]]))
+    >>> fx.structure.Disc((0.3, 0.3), radius=0.1).holds(np.array([[0.3, 0.35], [0.5, 0.5]]))
     array([ True, False])
     """
 
@@ -244,7 +244,8 @@ def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> A
     if len(counts) != 2 or not all(isinstance(hole, Hole) for hole in listed):
         raise ModelError(
             f"holes must be Rectangle and Disc values, a mask of the elements or a function of an "
-            f"element's centre, got {short(holes)}. Rectangle((0.1, 0.1), (0.2, 0.2)), say."
+            f"element's centre, got {short(holes)}. "
+            "Pass fx.structure.Rectangle((0.1, 0.1), (0.2, 0.2)), for example."
         )
     return _shares(listed, lengths, counts) < _LEAST
 
@@ -341,7 +342,7 @@ class Rib(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> rib = fx.Rib((0.0, 0.3), (0.6, 0.3), width=0.01, height=0.03)
+    >>> rib = fx.structure.Rib((0.0, 0.3), (0.6, 0.3), width=0.01, height=0.03)
     """
 
     start: Sequence[float] = field(metadata=_PLACE)

@@ -143,7 +143,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     else:
         raise ModelError(
             f"check needs an FEModel or FEMatrices, got {type(model).__name__}. "
-            "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
+            "Pass fx.structure.FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
     with Progress(0, "check"):
         found = facts(matrices_, model if isinstance(model, FEModel) else None)

@@ -359,8 +359,8 @@ class FEMatrices(Value):
         if are_swapped(self.K, self.M, self.dofs):
             raise ModelError(
                 "K and M are swapped? M gives rigid translations no inertia, as a stiffness gives "
-                "them no force, and K resists them as a mass does. The order is FEMatrices(K, M), "
-                "but FEModel(M, K)."
+                "them no force, and K resists them as a mass does. The order is "
+                "fx.structure.FEMatrices(K, M), but FEModel(M, K)."
             )
         ready = self
         if flag(free, "free"):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..checks import FloatArray
-from ..lti.filters import highpass
+from ..lti.filters import high_pass_filter
 from ..modes import solve_modes
 from ..plant import (
     Actuator,
@@ -297,7 +297,7 @@ def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     held = suspend(modes, [GroundSpring(p, each, 0.1 * each / 13.2) for p in corners])
     ports = Ports(
         w=[
-            BaseAcceleration("floor", "z", 2e-4, highpass(0.3, order=2)),
+            BaseAcceleration("floor", "z", 2e-4, high_pass_filter(0.3, order=2)),
             *(Disturbance(f"air{i}", at=p, asd=1e-3) for i, p in enumerate(corners, 1)),
         ],
         u=[Actuator(f"coil{i}", at=p) for i, p in enumerate(corners, 1)],

@@ -183,7 +183,7 @@ class WaferStage(Value):
         *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
             What runs on it.
         duration : float [s]
-        reference : SetPoint, array or mapping, optional
+        reference : SetPointProfile, array or mapping, optional
         rng : int or Generator, optional
             Of the noise.
         runs : int, optional

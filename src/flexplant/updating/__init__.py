@@ -30,7 +30,7 @@ from noisy responses to a model, ``examples/paper_plate.py`` has the paper's num
 from ..rooms import public_names as _public_names
 from .discrepancy import Discrepancy as Discrepancy
 from .discrepancy import ModalUncertainty as ModalUncertainty
-from .judgement.identifiability import Identifiability as Identifiability
+from .judgement.identifiability import IdentifiabilityReport as IdentifiabilityReport
 from .judgement.identifiability import identifiability as identifiability
 from .judgement.localise import Localisation as Localisation
 from .judgement.localise import localise as localise

@@ -2,7 +2,7 @@
 
 - `workbench`: ``fx.workbench(plant)`` opens the page on this machine; ``python -m
   flexplant.workbench measured.uff`` on a file; in a notebook what it returns is the page.
-- `Workbench`: ``design``, what was shaped last; ``serve``, ``close``.
+- `WorkbenchServer`: ``design``, what was shaped last; ``serve``, ``close``.
 - `LoopLimits`: what the page draws as forbidden, and judges.
 - `open_file`: what the page opens by its path: a plant, or a design to go on with.
 
@@ -13,7 +13,7 @@ needs Panel: ``pip install 'flexplant[workbench]'``. It is served to this machin
 pickle, and opens no file but those whose path it was given. `examples/workbench.py` is its story.
 
 >>> import flexplant as fx
->>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+>>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
 >>> bench = fx.workbench(mass, open_browser=False)
 >>> design = bench.design.with_axis("out", fx.synthesis.ShapedAxis([fx.Pid(9e4), fx.Lead(50.0)]))
 >>> design.loops(mass).report.is_stable
@@ -23,7 +23,7 @@ Names elsewhere (MATLAB): ``controlSystemDesigner``, ``sisotool``: `workbench`; 
 """
 
 from ..rooms import called_names as _called_names
-from .launch import Workbench as Workbench
+from .launch import WorkbenchServer as WorkbenchServer
 from .launch import open_file as open_file
 from .launch import workbench as workbench
 from .verdict import LoopLimits as LoopLimits

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import ModelError, counted
 from ..lti.frequency import Frf
 from ..plant import StandardPlant
-from ..simulation.motion import SetPoint
+from ..simulation.motion import SetPointProfile
 from ..synthesis import LoopDesign, LowPass, Pid, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from .consequences import Question
@@ -70,7 +70,7 @@ class Bench:
         design: LoopDesign,
         model: Any = None,
         channel: str | None = None,
-        move: SetPoint | None = None,
+        move: SetPointProfile | None = None,
         limits: LoopLimits | None = None,
         source: str = "",
     ) -> None:

@@ -23,7 +23,7 @@ from ..lti.sampling import discretized
 from ..parallel import bars_of_thread
 from ..plant import StandardPlant
 from ..simulation import simulate
-from ..simulation.motion import SetPoint
+from ..simulation.motion import SetPointProfile
 from ..store import load
 from ..synthesis import LoopDesign, ShapedAxis, tune_loops
 from ..synthesis.laws.loop_design import axes_controller
@@ -60,7 +60,7 @@ class Question:
     machine: BenchMachine
     model: BenchMachine | None
     channel: str | None
-    move: SetPoint | None
+    move: SetPointProfile | None
 
     @property
     def plant(self) -> StandardPlant | None:

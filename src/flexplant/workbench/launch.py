@@ -18,7 +18,7 @@ from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System
 from ..parallel import in_notebook
 from ..plant import StandardPlant
-from ..simulation.motion import SetPoint
+from ..simulation.motion import SetPointProfile
 from ..store import load
 from ..synthesis import LoopDesign
 from .bench import Bench
@@ -110,7 +110,7 @@ class Served:
         self._over.wait(_TIMEOUT)
 
 
-class Workbench(Bench):
+class WorkbenchServer(Bench):
     """The page of `flexplant.workbench`: it serves itself, and shows itself in a notebook.
 
     Parameters
@@ -124,7 +124,7 @@ class Workbench(Bench):
     Examples
     --------
     >>> import flexplant as fx
-    >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+    >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
     >>> fx.workbench(mass, open_browser=False).top < 1e3  # frequencies of sliders [Hz]
     True
     """
@@ -204,17 +204,17 @@ def workbench(
     unstable: int | None = None,
     references: Mapping[str, str] | None = None,
     channel: str | None = None,
-    move: SetPoint | None = None,
+    move: SetPointProfile | None = None,
     limits: LoopLimits | None = None,
     source: str = "",
     port: int = 0,
     open_browser: bool = True,
     block: bool | None = None,
-) -> Workbench:
+) -> WorkbenchServer:
     """Open a page in the browser on which loops are shaped by hand, axis by axis.
 
     The page is served on this machine only. In a notebook the object that is returned shows the
-    page in its cell; `Workbench.design` is what was shaped last.
+    page in its cell; `WorkbenchServer.design` is what was shaped last.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def workbench(
         As for `design_loops`; of an assembled plant, or of the model, the rigid-body axes.
     channel : str, optional
         The z whose rms is predicted; the first error of the plant when not given.
-    move : SetPoint, optional
+    move : SetPointProfile, optional
         The set-point whose error is drawn; a unit step when not given.
     limits : LoopLimits, optional
         What the page draws as forbidden, and judges.
@@ -243,7 +243,7 @@ def workbench(
 
     Returns
     -------
-    Workbench
+    WorkbenchServer
 
     Raises
     ------
@@ -255,13 +255,13 @@ def workbench(
     Examples
     --------
     >>> import flexplant as fx
-    >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+    >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
     >>> bench = fx.workbench(mass, open_browser=False)
     >>> bench.design.loops(mass).report.is_stable
     True
     """
     instance(limits, LoopLimits | None, "limits", "Pass LoopLimits(peak=2.0).")
-    instance(move, SetPoint | None, "move", "Pass setpoint(...).")
+    instance(move, SetPointProfile | None, "move", "Pass setpoint(...).")
     instance(design, LoopDesign | None, "design", "Pass LoopDesign.on(plant).", LabelError)
     options = {
         "model": model, "before": before, "after": after, "rate": rate,
@@ -269,7 +269,7 @@ def workbench(
         "references": references, "channel": channel, "move": move, "limits": limits,
         "source": source,
     }  # fmt: skip
-    bench = Workbench.of(plant, design, options)
+    bench = WorkbenchServer.of(plant, design, options)
     if open_browser and not in_notebook():
         waits = not sys.flags.interactive and not hasattr(sys, "ps1")
         bench.serve(port, open_browser=True, block=waits if block is None else block)

@@ -88,7 +88,7 @@ def design_ncf(
     >>> import flexplant as fx
     >>> plant = fx.lti.tf([1.0], [1.0, 0.0, 0.0])  # a free mass
     >>> controller = fx.design_ncf(plant)
-    >>> round(fx.ncf_margin(plant, controller), 2)
+    >>> round(fx.synthesis.ncf_margin(plant, controller), 2)
     0.35
     """
     require_model(plant)
@@ -150,7 +150,7 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     --------
     >>> import flexplant as fx
     >>> plant, controller = fx.lti.tf([1.0], [1.0, 0.0]), fx.lti.tf([-1.0], [1.0])
-    >>> round(fx.ncf_margin(plant, controller), 4)  # 1 / sqrt(2)
+    >>> round(fx.synthesis.ncf_margin(plant, controller), 4)  # 1 / sqrt(2)
     0.7071
     """
     G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)

@@ -13,7 +13,7 @@ from ...checks import ComplexArray, FloatArray, Value, below_half_rate, positive
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
-from ...lti.filters import lowpass
+from ...lti.filters import low_pass_filter
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import connect, loop_poles, series, side_by_side
 from ...lti.minimal import minimal
@@ -263,7 +263,7 @@ def _model(given: float | System, axes: Axes) -> StateSpace:
     """Return the reference model: as it is given, or low-passes."""
     if not isinstance(given, int | float | np.number):
         return as_statespace(given)
-    one = lowpass(positive(given, "model"), order=2)
+    one = low_pass_filter(positive(given, "model"), order=2)
     names = [f"{name}:ref" for name in axes.names]
     return side_by_side([one] * len(names), axes.names).replace(inputs=names)
 
@@ -273,7 +273,7 @@ def _shaping(axes: Axes, freq: float, rolloff: float | None) -> StateSpace:
     if rolloff is None:
         return integral_action(axes.plant, freq)
     names = axes.before.inputs
-    filters = side_by_side([lowpass(rolloff, order=2)] * len(names), names)
+    filters = side_by_side([low_pass_filter(rolloff, order=2)] * len(names), names)
     filters = tustin(filters, axes.rate) if axes.rate else filters
     return series(integral_action(series(filters, axes.plant), freq), filters)
 

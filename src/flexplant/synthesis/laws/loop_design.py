@@ -107,7 +107,7 @@ def axes_of(
         if rate is not None or delay:
             raise ModelError(
                 "rate and delay are those of a measured Frf; a model has them in it: pass "
-                "discretized(plant, rate, delay=)."
+                "fx.lti.discretized(plant, rate, delay=)."
             )
         rate, inputs, outputs = (1.0 / plant.dt if plant.dt else None), plant.inputs, plant.outputs
     first, last = static_map(before, inputs, "before"), static_map(after, outputs, "after")

@@ -90,7 +90,7 @@ def tune_loops(
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)
+    >>> plant = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)
     >>> design = fx.tune_loops(plant)
     >>> design.report.is_stable
     True

@@ -447,7 +447,8 @@ class Lmi(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> slow = fx.lti.low_pass_filter(0.1)
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=slow, KS=0.1)
     >>> fx.design_hinf(sys, fx.Lmi()).gamma < 1
     True
     """

@@ -95,7 +95,8 @@ def design_lmi(
     Examples
     --------
     >>> import flexplant as fx
-    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> slow = fx.lti.low_pass_filter(0.1)
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=slow, KS=0.1)
     >>> found = fx.synthesis.design_lmi(sys, minimize=fx.synthesis.Hinf())
     >>> found.gamma < 1
     True

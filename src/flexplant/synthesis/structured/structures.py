@@ -297,7 +297,8 @@ class Parametrised:
     >>> import flexplant as fx
     >>> def gain(p):
     ...     return fx.StateSpace([], [], [], [[p[0]]], inputs=["out:error"], outputs=["in"])
-    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> slow = fx.lti.low_pass_filter(0.1)
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=slow, KS=0.1)
     >>> structure = fx.synthesis.Parametrised(gain, start=[1.0])
     >>> fx.synthesis.design_structured(sys, structure, starts=1).gamma < 1
     True

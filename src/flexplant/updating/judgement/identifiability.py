@@ -33,7 +33,7 @@ NAMED = 3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identifiability(Value):
+class IdentifiabilityReport(Value):
     """What the residuals determine of the parameters, to first order.
 
     Parameters
@@ -75,7 +75,8 @@ class Identifiability(Value):
     def __repr__(self) -> str:
         lines = [
             (
-                f"<Identifiability: {self.rank} of {counted(len(self.parameters), 'combination')}, "
+                f"<IdentifiabilityReport: {self.rank} of "
+                f"{counted(len(self.parameters), 'combination')}, "
                 f"singular values {self.singular_values[0]:.3g} to {self.singular_values[-1]:.3g}"
             )
         ]
@@ -104,7 +105,7 @@ def identifiability(
     residuals: Sequence[Any],
     *,
     start: Sequence[float] | FloatArray | None = None,
-) -> Identifiability:
+) -> IdentifiabilityReport:
     """Return which parameters the residuals determine at a start, before solving.
 
     The singular values of the weighted sensitivities S, the correlation
@@ -118,7 +119,7 @@ def identifiability(
 
     Returns
     -------
-    Identifiability
+    IdentifiabilityReport
 
     Raises
     ------
@@ -130,7 +131,8 @@ def identifiability(
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j], modes=[2]))
-    >>> found = fx.identifiability(drawing, [fx.AddedMass("1:x"), fx.AddedMass("3:x")], [poles])
+    >>> ends = [fx.AddedMass("1:x"), fx.AddedMass("3:x")]
+    >>> found = fx.updating.identifiability(drawing, ends, [poles])
     >>> found.rank  # of two: one pole is the same for both ends
     1
     """
@@ -155,7 +157,7 @@ def identifiability(
     poor = list(dict.fromkeys([*unseen, *(n for group in mixed for n in group)]))
     # combinations of the parameters themselves that change no residual
     lost = Vt[~clear] / length
-    return Identifiability(
+    return IdentifiabilityReport(
         parameters=names,
         singular_values=s,
         combinations=Vt.T,

@@ -39,8 +39,9 @@ def localise(
 ) -> Localisation:
     """Find which of many candidate changes explains a measurement.
 
-    Arguments are as for `update`: ``found = fx.localise(drawing, candidates, residuals)``, with a
-    candidate for every place, ``[fx.AddedMass(at) for at in drawing.dofs.labels]`` say.
+    Arguments are as for `update`: ``found = fx.updating.localise(drawing, candidates,
+    residuals)``, with a candidate for every place, for example
+    ``[fx.AddedMass(at) for at in drawing.dofs.labels]``.
     `found.chosen` names up to `most` of them, none where nothing is wrong; `found.ranking` all by
     what each explains alone. `found.alike_sets` are the sets that explain the data as well as the
     chosen one, which on a symmetric structure are many: pass each to `update`, or tell them apart
@@ -100,7 +101,7 @@ def localise(
     >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]
-    >>> fx.localise(drawing, masses, [fx.Eigenvalues(measured)]).ranking[0]
+    >>> fx.updating.localise(drawing, masses, [fx.Eigenvalues(measured)]).ranking[0]
     '3:x'
     """
     listed = checked_parameters(candidates)

@@ -117,7 +117,8 @@ def sample_posterior(
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2], covariance=[[1.0, 0.0], [0.0, 1.0]])
     >>> data, mass = [fx.Eigenvalues(measured)], [fx.AddedMass("3:x")]
-    >>> draws = fx.sample_posterior(drawing, mass, data, fx.update(drawing, mass, data), steps=100)
+    >>> fit = fx.update(drawing, mass, data)
+    >>> draws = fx.updating.sample_posterior(drawing, mass, data, fit, steps=100)
     >>> draws.draws.shape[1]
     1
     """

@@ -349,7 +349,7 @@ def validate(
     >>> poles = fx.solve_modes(heavier, count=3).poles
     >>> known = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[1]], modes=[2]))
     >>> unused = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[2]], modes=[3]))
-    >>> fx.validate(drawing, [fx.AddedMass("3:x")], [known], [unused]).helped
+    >>> fx.updating.validate(drawing, [fx.AddedMass("3:x")], [known], [unused]).helped
     True
     """
     listed = checked_parameters(parameters)

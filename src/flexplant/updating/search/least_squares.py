@@ -337,7 +337,7 @@ def _gauss_newton_step(
             f"equations, {counted(len(names), 'unknown')}, S is singular): {there}some combination "
             "of them changes nothing. Measure more modes, drop one of them, give priors, begin "
             "elsewhere (start=) or cut it off, updating.GaussNewton(truncate=1e-3). "
-            "identifiability(...) "
+            "fx.updating.identifiability(...) "
             "shows which."
         )
     step = -(Vt[keep].T @ ((U[:, keep].T @ r) / s[keep])) / length
