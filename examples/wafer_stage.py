@@ -137,8 +137,7 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
 def hinf(plant: fx.StandardPlant) -> tuple[Any, ...]:
     """Return the errors that the H-infinity controller reads, and the controller."""
     errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, BANDWIDTH)
-    weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
-    return errors, fx.design_hinf(weighted)
+    return errors, fx.design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
 
 
 def servo(plant: fx.StandardPlant) -> tuple[Any, ...]:
@@ -179,9 +178,8 @@ def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     """Return the predicted error of the die over places of a sensor beside those at the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
     plant, goal = plant_of(case, "measured"), fx.PoiVariance("die")
-    return fx.placement.sensor_map(
-        plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)]
-    )
+    apart = [fx.placement.OffPoi(0.12)]
+    return fx.placement.sensor_map(plant, points, goal, asd=NOISE, constraints=apart)
 
 
 # %% What it shows: each claim is printed with its figures, and stops the example when untrue
