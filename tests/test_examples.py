@@ -157,13 +157,13 @@ def test_every_row_has_noise_of_its_own(result):
 
 
 def test_the_closed_loops(result):
-    """0.1 %: unstable as if the model were the machine, 78 Hz and 7.4 dB where it is tolerant."""
+    """0.1 %: unstable as if the model were the machine, 82 Hz and 7.7 dB where it is tolerant."""
     case = result["cases"][0.001]
     table, loops = case["table"], case["loops"]
     sure, held = table["H-infinity, updated"], table["tolerant, measured"]
     assert sure.decay > 1.001
     assert not loops["H-infinity, updated"]["model"].is_stable  # the modes left out show it
-    assert held.bandwidth == pytest.approx(78.5, abs=2.0)
+    assert held.bandwidth == pytest.approx(82.3, abs=2.0)
     promised = loops["tolerant, measured"]["model"].modulus_margin
     assert promised >= 0.4 * (1 - 1e-6)
     assert held.margin == pytest.approx(promised, rel=0.05)
