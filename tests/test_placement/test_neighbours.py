@@ -207,12 +207,17 @@ def test_a_short_list_by_the_hinf_level():
     )
     tracked = level.replace(w={"f": 1.0, "die:ref": 1e-6}, z={"die:error": 1e6})
     assert tracked(followed) > level(plant)
-    # one rule for scores and places
-    off = score_sensors(plant, singles, PoiVariance(), constraints=[OffPoi()])
+    # one rule for scores and places: the sensor on the POI is the plant's own and may stay there,
+    # unless a radius keeps all sensors away
+    kept = score_sensors(plant, singles, PoiVariance(), constraints=[OffPoi()])
+    sensors = [plant.assembled.ports.y[i] for i in (0, 1, 3)]
+    assert place_sensors(plant, sensors, 1, PoiVariance()).chosen == kept.best == ("s3",)
+    away = [OffPoi(0.05)]
+    off = score_sensors(plant, singles, PoiVariance(), constraints=away)
     assert off.layouts[2] == ("s3",)
     assert "OffPoi" in off.reasons[2]
-    sensors = [plant.assembled.ports.y[i] for i in (0, 1, 3)]
-    assert place_sensors(plant, sensors, 1, PoiVariance()).chosen == off.best == ("s1",)
+    placed = place_sensors(plant, sensors, 1, PoiVariance(), constraints=away)
+    assert placed.chosen == off.best == ("s1",)
 
 
 def test_what_wrappers_refuse(make):

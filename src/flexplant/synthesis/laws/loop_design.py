@@ -88,6 +88,11 @@ def axes_of(
 ) -> Axes:
     """Return a plant in its decoupled axes; parameters as for `design_loops`."""
     plant = getattr(plant, "nominal", plant)  # of an uncertain one
+    if isinstance(plant, np.ndarray | list | tuple | float | int):
+        raise ModelError(
+            f"plant must be a plant, a system or an Frf, got {short(plant)}: a gain alone has no "
+            "motion to control. Pass fx.lti.as_statespace(gain) where a static plant is meant."
+        )
     given = plant if isinstance(plant, StandardPlant) else None
     if hasattr(plant, "frdata"):
         plant = Frf.from_control(plant)
