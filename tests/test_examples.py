@@ -429,7 +429,7 @@ def test_what_is_said_of_other_designs(judged):
     assert judged(80.0, {}, sure=True)[1][3] == 0.0
     usual = {"kind": "measured", "sure": True}, {"kind": "drawing", "sure": True}, {}
     margins = [judged(80.0, {}, 0.01, **options)[1][3] for options in usual]
-    np.testing.assert_allclose(margins, [0.35, 0.24, 0.48], atol=0.01)
+    np.testing.assert_allclose(margins, [0.44, 0.34, 0.50], atol=0.01)
 
 
 @pytest.mark.parametrize(("bandwidth", "damping"), [(30.0, 0.01), (50.0, 0.001), (80.0, 0.001)])
