@@ -169,7 +169,7 @@ def test_what_does_not_go_together_is_refused():
         design_loops(plant(), law().sampled(2000.0))
     with pytest.raises(ModelError, match="4 commands act on 3 motions"):
         design_loops(frf, law(), after=axes["after"])
-    with pytest.raises(ModelError, match=r"pass discretized\(plant"):
+    with pytest.raises(ModelError, match=r"pass fx\.lti\.discretized\(plant"):
         design_loops(plant(), law(), rate=RATE)
     with pytest.raises(ModelError, match=r"is no product of elements: 3.0.*is Pid\(gain\)"):
         design_loops(plant(), dict.fromkeys(["die:z", "die:rx", "die:ry"], 3.0))
