@@ -14,7 +14,7 @@ from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverEr
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING, SPLIT
+from ...tolerances import ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared
 from ..scaling import FELT, normalised
@@ -147,7 +147,7 @@ def _limit(p: Prepared, poles: ComplexArray, decay: float) -> list[tuple[complex
 def require_shown(p: Prepared) -> None:
     """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
     size = max(float(np.linalg.norm(p.A, 2)) if p.A.size else 0.0, 1.0)
-    for one in missed_modes(p, SPLIT * size, ROUNDING * size):
+    for one in missed_modes(p, _SLOW, ROUNDING * size):
         raise AssumptionError(one)
 
 
