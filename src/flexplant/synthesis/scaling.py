@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.linalg as la
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..checks import ComplexArray, FloatArray
 from ..lti.equations import bordered_scale, state_scale
@@ -98,23 +99,27 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
     omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
     G = responses(g, omega / (2.0 * np.pi))
-    falls = _slopes(G, m1, p1) < -np.log(_FALL)
-    # the first point after the first fall at which there is none
-    settled = np.logical_or.accumulate(falls, axis=1) & ~falls
+    sizes_of = _log_sizes(G, m1, p1)
+    falls = np.diff(sizes_of) * _POINTS < -np.log(_FALL)
+    # the first point after the first fall from which none follows in a decade: between two
+    # resonances an answer rises, and falls on
+    ahead = np.pad(sizes_of[:, 1:], [(0, 0), (0, _POINTS - 1)], mode="edge")
+    lowest = np.min(sliding_window_view(ahead, _POINTS, axis=1), axis=2)
+    settled = np.logical_or.accumulate(falls, axis=1) & (lowest >= sizes_of[:, :-1] - np.log(_FALL))
     found = [omega[np.argmax(one)] for one in settled if one.any()]
     if not found:
         return float(np.exp(np.mean(np.log(sizes))))
     # far above the last corner of all answers nothing happens but that gains grow
-    plain = _slopes(G - g.D[:, :, None], m1, p1)
+    plain = np.diff(_log_sizes(G - g.D[:, :, None], m1, p1)) * _POINTS
     corners = np.any(np.abs(plain - plain[:, -1:]) > np.log(_CORNER), axis=0)
     last = omega[np.flatnonzero(corners)[-1]] if corners.any() else np.inf
     return float(min(min(found), _BEYOND * last))
 
 
-def _slopes(G: ComplexArray, m1: int, p1: int) -> FloatArray:
-    """Return the logarithmic slopes a decade of the answers to each u and of each y."""
+def _log_sizes(G: ComplexArray, m1: int, p1: int) -> FloatArray:
+    """Return the logarithms of the answers to each u and of each y, over frequency."""
     sides = np.linalg.norm(G[:p1, m1:], axis=0), np.linalg.norm(G[p1:, :m1], axis=1)
-    return np.asarray(np.diff(np.log(np.maximum(np.vstack(sides), TINY))) * _POINTS)
+    return np.asarray(np.log(np.maximum(np.vstack(sides), TINY)))
 
 
 def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
