@@ -93,7 +93,7 @@ def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     errors, _, found, messages = design()
     assert found.certificate["spectral radius"] < 1
     radius = found.certificate["spectral radius with modes left out"]
-    assert radius > 1.001
+    assert radius > 1.0
     assert found.certificate["modulus margin with modes left out"] == 0.0
     whole = sampled(many())
     # oracle: stability() is the radius' logarithm or the like: only its sign counts

@@ -251,7 +251,7 @@ def test_one_controller_for_several_machines():
 @pytest.mark.long
 def test_the_stage_with_decoupled_laws_at_two_poi_positions():
     """A stage in SI units, one law for each rigid-body axis; the modes left out are checked."""
-    P = sampled(small(), ports())
+    P = sampled(small(), ports()).replace(evaluation=many())
     weighted = []
     for plant in (P, P.at(poi=(0.2, 0.35, 0.0))):
         errors, weights = reference_errors(plant), stage_weights(plant, 20.0)
@@ -259,9 +259,7 @@ def test_the_stage_with_decoupled_laws_at_two_poi_positions():
     w = (2 * np.pi * 20.0) ** 2
     start = Pid.corners(w / 4, integrator=2.0, zero=5.0, pole=80.0) * LowPass(160.0)
     structure = TunedLaws(start, free=("p", "i", "d", "freq"))
-    found = design_structured(
-        weighted.replace(evaluation=many()), structure, starts=1, evaluations=120
-    )
+    found = design_structured(weighted, structure, starts=1, evaluations=120)
     norms = [judged(plant, found) for plant in weighted]
     assert found.gamma == pytest.approx(max(norms), rel=2e-3)
     assert found.certificate["norm of plant 2"] == pytest.approx(norms[1], rel=2e-3)
