@@ -117,7 +117,7 @@ def chain_record(count, rate, seed, duration=4.0):
     sensors = [Sensor("y1", at="1:x", asd=1e-12), Sensor("y2", at=f"{count}:x", asd=3e-12)]
     truth = assemble_plant(every, own.replace(y=sensors)).discretized(rate, delay=1)
     observer = design_kalman(truth)
-    servo = design_servo(truth, bandwidth=20.0, observer=observer)
+    servo = design_servo(truth, bandwidth=10.0, observer=observer)
     run = simulate(close_loop(truth, observer, servo), duration=duration, rng=seed)
     return truth, every, run
 

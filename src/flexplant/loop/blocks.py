@@ -14,7 +14,7 @@ from ..lti.interconnection import among, connect
 from ..lti.joining import equal_matrices
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import AnyPlant, StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import SAME
 from .anti_windup import recovery_gain
 
@@ -102,7 +102,7 @@ def commands(
 def as_block(block: Any, name: str, dt: float) -> StateSpace:
     """Return a block as a StateSpace of the plant's dt; messages call it by a name."""
     inner = getattr(block, "system", block)
-    if isinstance(block, StandardPlant) or not (
+    if isinstance(block, AnyPlant) or not (
         isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
     ):
         raise ModelError(

@@ -26,7 +26,7 @@ from ..lti.interconnection import loop_poles
 from ..lti.measured_lines import on_lines
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, movable_outputs
 from .closed import ClosedLoop
@@ -186,7 +186,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
         plant = Frf.from_control(plant)
     if isinstance(plant, Frf):
         return _measured_loop(plant, controller, _quantities(loop[1]))
-    if isinstance(plant, StandardPlant):
+    if isinstance(plant, AnyPlant):
         require_known("y for the controller", controller.inputs, plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
         fed = movable_outputs(plant.system.select(plant.y, driven))
@@ -255,7 +255,7 @@ def _law_system(law: Any) -> StateSpace:
 def _quantities(law: Any) -> dict[str, str]:
     """Return what the sensors measure that a controller was designed for, where that is known."""
     plant = getattr(law, "plant", None)
-    if not isinstance(plant, StandardPlant) or not plant.is_assembled:
+    if not isinstance(plant, AnyPlant) or not plant.is_assembled:
         return {}
     return {sensor.name: sensor.quantity for sensor in plant.assembled.ports.y}
 

@@ -18,7 +18,7 @@ from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import AnyPlant, StandardPlant
+from ...plant import AnyPlant
 from ...tolerances import TINY
 from ..controller import Controller, with_left_out
 
@@ -92,7 +92,7 @@ def design_ncf(
     0.35
     """
     require_model(plant)
-    G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
+    G = plant.Gyu if isinstance(plant, AnyPlant) else as_statespace(plant)
     back_off = positive(back_off, "back_off")
     first = as_statespace(np.eye(len(G.inputs)) if before is None else before)
     last = as_statespace(np.eye(len(G.outputs)) if after is None else after)
@@ -119,7 +119,7 @@ def design_ncf(
         lower=least,
         certificate=certificate | {"modulus margin": modulus_margin((G, whole))},
     )
-    return with_left_out(answer, plant) if isinstance(plant, StandardPlant) else answer
+    return with_left_out(answer, plant) if isinstance(plant, AnyPlant) else answer
 
 
 def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> float:
@@ -153,7 +153,7 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     >>> round(fx.synthesis.ncf_margin(plant, controller), 4)  # 1 / sqrt(2)
     0.7071
     """
-    G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
+    G = plant.Gyu if isinstance(plant, AnyPlant) else as_statespace(plant)
     return loop_margin(G, as_statespace(controller))[0]
 
 

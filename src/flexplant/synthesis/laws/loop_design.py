@@ -17,7 +17,7 @@ from ...lti.frequency import Frf
 from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import AnyPlant, StandardPlant, decouple
+from ...plant import AnyPlant, decouple
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import checked_loop
 from .law import Law, LawElement
@@ -93,7 +93,7 @@ def axes_of(
             f"plant must be a plant, a system or an Frf, got {short(plant)}: a gain alone has no "
             "motion to control. Pass fx.lti.as_statespace(gain) where a static plant is meant."
         )
-    given = plant if isinstance(plant, StandardPlant) else None
+    given = plant if isinstance(plant, AnyPlant) else None
     if hasattr(plant, "frdata"):
         plant = Frf.from_control(plant)
     if given is not None:
