@@ -208,7 +208,7 @@ def test_directions_that_give_no_global_one_are_refused_by_name(tmp_path):
     moved = nodes(2411, node_nums=[1, 2], disp_cs=[5, 0])
     one = np.arange(32) + 1j
     path = written(tmp_path, [skew, moved, record((1, 1), (2, 3), one)])
-    with pytest.raises(ModelError, match=r"node 1 move along \[0\.866.*Measure all three"):
+    with pytest.raises(ModelError, match=r"node 1 move along \[ ?0\.866.*Measure all three"):
         read_frf_uff(path)
     with pytest.raises(ModelError, match="node 1 move along"):
         read_frf_uff(written(tmp_path, [skew, moved, record((2, 3), (1, 2), one)]))

@@ -265,11 +265,16 @@ class _Sizes:
         W = real_gain(plant.system, sigma, driven.channels, pushed)
         moved = np.linalg.norm(d[:, None] * W, axis=0) * np.sqrt(m / r)
         equal = dict(zip(pushed, (1.0 / divisor(moved)).tolist(), strict=True))
+        # accelerations of the floor are those of unit axes: of a rotation a unit over its arm
+        units = plant.units
+        arm = max((a for n, a in zip(driven.channels, d, strict=True) if units.get(n) == "rad"),
+                  default=1.0)  # fmt: skip
+        shaken = {"m/s^2": sigma**2, "rad/s^2": sigma**2 / float(arm)}
         return cls(
             dict(zip(driven.channels, d.tolist(), strict=True)),
             dict(zip(sensors, noises.tolist(), strict=True)),
             dict(zip(plant.u, forces.tolist(), strict=True)),
-            _capped(equal, dict(zip(plant.u, forces.tolist(), strict=True)), plant.units, sigma),
+            _capped(equal, dict(zip(plant.u, forces.tolist(), strict=True)), units, shaken),
         )
 
     @property
@@ -281,7 +286,10 @@ class _Sizes:
 
 
 def _capped(
-    equal: Mapping[str, float], forces: Mapping[str, float], units: Mapping[str, str], sigma: float
+    equal: Mapping[str, float],
+    forces: Mapping[str, float],
+    units: Mapping[str, str],
+    shaken: Mapping[str, float],
 ) -> dict[str, float]:
     """Return the sizes of disturbances that move the axes as actuators do, bounded by their kind.
 
@@ -291,8 +299,8 @@ def _capped(
     found = {}
     for name, size in equal.items():
         unit = units.get(name)
-        if unit in ("m/s^2", "rad/s^2"):
-            found[name] = sigma**2
+        if unit in shaken:
+            found[name] = shaken[unit]
             continue
         alike = [force for own, force in forces.items() if units.get(own) == unit]
         others = [other for own, other in equal.items() if units.get(own) == unit]
