@@ -130,7 +130,8 @@ def test_of_several_references_none_is_taken_silently(design):
         found = loop.frequency_response(freq[[point]])[f"{axis}:error", f"{axis}:ref"]
         assert size[point] == pytest.approx(20 * np.log10(abs(found[0])), abs=1e-6)
         row = fx.compare_loops({"servo": loop}, reference=f"{axis}:ref")["servo"]
-        assert row.peak == pytest.approx(10 ** (max(size) / 20), rel=1e-6)
+        # the table judges the loop on the evaluation model, the picture shows the design model
+        assert row.peak == pytest.approx(10 ** (max(size) / 20), rel=1e-3)
 
 
 @pytest.mark.slow
