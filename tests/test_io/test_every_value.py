@@ -263,11 +263,6 @@ def of_reductions(fe, modes, rom):
         fx.reduction.Greedy(),
     )
     yield fx.reduction.rank_modes(modes, inputs=at)
-    cycle = fx.synthesis.LimitCycle("y1", freq=33.0, amplitude=2e-9)
-    gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=["y1"], outputs=["u1"])
-    margins = {"modulus margin": 0.5, "modulus margin before": 0.52}
-    sizes = {"y1": 1e-3, "u1": 2e-3}
-    yield fx.synthesis.FixedPointController(gain, 9, 16, 0, sizes, margins, [cycle], {"8": "lost"})
     yield fx.reduce(modes, truncation).quality(fe, band=(100.0, 400.0), freq=np.array([250.0]))
 
 

@@ -11,8 +11,8 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
 - `mu`, `robust_stability`, `worst_case_gain`, `design_mu`: guarantees for uncertain plants.
 
 To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
-`second_order_sections`, `write_c` (a whole loop in one C file; 60 states in 0.04 us a sample),
-`fixed_point` (words of stated length, the fewest that hold, limit cycles); `fx.io.write_fmu`.
+`second_order_sections`, `write_c` (a whole loop in one C file; 60 states in 0.04 us a sample);
+`fx.io.write_fmu`.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -38,9 +38,6 @@ Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `desi
 
 from ..rooms import public_names as _public_names
 from .aftercare.c_code import write_c as write_c
-from .aftercare.fixed_point import FixedPointController as FixedPointController
-from .aftercare.fixed_point import LimitCycle as LimitCycle
-from .aftercare.fixed_point import fixed_point as fixed_point
 from .aftercare.forms import anti_windup_form as anti_windup_form
 from .aftercare.forms import second_order_sections as second_order_sections
 from .aftercare.order import discretise_controller as discretise_controller

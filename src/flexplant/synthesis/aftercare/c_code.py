@@ -279,11 +279,6 @@ def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _La
     return _Law(K, len(K.outputs), back_gain(K, recovery))
 
 
-def controller_law(loop: ClosedLoop) -> StateSpace:
-    """Return all blocks of a loop as one system from y, what they command applied."""
-    return _law(loop, None, False, True).system
-
-
 def _check_rate(dt: float, states: int) -> None:
     if not dt and states:
         raise ModelError(
