@@ -157,18 +157,6 @@ def abaqus():
     return [named.encode(), plain.encode()]
 
 
-def sierra():
-    i, j = np.nonzero(np.tril(K))
-    rows = "".join(f"{a + 1} {b + 1} {K[a, b]:.12e}\n" for a, b in zip(i, j, strict=True))
-    return [f"function A = Kssr\nA = [\n{rows}];\n".encode()]
-
-
-def sierra_map():
-    entries = "".join(f"x({9 * (k // 3) + k % 3 + 1}) = {k + 1};\n" for k in range(5))
-    listed = "1 2 3 0 0 0 0 0 4 5 0 0 0 0 0 0".replace(" ", "\n")
-    return [f"function x = a()\nx = zeros(18, 1);\n{entries}".encode(), f"m = [{listed}];".encode()]
-
-
 def exodus(make=None):
     def write(path):
         with sio.netcdf_file(path, "w") as file:
@@ -316,12 +304,6 @@ def example_full():
     return examples.fullfile
 
 
-def with_map(path):
-    text = sierra()[0]
-    (path.parent / "Kssr.m").write_bytes(text)
-    return io.read_sierra(path.parent / "Kssr.m", dof_map=path)
-
-
 def exodus_modes(path):
     return io.read_exodus_modes(path, rigid_below=1e-9)
 
@@ -360,8 +342,6 @@ READERS = {
     "dmig": ("K.pch", dmig, io.read_dmig),
     "bulk": ("K.bdf", bulk, read_nodes),
     "abaqus": ("K.mtx", abaqus, io.read_abaqus),
-    "sierra": ("K.m", sierra, io.read_sierra),
-    "sierra_map": ("map.m", sierra_map, with_map),
     "exodus": ("m.exo", exodus, exodus_modes),
     "exodus_hdf5": ("m.exo", partial(exodus, True), exodus_modes),
     "op2": ("m.op2", result_file, modes_of),

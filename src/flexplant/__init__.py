@@ -151,6 +151,8 @@ lower bound too, by a perturbation that reaches it.
 | ``placement.ByRows``, ``Found`` | `placement.RowSelection`, `placement.SearchResult` |
 | ``plant.Along`` | `plant.PortPath` |
 | ``plant.Seen``, ``plant.Moves`` | `plant.MeasuredRow`, `plant.PlaceMotion` |
+| ``synthesis.fixed_point`` | gone: `synthesis.write_c` computes in float or double |
+| ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy

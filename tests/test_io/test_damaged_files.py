@@ -150,7 +150,6 @@ def test_a_number_without_its_last_digits(tmp_path):
     head = "%%MatrixMarket matrix coordinate real symmetric\n5 5 5\n"
     texts = {
         "K.mtx": (io.read_matrix_market, head + "\n".join(rows)),
-        "K.m": (io.read_sierra, "\n".join(rows)),
         "job_STIF2.mtx": (io.read_abaqus, "\n".join(rows)),
     }
     for name, (read, text) in texts.items():

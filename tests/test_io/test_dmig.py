@@ -314,10 +314,12 @@ def test_the_common_door_hands_on_what_this_reader_takes(tmp_path):
     text = LARGE.replace("7               6", "7               0")
     path = written(tmp_path, text)
     assert fx.io.read_matrices(path, scalar_direction="z").dofs.labels == ("1:x", "1:y", "7:z")
-    with pytest.raises(FlexplantError, match=r"read_dmig, which has no option 'dof_map'.*scalar_d"):
-        fx.io.read_matrices(path, dof_map="map.m")
-    with pytest.raises(FlexplantError, match="read_sierra, which has no option 'scalar_direction'"):
-        fx.read_model(written(tmp_path, "1 1 2.0\n", "K.m"), scalar_direction="z")
+    with pytest.raises(
+        FlexplantError, match=r"read_dmig, which has no option 'rotations'.*scalar_d"
+    ):
+        fx.io.read_matrices(path, rotations={1: None})
+    with pytest.raises(FlexplantError, match="read_abaqus, which has no option 'scalar_direction'"):
+        fx.read_model(written(tmp_path, "1,1,1,1,2.0\n", "K.mtx"), scalar_direction="z")
     with pytest.raises(FlexplantError, match="is a folder"):
         fx.read_model(tmp_path)
 

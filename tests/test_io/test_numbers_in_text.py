@@ -50,10 +50,6 @@ def abaqus_coordinate(word):
     return f"1 1 {word}\n2 2 3.0\n"
 
 
-def sierra(word):
-    return f"K = [\n1 1 {word}\n2 2 3.0\n];\n"
-
-
 FORMATS = {
     matrix_market: (fx.io.read_matrix_market, ".mtx", 5),
     matrix_market_array: (fx.io.read_matrix_market, ".mtx", 6),
@@ -63,7 +59,6 @@ FORMATS = {
     dmig_large: (fx.io.read_dmig, ".pch", 3),
     abaqus: (fx.io.read_abaqus, ".mtx", 2),
     abaqus_coordinate: (fx.io.read_abaqus, ".mtx", 1),
-    sierra: (fx.io.read_sierra, ".m", 2),
 }
 
 

@@ -27,7 +27,6 @@ be read are refused with what to write instead.
 | Nastran OUTPUT4 | `read_op4` | .op4: text, binary, dense, sparse, both byte orders |
 | Nastran punch | `read_dmig` | .pch: DMIG in all fields; GRID, CORD2x of the bulk data |
 | Abaqus | `read_abaqus` | .mtx: MATRIX OUTPUT as text; NODE of the input file |
-| Sierra | `read_sierra` | .m: K, M as text; nodes of an Exodus file |
 | modes | `read_modes` | .op2, .pch, .rst, .exo, .uff: of a solved model |
 | Exodus | `read_exodus_modes` | .exo, .e: modes (classic netCDF; HDF5 with an extra) |
 | universal file | `read_modes_uff`, ... | .uff, .unv: 55, 58, 2414, nodes; with `flexplant[uff]` |
@@ -84,6 +83,7 @@ says, and damping must be stated.
 from ..rooms import public_names as _public_names
 from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys
+from .exodus import read_exodus_modes as read_exodus_modes
 from .fe_modes import read_modes as read_modes
 from .fmu import write_fmu as write_fmu
 from .frf_files import read_frf_csv as read_frf_csv
@@ -103,8 +103,6 @@ from .op4 import read_op4 as read_op4
 from .op4 import read_op4_matrices as read_op4_matrices
 from .punch import read_dmig as read_dmig
 from .records import read_records as read_records
-from .sierra import read_exodus_modes as read_exodus_modes
-from .sierra import read_sierra as read_sierra
 from .tables import read_dofs as read_dofs
 from .uff import read_frf_uff as read_frf_uff
 from .uff import read_modes_uff as read_modes_uff

@@ -44,20 +44,18 @@ def read_matrices(
     dofs: DofSet | str | Path | None = None,
     nodes: str | Path | None = None,
     scalar_direction: str | None = None,
-    dof_map: str | Path | None = None,
-    exodus: str | Path | None = None,
     rotations: Mapping[int, Any] | None = None,
 ) -> FEMatrices:
     """Return the matrices of a file, whichever program wrote it, for `check`.
 
     By suffix and content: Matrix Market or Abaqus .mtx; Harwell-Boeing .rsa, .rua; MATLAB .mat;
-    NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch; Sierra .m.
+    NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch.
 
     Parameters
     ----------
     path : str or Path
         The file; where each matrix has its own, that of K.
-    stiffness, mass, damping, dofs, nodes, scalar_direction, dof_map, exodus, rotations : optional
+    stiffness, mass, damping, dofs, nodes, scalar_direction, rotations : optional
         As for `read_model`.
 
     Raises
@@ -86,8 +84,6 @@ def read_matrices(
         "dofs": named if "dofs" in form.options else None,
         "nodes": nodes if known_nodes else None,
         "scalar_direction": scalar_direction,
-        "dof_map": dof_map,
-        "exodus": exodus,
         "rotations": rotations,
     }
     options: dict[str, Any] = {
@@ -128,8 +124,6 @@ def read_model(
     free: bool = False,
     name: str | None = None,
     scalar_direction: str | None = None,
-    dof_map: str | Path | None = None,
-    exodus: str | Path | None = None,
     rotations: Mapping[int, Any] | None = None,
 ) -> FEModel:
     """Return the model of a file, whichever program wrote it.
@@ -160,9 +154,9 @@ def read_model(
         Free the rigid-body motions that only lost digits of a text hold.
     name : str, optional
         For display; the name of the file when not given.
-    scalar_direction, dof_map, exodus, rotations : optional
-        Of one format each: what scalar points move in (`read_dmig`), the map and the mesh of
-        `read_sierra`, local systems (`read_ansys`).
+    scalar_direction, rotations : optional
+        Options of one format: the direction in which scalar points move (`read_dmig`), and local
+        coordinate systems (`read_ansys`).
 
     Raises
     ------
@@ -203,8 +197,6 @@ def read_model(
         dofs=dofs,
         nodes=nodes,
         scalar_direction=scalar_direction,
-        dof_map=dof_map,
-        exodus=exodus,
         rotations=rotations,
     )
     if sizes != ("m", "kg", "s"):
