@@ -129,39 +129,6 @@ def error_in_extended_precision(plant, observer):
     return (np.sum((E @ X) * E, axis=1) + np.sum((D * root) ** 2, axis=1)).astype(float)
 
 
-def error_peak(plant, observer, count=3000):
-    """Largest gain of z - hat at any frequency from noises of unit variance, by a dense sweep."""
-    poles = np.concatenate([np.linalg.eigvals(plant["A"]), np.linalg.eigvals(observer["A"])])
-    poles = poles[np.abs(poles) > 0.1]
-    near = np.abs(np.angle(poles))[:, None] + (1 - np.abs(poles))[:, None] * np.linspace(-3, 3, 61)
-    even = [np.geomspace(1e-4, 0.1, count // 4), np.linspace(0, np.pi, count)]
-    grid = np.unique(np.abs(np.concatenate([*even, near.ravel()])))
-    z = np.exp(1j * grid[(grid > 1e-5) & (grid <= np.pi)])[:, None, None]
-
-    def responses(A, B):
-        return np.linalg.solve(z * np.eye(A.shape[0]) - A, np.broadcast_to(B, (z.size, *B.shape)))
-
-    F = observer["C"] @ responses(observer["A"], observer["B"]) + observer["D"]
-    moved = responses(plant["A"], plant["factor"])
-    root = np.sqrt(np.diag(plant["R"]))
-    both = np.concatenate([(plant["C1"] - F @ plant["C2"]) @ moved, -F * root], axis=2)
-    return np.linalg.norm(both, 2, axis=(1, 2)).max()
-
-
-def scalar_filter_variance(a, nominal, K, L, q, r):
-    """Variance of x - hat of a filter with one state of pole `nominal` on x+ = a x + w, y = x + v.
-
-    By the two-state Stein equation, solved as a linear system for its three entries.
-    """
-    F = np.array([[a, 0.0], [K, nominal - K]])
-    if max(abs(np.linalg.eigvals(F))) >= 1:
-        return 1e9
-    M = np.diag([q, K * K * r])
-    X = np.linalg.solve(np.eye(4) - np.kron(F, F), M.reshape(-1)).reshape(2, 2)
-    E = np.array([1 - L, -(1 - L)])
-    return E @ X @ E + L * L * r
-
-
 def batch(plant, y, u, P0, Z, upto):
     """Best linear unbiased estimates of z[k] from the measurements before sample upto[k], dense.
 

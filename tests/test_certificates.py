@@ -171,18 +171,9 @@ WRONG = {
         "estimation.error._two_ways", larger(1.02, 1),
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
-    "minimax filter": (
-        "estimation.robust_filter._means", larger(1.001),
-        lambda: fx.estimation.design_minimax_filter(masses(), [masses()], iterations=3),
-        "those of the filter in closed form differ",
-    ),
     "filter of several rates": (
         "estimation.multirate._joseph_step", larger(1.001, 3),
         lambda: fx.estimation.design_multirate(masses(), {"y2": 2}), "one period",
-    ),
-    "H-infinity filter": (
-        "estimation.robust_filter._central_gains", larger(1.003, 1),
-        lambda: fx.estimation.design_hinf_filter(masses()), "more than the level",
     ),
     "unknown inputs": (
         "estimation.unknown_inputs._input_design", given(1.001, 2),

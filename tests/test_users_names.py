@@ -117,8 +117,6 @@ USES = {
     ),
     "estimated": lambda c: (c.observer.estimate(c.run), c.observer.report()),
     "consistent": lambda c: est.consistency(c.observer, c.observer.estimate(c.run)),
-    "hinf filter": lambda c: est.design_hinf_filter(c.plant),
-    "minimax filter": lambda c: est.design_minimax_filter(c.plant, [c.plant], iterations=3),
     "multirate": lambda c: est.design_multirate(c.plant, {c.y2: 2}),
     "inputs": lambda c: est.design_input_estimator(c.plant, [c.amp], est.Augmented(drift=1.0)),
     "noise levels": lambda c: est.estimate_noise(c.plant, c.run),

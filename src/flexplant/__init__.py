@@ -152,6 +152,7 @@ lower bound too, by a perturbation that reaches it.
 | ``plant.Along`` | `plant.PortPath` |
 | ``plant.Seen``, ``plant.Moves`` | `plant.MeasuredRow`, `plant.PlaceMotion` |
 | ``synthesis.fixed_point`` | gone: `synthesis.write_c` computes in float or double |
+| ``design_hinf_filter``, ``design_minimax_filter`` | `design_kalman`; `plant.uncertain` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

@@ -90,8 +90,6 @@
    Springer, 2004.
 .. [George1973] George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10,
    1973.
-.. [Geromel1999] Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal
-   Process. 47, 1999.
 .. [GillijnsDeMoor2007a] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
    linear discrete-time systems, Automatica 43, 2007, 111-116.
 .. [GillijnsDeMoor2007b] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
@@ -117,7 +115,6 @@
    34, 1992.
 .. [Hanus1987] Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless
    transfer method, Automatica 23, 1987.
-.. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
 .. [Hewer1971] Hewer, An iterative technique for the computation of the steady state gains for the
    discrete optimal regulator, IEEE Trans. Autom. Control 16, 1971, 382-384.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
@@ -155,8 +152,6 @@
 .. [Lawrence2000] Lawrence, Tits, Van Dooren, A fast algorithm for the computation of an upper bound
    on the mu-norm, Automatica 36, 2000.
 .. [LawsonHanson1995] Lawson, Hanson, Solving Least Squares Problems, SIAM, 1995.
-.. [LevineAthans1970] Levine, Athans, On the determination of the optimal constant output feedback
-   gains for linear multivariable systems, IEEE Trans. Autom. Control 15, 1970.
 .. [LewisOverton2013] Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Math.
    Program. 141, 2013.
 .. [Limebeer1993] Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom

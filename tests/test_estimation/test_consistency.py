@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.stats import binom
-from test_kalman import modes, ports
-from test_robust import one_state
+from test_kalman import modes, one_state, ports
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import consistency, design_kalman

@@ -56,6 +56,19 @@ def ports(asd=1e-3, sensor_asd=1e-12, **changes):
     return Ports(**(fields | changes))
 
 
+def one_state(a, q=1.0, r=2.0):
+    """x+ = a x + xi, y = x + v, z = x, with variances q and r per sample."""
+    dt = 1e-3
+    g = StateSpace(
+        [[a]], [[1.0, 0.0, 0.0]], [[1.0], [1.0]], [[0, 0, 0], [0, 1.0, 0]], dt,
+        inputs=["force", "y1:noise", "u1"], outputs=["die:z", "y1"],
+    )  # fmt: skip
+    asd = {"y1:noise": np.sqrt(2 * r * dt)}
+    return StandardPlant.from_statespace(
+        g, u=["u1"], y=["y1"], asd=asd, noise_factor=[[np.sqrt(q)]]
+    )
+
+
 @cache
 def modes(zeta=1e-3, count=24):
     plate = kirchhoff_plate(

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from test_kalman import plate_plant
-from test_robust import one_state
+from test_kalman import one_state, plate_plant
 
 from flexplant.errors import LabelError, ModelError, SolverError
 from flexplant.estimation import design_kalman, design_multirate

@@ -8,8 +8,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import chi2
 from test_consistency import machine, plant, recorded
-from test_kalman import INSET
-from test_robust import one_state
+from test_kalman import INSET, one_state
 
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
 from flexplant.estimation import consistency, design_kalman, estimate_noise

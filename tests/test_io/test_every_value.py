@@ -233,8 +233,6 @@ def of_estimators(plant, small):
     yield estimation.consistency(observer, observer.estimate(longer))
     pole = np.array([-1.0 + 100.0j])
     yield estimation.MovedModes((4,), pole, 1.01 * pole, np.eye(2))
-    yield estimation.design_hinf_filter(small, accuracy=0.5)
-    yield estimation.design_minimax_filter(small, [small], iterations=2)
     yield estimation.design_multirate(small, {"y1": 2})
     unknown = [name for name in small.w if not name.endswith(":noise")][:1]
     yield estimation.invertibility(small, unknown)

@@ -6,8 +6,7 @@
 - `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
   moving POI); ``step(y, u)`` runs sample by sample.
 - `consistency`, `estimate_noise`: whether a record contradicts the filter, and what would not.
-- `design_static`, `design_multirate`, `design_input_estimator`, `design_hinf_filter`,
-  `design_minimax_filter`: other estimators.
+- `design_static`, `design_multirate`, `design_input_estimator`: other estimators.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -58,11 +57,6 @@ from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate
 from .noise_from_records import NoiseLevels as NoiseLevels
 from .noise_from_records import estimate_noise as estimate_noise
-from .robust_filter import HinfFilterCertificate as HinfFilterCertificate
-from .robust_filter import MinimaxCertificate as MinimaxCertificate
-from .robust_filter import RobustFilter as RobustFilter
-from .robust_filter import design_hinf_filter as design_hinf_filter
-from .robust_filter import design_minimax_filter as design_minimax_filter
 from .unknown_inputs import Augmented as Augmented
 from .unknown_inputs import InputCertificate as InputCertificate
 from .unknown_inputs import InputEstimator as InputEstimator

@@ -494,7 +494,7 @@ def errors_on_machines(
 
     Parameters
     ----------
-    estimators : KalmanEstimator, StaticEstimator or RobustFilter, or mapping {name: estimator}
+    estimators : KalmanEstimator or StaticEstimator, or mapping {name: estimator}
         All of the same POIs.
     machines : sequence of StandardPlant
         Sampled alike: `plant.uncertain(fit).sample(rng, 20)`.

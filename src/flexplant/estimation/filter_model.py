@@ -233,12 +233,6 @@ def noise_root(model: FilterModel) -> tuple[FloatArray, FloatArray]:
     return root[:n], root[n:]
 
 
-def error_system(model: FilterModel, K: FloatArray, L_z: FloatArray) -> StateSpace:
-    """Return the error of a filter on its own model, driven by noise of unit variance."""
-    m, (G, H) = model, noise_root(model)
-    return StateSpace(m.A - K @ m.C2, G - K @ H, m.C1 - L_z @ m.C2, -L_z @ H, m.dt)
-
-
 def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
     """Return the variances (nz,) of the error of a filter on its own model."""
     m, left = model, model.C1 - L_z @ model.C2

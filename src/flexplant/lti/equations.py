@@ -135,26 +135,6 @@ def stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     return X + doubled(A, A @ X @ A.T + Q - X)
 
 
-def powers(A: FloatArray) -> list[FloatArray]:
-    """Return A, A^2, A^4, ... until they vanish: for Stein equations of one A (`stein_sum`)."""
-    found = [A]
-    while not (size := np.linalg.norm(found[-1])) < _LAST:
-        if len(found) > DOUBLINGS or not np.isfinite(size):
-            raise SolverError("A is not strictly stable: the powers of A do not vanish.")
-        found.append(found[-1] @ found[-1])
-    return found
-
-
-def stein_sum(
-    left: list[FloatArray], right: list[FloatArray], first: FloatArray, *, turned: bool = False
-) -> FloatArray:
-    """Return the sum of ``A^j first B'^j`` (``A'^j first B^j`` when turned) by doubling."""
-    X = first
-    for P, Q in zip(left, right, strict=False):
-        X = X + (P.T @ X @ Q if turned else P @ X @ Q.T)
-    return X
-
-
 def sylvester(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Return X of ``A X - X B + C = 0``, by Schur forms and one correction."""
     if not C.size:
