@@ -75,7 +75,6 @@ def main() -> dict[str, Any]:
     centre = fx.close_loop(plant, *design(plant))
     schedule = fx.loop.schedule_loops(plant, design, places=np.linspace(*X.range, 11))
     print(schedule)
-    print(fx.simulation.certify_speed(schedule, 0.8))
 
     # %% What the position does: of the model, then of the machine
     truth = machine.loop(PORTS, *centre.blocks).plant

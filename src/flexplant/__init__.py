@@ -153,6 +153,7 @@ lower bound too, by a perturbation that reaches it.
 | ``plant.Seen``, ``plant.Moves`` | `plant.MeasuredRow`, `plant.PlaceMotion` |
 | ``synthesis.fixed_point`` | gone: `synthesis.write_c` computes in float or double |
 | ``design_hinf_filter``, ``design_minimax_filter`` | `design_kalman`; `plant.uncertain` |
+| ``simulation.certify_speed`` | gone: `simulation.rms_along(..., repeats=True)`, one path |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

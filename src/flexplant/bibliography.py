@@ -85,7 +85,6 @@
    Sound and Vibration 211, 1998.
 .. [GahinetApkarian1994] Gahinet, Apkarian, A linear matrix inequality approach to H-infinity
    control, Int. J. Robust Nonlinear Control 4, 1994.
-.. [Garloff1993] Garloff, The Bernstein algorithm, Interval Computations 2, 1993, 154-168.
 .. [Gawronski2004] Gawronski, Advanced Structural Dynamics and Active Control of Structures,
    Springer, 2004.
 .. [George1973] George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10,
@@ -235,8 +234,6 @@
    information in stationary time series, Arkiv foer Matematik 2, 1953.
 .. [WolkowiczStyan1980] Wolkowicz, Styan, Bounds for eigenvalues using traces, Linear Algebra Appl.
    29, 1980.
-.. [Wu1996] Wu, Yang, Packard, Becker, Induced L2-norm control for LPV systems with bounded
-   parameter variation rates, Int. J. Robust Nonlinear Control 6, 1996, 983-998.
 .. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.
 .. [YoungBudynas2002] Young, Budynas, Roark's Formulas for Stress and Strain, 7th ed., McGraw-Hill,
    2002.

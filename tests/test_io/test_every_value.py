@@ -213,7 +213,6 @@ def of_positions(modes):
     loops = [fx.close_loop(plant.at(x=v), fx.design_static(plant.at(x=v)), servo) for v in (0, 0.1)]
     yield fx.loop.ScheduledLoop("x", [0.0, 0.1], loops)
     yield fx.simulation.PathRms([0.0], [[1e-9]], ["die:error"], {"die:error": "m"})
-    yield fx.simulation.SpeedCertificate("x", 0.8, [0.0, 0.1], np.ones((2, 1, 1)), [(0.8, None)])
     one = np.ones((1, 1))
     yield fx.simulation.PathFilters([0.0], ["die:z"], one, one, one, {"die:z": "m"})
 

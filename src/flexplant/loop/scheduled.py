@@ -161,9 +161,8 @@ def schedule_loops(
 
     Notes
     -----
-    Stability is checked at the places and half way between them, of the machine at rest there. For
-    all positions between, and up to which speed, is what `simulation.certify_speed` proves;
-    `rms_along(..., repeats=True)` has the growth along one trajectory.
+    Stability is checked at the places and half way between them, of the machine at rest there.
+    `rms_along(..., repeats=True)` computes the growth along one trajectory.
 
     Examples
     --------

@@ -7,7 +7,7 @@
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: what is required of margins and errors; a verdict says what is reached.
-- `certify_speed(loop)`: how fast a machine may move, proven; `rms_along`: its errors on a path.
+- `rms_along(loop, moving=)`: the errors of a moving machine along its path.
 - `study(machines, pipeline, executor=)`: one pipeline for many machines, resumed where stopped.
 
 >>> import flexplant as fx
@@ -103,8 +103,6 @@ from .simulate import simulate as simulate
 from .simulate import spectral_noise as spectral_noise
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
-from .speed_certificate import SpeedCertificate as SpeedCertificate
-from .speed_certificate import certify_speed as certify_speed
 from .study import EstimatorComparison as EstimatorComparison
 from .study import StudyTable as StudyTable
 from .study import compare_estimators as compare_estimators
