@@ -59,7 +59,10 @@ _THEIRS = {
     "StateSpace.dcgain": "dcgain", "frequency_response": "freqresp",
     "plot.bode": "bode bode_plot bodeplot", "plot.singular_values": "sigma",
     "plot.nyquist": "nyquist nyquist_plot", "plot.pole_map": "pzmap",
-    "plot.step": "step step_response", "loop.report_loops": "margin allmargin stability_margins",
+    "lti.step (plot.step draws it)": "step step_response",
+    "lti.impulse": "impulse impulse_response",
+    "lti.lsim (simulate for a loop with noise)": "lsim forced_response",
+    "lti.step_info": "stepinfo", "loop.report_loops": "margin allmargin stability_margins",
     "loop.sensitivity": "loopsens", "lti.discretized": "c2d sample_system",
     "h2_norm (or hinf_norm)": "norm", "peak_gain": "getPeakGain", "minimal": "minreal",
     "balanced": "balred balreal", "modal_form": "canon", "lti.solve_lyapunov": "lyap",
@@ -70,7 +73,7 @@ _THEIRS = {
     "synthesis.design_structured": "hinfstruct", "tune_loops": "systune", "design_servo": "pidtune",
     "synthesis.mu": "mussv", "synthesis.robust_stability": "robstab",
     "synthesis.worst_case_gain": "wcgain", "synthesis.design_mu": "musyn",
-    "simulate": "lsim forced_response", "estimate_frf": "tfestimate modalfrf",
+    "estimate_frf": "tfestimate modalfrf",
     "identify_modes": "modalfit",
 }  # fmt: skip
 OURS = {foreign: ours for ours, names in _THEIRS.items() for foreign in names.split()}

@@ -7,6 +7,8 @@ weight is made of is one.
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
 - `frequency_response`: an `Frf`, of systems, of structures between their ports, measured or not.
 - `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
+- `step`, `impulse`, `lsim`, `step_info`: what a system answers over time, in numbers;
+  `fx.plot.step` draws it.
 - `h2_norm`, `hinf_norm`, `peak_gain`: norms, the last two with the frequency, found with proof.
 - `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,
   `modal_form`: fewer or clearer states.
@@ -36,7 +38,8 @@ goes back. Their names (``fx.c2d``) raise an error that says ours.
 | ``series``, ``feedback``, ``lft`` | the same in `fx.lti`; `g2 * g1`, `g1 + g2`, `1 / (1 + L)` |
 | ``freqresp`` | `fx.frequency_response` |
 | ``bode``, ``sigma`` | `fx.plot.bode`, `fx.plot.singular_values` |
-| ``nyquist``, ``pzmap``, ``step`` | `fx.plot.nyquist`, `fx.plot.pole_map`, `fx.plot.step` |
+| ``nyquist``, ``pzmap`` | `fx.plot.nyquist`, `fx.plot.pole_map` |
+| ``step``, ``impulse``, ``lsim``, ``stepinfo`` | `fx.lti.step`, `impulse`, `lsim`, `step_info` |
 | ``c2d`` | `fx.lti.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
 | ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm` |
 | ``getPeakGain`` | `fx.peak_gain` |
@@ -93,5 +96,11 @@ from .riccati import filter_dare as filter_dare
 from .sampling import discretized as discretized
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
+from .time_responses import StepInfo as StepInfo
+from .time_responses import TimeResponse as TimeResponse
+from .time_responses import impulse as impulse
+from .time_responses import lsim as lsim
+from .time_responses import step as step
+from .time_responses import step_info as step_info
 
 __dir__ = _public_names(__name__)

@@ -13,12 +13,10 @@ from ..checks import FloatArray, instance, name_list, positive, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.blocks import references
-from ..lti.discretisation import Recursion
-from ..lti.responses import continuous_poles
-from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace, as_statespace
+from ..lti.time_responses import decay_time
+from ..lti.time_responses import step as step_response
 from ..simulation import Response
-from ..tolerances import SPLIT
 from ._axes import (
     BLUE,
     GREY,
@@ -180,12 +178,6 @@ def _draw_panel(
     finish(ax, x=named("time", time), y=named(quantity, shown), given=given)
 
 
-#: a pole is shown until it has decayed to 1 %, or for so many periods
-_DECAY, _PERIODS = 4.6, 20.0
-#: samples of a picture at least and at most, and in a period of the fastest pole
-_FEWEST, _MANY, _FINE = 500, 20_000, 12.0
-
-
 def step(
     systems: Any,
     *,
@@ -236,14 +228,22 @@ def step(
         for name, known in [(r, g.outputs) for r in rows] + [(c, g.inputs) for c in columns]:
             require_known("channel", [name], known, f"the system {label}".strip())
     end = (
-        max(map(_duration, found.values())) if duration is None else positive(duration, "duration")
+        max(map(decay_time, found.values())) if duration is None else positive(duration, "duration")
     )
     panels = channel_axes(ax, len(rows), len(columns), (1,), max(3.6, 2.4 * len(rows)))
     for (label, g), look in zip(found.items(), styles(found), strict=True):
-        time, data = _step_responses(g.select(rows, columns), end)
+        answer = step_response(g.select(rows, columns), duration=end)
         for i, output in enumerate(rows):
             for j, name in enumerate(columns):
-                _draw_step(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
+                _draw_step(
+                    panels[i, j],
+                    answer.time,
+                    answer.data[i, j],
+                    g,
+                    (output, name),
+                    label or None,
+                    look,
+                )
     for panel in panels[:-1].ravel():
         panel.set_xlabel("")
     for panel, name in zip(panels[0], columns, strict=True):
@@ -277,32 +277,3 @@ def _draw_step(
     form: dict[str, Any] = {"drawstyle": "steps-post"} if g.dt else {}
     ax.plot(time / second, signal / factor, label=text, **look, **form)
     finish(ax, x=named("time", clock), y=named(channel[0], unit))
-
-
-def _duration(g: StateSpace) -> float:
-    """Return the time [s] in which the slowest pole decays or has turned often."""
-    poles = continuous_poles(g)
-    size = np.abs(poles)
-    moving = poles[size > SPLIT * size.max(initial=0.0)]
-    if not moving.size:
-        return 100.0 * g.dt if g.dt else 1.0
-    # undamped modes are drawn for their periods alone
-    decay = _DECAY / np.maximum(np.abs(moving.real), 1e-12 * np.abs(moving))
-    return float(np.max(np.minimum(decay, 2.0 * np.pi * _PERIODS / np.abs(moving))))
-
-
-def _step_responses(g: StateSpace, end: float) -> tuple[FloatArray, FloatArray]:
-    """Return times and the responses (p, m, n) to a step at each input."""
-    h = g.dt
-    if not h:
-        fastest = float(np.max(np.abs(g.poles()), initial=0.0))
-        fine = 2.0 * np.pi / (_FINE * fastest) if fastest else end
-        h = float(np.clip(fine, end / _MANY, end / _FEWEST))
-        g = held_exactly(g, 1.0 / h)
-    count = int(np.ceil(end / h)) + 1
-    run = Recursion(g.A, g.B, g.C, g.D)
-    start = np.zeros(g.n_states)
-    data = np.empty((len(g.outputs), len(g.inputs), count))
-    for j in range(len(g.inputs)):
-        data[:, j] = run.run(np.eye(len(g.inputs))[[j] * count], start)[0].T
-    return np.asarray(h * np.arange(count), dtype=np.float64), data
