@@ -25,7 +25,7 @@ def is_public(name, item):
 #: anything else stays in its room (`flexplant.lti.tustin`)
 FRONT = """
 FlexplantError FlexplantWarning load
-read_model read_matrices check DofSet FEModel kirchhoff_plate beam chain solid_block
+read_model read_matrices check DofSet FEModel plate kirchhoff_plate beam chain solid_block
 interpolated PointMass Spring Damper ModalDamping
 solve_modes Modes reduce ReducedModel DesiredDofs ModalBalanced
 select_dofs

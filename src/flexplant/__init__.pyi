@@ -94,6 +94,7 @@ from .structure import chain as chain
 from .structure import check as check
 from .structure import interpolated as interpolated
 from .structure import kirchhoff_plate as kirchhoff_plate
+from .structure import plate as plate
 from .structure import solid_block as solid_block
 from .synthesis import Controller as Controller
 from .synthesis import Lead as Lead

@@ -79,6 +79,8 @@
 .. [Fletcher1987] Fletcher, Practical Methods of Optimization, 2nd ed., Wiley, 1987.
 .. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,
    Addison-Wesley, 1998.
+.. [FriedmanKosmatka1993] Friedman, Kosmatka, An improved two-node Timoshenko beam finite element,
+   Computers & Structures 47, 1993, 473-481.
 .. [FriswellGarveyPenny1995] Friswell, Garvey, Penny, Model reduction using dynamic and iterated IRS
    techniques, J. Sound and Vibration 186, 1995.
 .. [FriswellGarveyPenny1998] Friswell, Garvey, Penny, The convergence of the iterated IRS method, J.
@@ -131,6 +133,8 @@
 .. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large
    space structures, J. Guid. Control Dyn. 14, 1991.
 .. [KassRaftery1995] Kass, Raftery, Bayes factors, J. American Statistical Association 90, 1995.
+.. [Katili1993] Katili, A new discrete Kirchhoff-Mindlin element based on Mindlin-Reissner plate
+   theory and assumed shear strain fields, Int. J. Numer. Methods Eng. 36, 1993, 1885-1908.
 .. [Kaufman1975] Kaufman, A variable projection method for solving separable nonlinear least squares
    problems, BIT 15, 1975.
 .. [KennedyOHagan2001] Kennedy, O'Hagan, Bayesian calibration of computer models, J. Royal
@@ -165,6 +169,8 @@
    reconstruction, IEEE Control Systems 38, 2018.
 .. [McFarlaneGlover1992] McFarlane, Glover, A loop-shaping design procedure using H-infinity
    synthesis, IEEE Trans. Autom. Control 37, 1992.
+.. [Mindlin1951] Mindlin, Influence of rotatory inertia and shear on flexural motions of isotropic,
+   elastic plates, J. Appl. Mech. 18, 1951, 31-38.
 .. [Modelica2022] Modelica Association, Functional Mock-up Interface for Model Exchange,
    Co-Simulation, and Scheduled Execution, version 3.0, 2022.
 .. [MorganScott1986] Morgan, Scott, Generalizations of Davidson's method for computing eigenvalues

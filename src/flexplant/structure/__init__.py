@@ -3,14 +3,15 @@ r"""What the machine is: finite-element matrices with labelled degrees of freedo
 An `FEModel` holds M, D and K with the DOFs they belong to; ``"41:z"`` is the motion of node 41 in
 z. It is read from files (`fx.read_model`), or meshed here:
 
-- `kirchhoff_plate` with ribs and holes, `beam`, `chain`, `solid_block`: meshes.
+- `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `chain`,
+  `solid_block`: meshes.
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
 - `ModalDamping` (of measured poles too), `Rayleigh`, `Hysteretic` (loss factors, by region too).
 - `check`: symmetry, definiteness, rigid-body motions, mechanisms, mass: what is wrong with a model.
 - `interpolated`: shapes between the nodes of foreign matrices, so that a POI may be anywhere.
 
 >>> import flexplant as fx
->>> plate = fx.kirchhoff_plate(
+>>> plate = fx.plate(
 ...     size=(0.6, 0.4), thickness=0.02, elements=(6, 4),
 ...     density=2700, youngs_modulus=70e9, poisson_ratio=0.33,
 ... )
@@ -53,5 +54,7 @@ from .simple_models import kirchhoff_plate as kirchhoff_plate
 from .simple_models import solid_block as solid_block
 from .slides import slides as slides
 from .slides import sliding as sliding
+from .thick_plate import ThickPlateShape as ThickPlateShape
+from .thick_plate import plate as plate
 
 __dir__ = _public_names(__name__)

@@ -59,17 +59,6 @@ def beam_rotary(length: float) -> FloatArray:
     return _mirror_upper(half / (30 * h))
 
 
-def hermite(s: float, length: float, order: int = 0) -> FloatArray:
-    """Return the weights (4,) of z, dz/dx at both ends in z (or its slope) at s from 0 to 1."""
-    if order == 0:
-        cubic = 3 * s**2 - 2 * s**3
-        return np.array(
-            [1 - cubic, length * s * (1 - s) ** 2, cubic, length * (s**3 - s**2)], dtype=np.float64
-        )
-    bow = 6 * (s - s**2)
-    return np.array([-bow / length, 1 - 4 * s + 3 * s**2, bow / length, 3 * s**2 - 2 * s])
-
-
 def plate_terms(s: Any, t: Any, dp: int, dq: int) -> FloatArray:
     """Return the d^dp/ds^dp d^dq/dt^dq derivatives (..., 12) of the terms s^p t^q."""
     return _monomials(_P, s, dp) * _monomials(_Q, t, dq)

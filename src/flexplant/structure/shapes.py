@@ -14,14 +14,8 @@ from ..checks import FloatArray, real_array
 from ..errors import LabelError, require_known
 from ..labels import Interpolation
 from ..tolerances import SAME
-from .element_matrices import (
-    Grid,
-    brick_shape,
-    brick_slopes,
-    hermite,
-    plate_coefficients,
-    plate_terms,
-)
+from .element_matrices import Grid, brick_shape, brick_slopes, plate_coefficients, plate_terms
+from .thick_elements import beam_parts, edge_share
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,12 +109,23 @@ class PlateShape(GridShape):
         slack = SAME * max(self.size)
         if not _is_inside(point[:2], self.size, slack):
             raise self._off(point, float(np.max(self.thickness)))
-        element, (s, t), (a, b) = self._located(point, self.size, lambda: self._in_hole(point))
+        element, (s, t), _ = self._located(point, self.size, lambda: self._in_hole(point))
         thick: Any = self.thickness
         depth = thick if np.ndim(thick) == 0 else float(thick[element[::-1]])
         if abs(point[2]) > 0.5 * depth + slack:
             raise self._off(point, depth)
-        return self._row(element, _plate_weights(direction, s, t, a, b))
+        return self._row(element, self._weights(direction, element, s, t))
+
+    def _weights(self, direction: str, element: Any, s: Any, t: Any) -> FloatArray:
+        """Return the weights (..., 12) of the DOFs of elements (x, y) at s, t between 0 and 1."""
+        a, b = (n / k for n, k in zip(self.size, self.elements, strict=True))
+        if direction == "z":
+            terms = plate_terms(s, t, 0, 0)
+        elif direction == "rx":
+            terms = plate_terms(s, t, 0, 1) / b
+        else:
+            terms = -plate_terms(s, t, 1, 0) / a
+        return np.asarray(terms @ plate_coefficients(a, b))
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3); the same as `row` one by one."""
@@ -139,8 +144,8 @@ class PlateShape(GridShape):
             s, t = (place.T - element)[:, plain]
             nodes = grid.rank[(element.T[plain, None] + grid.corners) @ np.array([1, count[0] + 1])]
             columns = (3 * nodes[:, :, None] + np.arange(3)).reshape(-1, 12)
-            found[np.flatnonzero(plain)[:, None], columns] = _plate_weights(
-                direction, s, t, *(size / count)
+            found[np.flatnonzero(plain)[:, None], columns] = self._weights(
+                direction, element[:, plain], s, t
             )
         else:
             plain[:] = False
@@ -175,6 +180,8 @@ class BeamShape(GridShape):
         Of the beam.
     elements : int
         Their number.
+    softness : float or (elements,) array, optional [m^2]
+        Bending stiffness over shear stiffness. None: the beam does not shear.
 
     Examples
     --------
@@ -185,12 +192,13 @@ class BeamShape(GridShape):
 
     length: float
     elements: int
+    softness: float | FloatArray | None = None
 
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return (self.elements,), None, 2
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion z or ry = -dz/dx at a point.
+        """Return the weights (n,) of all DOFs in the motion z or ry of the section at a point.
 
         Raises
         ------
@@ -207,8 +215,13 @@ class BeamShape(GridShape):
                 "in metres."
             )
         element, (s,), (h,) = self._located(point, (self.length,), lambda: LabelError("no element"))
-        weights = hermite(s, h, 0 if direction == "z" else 1) * [1, -1, 1, -1]
-        return self._row(element, weights if direction == "z" else -weights)
+        given = np.asarray(0.0 if self.softness is None else self.softness)
+        soft = np.broadcast_to(given, (self.elements,))[element[0]]
+        z, slope = (
+            (one[0] + edge_share(soft, h) * one[1])[0] for one in beam_parts(np.array([s]), h)
+        )
+        weights = (z if direction == "z" else -slope) * [1, -1, 1, -1]
+        return self._row(element, weights)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -270,15 +283,6 @@ class BlockShape(GridShape):
 
 
 _BLOCK_MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
-
-
-def _plate_weights(direction: str, s: Any, t: Any, a: float, b: float) -> FloatArray:
-    """Return the weights (..., 12) of an element's DOFs at s, t between 0 and 1."""
-    if direction == "z":
-        terms = plate_terms(s, t, 0, 0)
-    else:
-        terms = plate_terms(s, t, 0, 1) / b if direction == "rx" else -plate_terms(s, t, 1, 0) / a
-    return np.asarray(terms @ plate_coefficients(a, b))
 
 
 def _is_inside(point: FloatArray, lengths: Sequence[float], slack: float) -> bool:

@@ -47,6 +47,7 @@ from .grid_fields import (
 from .model import FEModel
 from .shapes import BeamShape, BlockShape
 from .shapes import PlateShape as PlateShape
+from .thick_elements import beam_terms, edge_share
 
 
 def chain(
@@ -138,15 +139,20 @@ def beam(
     youngs_modulus: Field,
     area: Field,
     inertia: Field,
+    poisson_ratio: Field | None = None,
+    shear_factor: float = 5 / 6,
     ends: tuple[str, str] = ("free", "free"),
     name: str | None = None,
 ) -> FEModel:
-    """Return a straight beam in bending (Euler-Bernoulli), along x from the origin.
+    """Return a straight beam in bending along x from the origin, by Euler-Bernoulli or Timoshenko.
 
     ``rho A z'' + (E I z_xx)_xx = f``: two-node elements with cubic shape functions and consistent
     mass. Nodes are numbered from 1; each has the DOFs z [m] and ry = -dz/dx [rad], less those that
-    its end holds. Shear and the inertia of turning sections are left out: good for wave lengths
-    well above ten times the height.
+    its end holds. That is good for wave lengths well above ten times the height.
+
+    With `poisson_ratio` the beam shears and its sections have inertia: ``rho A z'' = (k G A (z_x -
+    t))_x``, ``rho I t'' = (E I t_x)_x + k G A (z_x - t)``, in elements that are exact in statics
+    [FriedmanKosmatka1993]_. There ry is the rotation -t of the section.
 
     Parameters
     ----------
@@ -158,6 +164,10 @@ def beam(
         Of the material.
     area, inertia : float, (elements,) array or function of x [m^2], [m^4]
         Of the cross section, and its second moment of area.
+    poisson_ratio : float, (elements,) array or function of x, optional [-]
+        Of the material, for the shear modulus G = E / 2 (1 + nu). None: Euler-Bernoulli.
+    shear_factor : float
+        k of the shear stiffness k G A; 5/6 of a rectangular section.
     ends : (str, str)
         How each end is held: "free", "pinned" (z), "clamped" (z and ry) or "guided" (ry).
     name : str, optional
@@ -190,12 +200,26 @@ def beam(
         )
     )
     grid, h = Grid(counts, 2, np.ones(counts, dtype=bool)), lengths[0] / counts[0]
+    turns = E * inertia_of  # bending stiffness
+    softness: Any = None
+    if poisson_ratio is None:
+        M, K = [(beam_mass(h), rho * A)], [(beam_stiffness(h), turns)]
+    else:
+        nu = poisson_of(poisson_ratio, lengths, counts, None)
+        sheared = positive(shear_factor, "shear_factor") * A
+        softness = 2.0 * (1.0 + nu) * inertia_of / sheared
+        f = edge_share(softness, h)
+        masses, rotary, sections = beam_terms(h)
+        M = [(one, rho * A * f**k) for k, one in enumerate(masses)]
+        M += [(one, rho * inertia_of * f**k) for k, one in enumerate(rotary)]
+        K = [(beam_stiffness(h), turns * f), (sections, turns * (1.0 - f))]
     sign = np.outer([1, -1, 1, -1], [1, -1, 1, -1])  # ry = -dz/dx
+    shape = BeamShape(lengths[0], counts[0], softness)
     free = FEModel._proven(
-        M=grid.matrix([(sign * beam_mass(h), rho * A)]),
-        K=grid.matrix([(sign * beam_stiffness(h), E * inertia_of)]),
+        M=grid.matrix([(sign * matrix, weight) for matrix, weight in M]),
+        K=grid.matrix([(sign * matrix, weight) for matrix, weight in K]),
         D=None,
-        dofs=dofs_of(grid, lengths, ("z", "ry"), BeamShape(lengths[0], counts[0])),
+        dofs=dofs_of(grid, lengths, ("z", "ry"), shape),
         name="beam" if name is None else name,
     )
     labels = [
@@ -227,7 +251,7 @@ def kirchhoff_plate(
     ribs: Iterable[Rib] | Rib = (),
     name: str | None = None,
 ) -> FEModel:
-    """Return a free rectangular plate in bending.
+    """Return a free rectangular thin plate in bending: no shear, no rotary inertia (`plate` has).
 
     Four-node non-conforming elements with the complete cubic and x^3 y, x y^3 (Adini, Clough and
     Melosh), stiffness and consistent mass integrated exactly. The plate lies in the x-y plane with
