@@ -535,7 +535,7 @@ def test_files_of_other_versions(tmp_path, monkeypatch):
         name: part for name, part in kept.items() if name != "origin"
     })  # fmt: skip
     plant.save(tmp_path / "old")
-    assert not load(tmp_path / "old").is_assembled
+    assert load(tmp_path / "old").model is None
     monkeypatch.setattr(type(plant), "_fields", lambda self: {
         name: part for name, part in kept.items() if name != "system"
     })  # fmt: skip

@@ -80,7 +80,7 @@ def test_refusals():
     with pytest.raises(LabelError, match="other channels in w"):
         _ = plant.replace(evaluation=other).evaluation_plant
     foreign = fx.StandardPlant.from_statespace(plant.system)
-    with pytest.raises(ModelError, match="this plant was not assembled from one"):
+    with pytest.raises(ModelError, match="this plant was not assembled from a structure"):
         _ = foreign.replace(evaluation=MODES).evaluation_plant
     with pytest.raises(ModelError, match="evaluation must be of type FEModel"):
         plant.replace(evaluation="whole")
@@ -160,7 +160,7 @@ def test_a_system_made_elsewhere_has_a_plant_as_its_evaluation_model():
         few.system, w=few.w, u=few.u, z=few.z, y=few.y, evaluation=every.system
     )
     same_response(plant.evaluation_plant.replace(origin=every.origin), every)
-    with pytest.raises(ModelError, match="this plant was not assembled from one"):
+    with pytest.raises(ModelError, match="this plant was not assembled from a structure"):
         _ = plant.replace(evaluation=MODES).evaluation_plant
 
 

@@ -289,7 +289,7 @@ class TestWhereItCameFrom:
         assert plant.continuous is plant
         assert fast.delay == fast.assembled.delay == 1.5
         assert plant.machine is plant
-        assert plant.is_assembled
+        assert plant.model is not None
         factor = fast.assembled.noise_factor
         np.testing.assert_array_equal(fast.process_noise, factor @ factor.T)
 
@@ -307,7 +307,7 @@ class TestWhereItCameFrom:
         plant = assemble_plant(some_modes(), ports())
         bare = StandardPlant.from_statespace(plant.system)
         for foreign in (bare, bare.discretized(1e4, delay=1), bare.weighted(z={"die:z": 2.0})):
-            assert not foreign.is_assembled
+            assert foreign.model is None
             assert not foreign.modal_blocks.size
             with pytest.raises(ModelError, match=r"not assembled.*Make it by assemble_plant"):
                 _ = foreign.assembled

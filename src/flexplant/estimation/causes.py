@@ -180,7 +180,7 @@ class SampledModes(NamedTuple):
 
 def sampled_modes(plant: AnyPlant) -> SampledModes:
     """Return the elastic modes of a plant."""
-    if plant.is_assembled:
+    if plant.modal_blocks.size:
         omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
         return SampledModes(plant.n_rigid + 1 + np.arange(omega.size), omega / (2 * np.pi))
     poles = np.linalg.eigvals(plant.system.A)
@@ -221,7 +221,7 @@ def peak_verdicts(
     plant, rate = observer.plant, 1.0 / observer.plant.dt
     kept = sampled_modes(plant)
     seen = folded(kept.freq, rate)
-    if not plant.is_assembled:  # its modes cannot be changed one by one
+    if not plant.modal_blocks.size:  # its modes cannot be changed one by one
         highest = max(peaks, key=lambda one: one.height)
         near = _modes_near(seen, highest.freq * rate, _NEAR)
         if near.size:
@@ -238,7 +238,7 @@ def peak_verdicts(
             continue  # explained already
         if np.any(np.abs(before.tried - peak.freq) <= _AGAIN * peak.freq):
             near = near[:0]
-        for i in near.tolist() if plant.is_assembled else ():
+        for i in near.tolist() if plant.modal_blocks.size else ():
             band = peak_band(lines, U, level, rate, at, float(seen[i]))
             mode, number = float(kept.freq[i]), int(kept.numbers[i])
             straight = abs(mode - rate * np.round(mode / rate) - seen[i]) <= SAME * rate

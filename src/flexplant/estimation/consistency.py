@@ -323,7 +323,7 @@ def _moved_modes(
 def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float, float]]:
     """Return the power of innovations around each mode beside the predicted one, and its p."""
     plant, lines = observer.plant, facts.lines.freq
-    if not plant.is_assembled:
+    if not plant.modal_blocks.size:
         return {}
     kept, found = sampled_modes(plant), {}
     rate, step = 1.0 / float(plant.dt), float(lines[0])
@@ -419,7 +419,7 @@ def _verdicts(
     if facts.white and facts.nis.p_value >= facts.alpha:
         return [LikelyCause("none", "the innovations are white and of the predicted size.")]
     numbers = None
-    if whole is not None and whole.is_assembled:
+    if whole is not None and whole.modal_blocks.size:
         missed = observer.left_out if observer.left_out is not None else left_out(
             observer.plant.machine, whole.machine
         )  # fmt: skip

@@ -254,13 +254,11 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
 def moving_parts(plant: AnyPlant) -> tuple[IntArray, IntArray]:
     """Return the states of modes on the unit circle, and all others that noise reaches."""
     g, factor = plant.system, plant.noise_factor
-    kept = np.zeros(0, dtype=np.int64)
-    if plant.is_assembled:
-        states = plant.modal_states.reshape(-1, 2)
-        blocks = g.A[states[:, :, None], states[:, None, :]]
-        undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= ON_CIRCLE
-        undamped[: plant.n_rigid] = True
-        kept = states[undamped].reshape(-1)
+    states = plant.modal_states.reshape(-1, 2)
+    blocks = g.A[states[:, :, None], states[:, None, :]]
+    undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= ON_CIRCLE
+    undamped[: plant.n_rigid] = True
+    kept = states[undamped].reshape(-1)
     reached = np.any(factor != 0, axis=1)
     pattern = g.A != 0
     while np.any(grown := ~reached & np.any(pattern[:, reached], axis=1)):

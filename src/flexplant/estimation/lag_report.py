@@ -268,7 +268,7 @@ class StaticEstimator(Value):
         plant = self.plant.evaluation_plant or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
-        held = plant.rigid_motions if plant.is_assembled else None
+        held = plant.rigid_motions if plant.modal_blocks.size else None
         found = error_variances(plant, self.system, None if held is None else held.modes)
         return float(np.sqrt(found.values[row]))
 

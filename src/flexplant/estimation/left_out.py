@@ -364,9 +364,9 @@ def unresolved_share(
 
     Their disturbances are taken away, and the error is computed once more.
     """
-    if not whole.is_assembled:
+    realisation = whole.realisation
+    if not realisation.n_modes:
         return None
-    realisation = whole.assembled.realisation
     if _KEPT not in realisation.__dict__:  # many plants are made of one
         realisation.__dict__[_KEPT] = _nodes_of(whole.model, realisation.outputs)
     nodes = realisation.__dict__[_KEPT]

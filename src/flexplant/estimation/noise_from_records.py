@@ -158,7 +158,7 @@ def _whole_plant(plant: AnyPlant) -> AnyPlant:
     found = plant.machine.evaluation_plant
     if found is None:
         return plant
-    if found.is_assembled and plant.is_assembled:
+    if found.model is not None:
         found = found.with_ports(plant.assembled.ports)
     return read_alike(plant, found)
 
@@ -179,7 +179,7 @@ def _noise_channels(plant: AnyPlant) -> tuple[str, ...]:
             f"{', '.join(silent)} has no density to start from: levels are found for sensors with "
             "noise of their own. Give Sensor(asd=) a guess, and a plant that reads sensors."
         )
-    if not plant.is_assembled:
+    if plant.machine.continuous.dt:  # the noise of a sample is given as a whole
         return PROCESS, *noises
     forces = [name for name in plant.w if plant.asd.get(name, 0.0) > 0 and name not in noises]
     return *forces, *noises
@@ -430,7 +430,7 @@ class NoiseLevels(Value):
     def plant(self) -> AnyPlant:
         """The plant with the estimated densities."""
         given = self.given
-        if not given.is_assembled:
+        if PROCESS in self.channels:
             factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]
             origin = given.machine.origin.replace(noise_factor=factor)
             return given.replace(asd={**given.asd, **self.asd}, origin=origin)

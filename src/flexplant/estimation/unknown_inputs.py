@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ..certificates import Certificate
 from ..checks import FloatArray, Value, checked, instance, positive, sizes_of
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
+from ..errors import AssumptionError, CertificateError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
@@ -329,7 +329,7 @@ def _without_noise(plant: AnyPlant, names: Sequence[str]) -> AnyPlant:
     loud = [name for name in names if plant.asd.get(name, 0.0) > 0]
     if not loud:
         return plant
-    if not plant.is_assembled:
+    if plant.machine.continuous.dt:  # the noise of a sample is known as a whole only
         raise ModelError(
             f"unknown inputs {', '.join(loud)} have a noise density, which is part of the given "
             "noise_factor. Give the plant a factor without them, and no asd of theirs."

@@ -418,7 +418,7 @@ def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatAr
     total = continuous_factor(plant)
     if len(white) == 1:
         return {white[0]: total}
-    if plant.is_assembled:
+    if not plant.machine.continuous.dt:
         found = {}
         for name in white:  # the plant sampled with one of them
             asd = {n: level for n, level in plant.asd.items() if n == name or n in plant.held}

@@ -26,7 +26,7 @@ from ..lti.interconnection import loop_poles
 from ..lti.measured_lines import on_lines
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
-from ..plant import AnyPlant
+from ..plant import AnyPlant, SensorPort
 from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, movable_outputs
 from .closed import ClosedLoop
@@ -255,9 +255,8 @@ def _law_system(law: Any) -> StateSpace:
 def _quantities(law: Any) -> dict[str, str]:
     """Return what the sensors measure that a controller was designed for, where that is known."""
     plant = getattr(law, "plant", None)
-    if not isinstance(plant, AnyPlant) or not plant.is_assembled:
-        return {}
-    return {sensor.name: sensor.quantity for sensor in plant.assembled.ports.y}
+    ports = plant.ports.y if isinstance(plant, AnyPlant) else ()
+    return {port.name: port.quantity for port in ports if isinstance(port, SensorPort)}
 
 
 def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:

@@ -8,36 +8,14 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Value, several, short
+from ..checks import FloatArray, several, short
 from ..errors import LabelError, ModelError, require_known
-from ..plant import Actuator, EvaluationModel, SensorPort, StandardPlant, standard_plant
+from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
+from ..plant.origins import PlantChannel as PlantChannel
 from ..plant.partitioned import require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
 from ..tolerances import TYPED
-
-
-@dataclass(frozen=True, eq=False)
-class PlantChannel(Value):
-    """A candidate that a plant made elsewhere has already: a row of C or a column of B.
-
-    Parameters
-    ----------
-    name : str
-        Of the channel.
-    side : {"y", "u"}
-        Whether it is a sensor or an actuator.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.placement.PlantChannel("y1", "y")
-    PlantChannel(name='y1', side='y')
-    """
-
-    name: str
-    side: str
-
 
 Port: TypeAlias = SensorPort | Actuator | PlantChannel
 
@@ -48,14 +26,11 @@ Side: TypeAlias = Literal["y", "u", "yu"]
 #: what users call them
 SIDES = {"sensors": "y", "actuators": "u"}
 _NAME = {"y": "Sensor", "u": "Actuator"}
-_KIND: dict[str, type[Any]] = {"y": SensorPort, "u": Actuator}
 
 
 def side_of(port: Port) -> str:
     """Return "y" of a sensor and "u" of an actuator."""
-    if isinstance(port, PlantChannel):
-        return port.side
-    return "y" if isinstance(port, SensorPort) else "u"
+    return str(port.home)
 
 
 def sides_of(ports: Iterable[Port]) -> Any:
@@ -75,23 +50,7 @@ def with_side(plant: StandardPlant, side: str, chosen: Sequence[Port]) -> Standa
     """Return the plant with these sensors (actuators, or both) instead of its own."""
     plant = standard_plant(plant)
     parts = {s: tuple(port for port in chosen if side_of(port) == s) for s in side}
-    if plant.is_assembled:
-        return plant.with_ports(plant.assembled.ports.replace(**parts))
-    return _restricted(plant, {s: [port.name for port in part] for s, part in parts.items()})
-
-
-def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPlant:
-    """Return a plant with some of its sensors and actuators, without noise and effort of others."""
-    y, u = kept.get("y", list(plant.y)), kept.get("u", list(plant.u))
-    silent = {f"{name}:noise" for name in plant.y if name not in y}
-    idle = {f"{name}:effort" for name in plant.u if name not in u}
-    w = [name for name in plant.w if name not in silent]
-    z = [name for name in plant.z if name not in idle]
-    asd = {name: size for name, size in plant.asd.items() if name not in silent}
-    system = plant.system.select([*z, *y], [*w, *u])
-    whole = plant.evaluation_plant
-    judged = EvaluationModel.of(whole and _restricted(whole, kept))
-    return plant.replace(system=system, w=w, u=u, z=z, y=y, asd=asd, evaluation=judged)
+    return plant.with_ports(plant.ports.replace(**parts))
 
 
 def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:
@@ -101,31 +60,21 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."
         )
-    if plant.is_assembled:
-        own = {port.name: port for port in getattr(plant.assembled.ports, side)}
-    else:
-        own = {name: PlantChannel(name, side) for name in (plant.y if side == "y" else plant.u)}
+    ports = plant.ports
+    own = {port.name: port for port in getattr(ports, side)}
     found: dict[str, Port] = {}
     for port in given:
         if isinstance(port, str):
             known = own | found
             require_known(_NAME[side].lower(), [port], known)
             port = known[port]
-        if not plant.is_assembled and not isinstance(port, PlantChannel):
-            raise ModelError(
-                f"the plant was not assembled from a structure, which would be needed for "
-                f"{short(port)}: its candidates are names of its channels. Pass names, or make "
-                "the plant by assemble_plant(model, ports)."
-            )
-        if plant.is_assembled and not isinstance(port, _KIND[side]):
+        if not isinstance(port, SensorPort | Actuator | PlantChannel) or port.home != side:
             raise ModelError(
                 f"candidates are {_NAME[side]}s or names of the plant's, got "
                 f"{short(port)}. Pass {_NAME[side]}(name, at=...)."
             )
-        if plant.is_assembled:  # one that moves is where the machine stands
-            ports = plant.assembled.ports
-            require_positions([port], ports.positions)
-            port = port_at(port, ports.values)
+        require_positions([port], ports.positions)
+        port = port_at(port, ports.values)  # one that moves is where the machine stands
         other = found.setdefault(port.name, port)
         if other is not port and other._fields() != port._fields():
             raise LabelError(
@@ -209,11 +158,10 @@ _APART = 1e6
 
 def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
     """Return where candidates and POIs are; a port with several points is at each of them."""
-    # of a plant made elsewhere no places are known
     names = tuple(port.name for port in candidates)
-    if not plant.is_assembled:
+    if plant.model is None:  # foreign matrices: no places are known
         return Places(names, (), ())
-    dofs, pois = plant.assembled.realisation.model.full_dofs, plant.assembled.ports.z
+    dofs, pois = plant.model.full_dofs, plant.ports.z
 
     own = (*plant.y, *plant.u)
     located = bool(np.any(np.ptp(dofs.xyz, axis=0)))

@@ -20,7 +20,7 @@ from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
-from .candidates import PlantChannel, Port, side_of
+from .candidates import Port, side_of
 from .convex import Quadratic, chosen_rows, measured, quadratic
 from .criterion import AGREEMENT, Criterion, Scorer
 from .poi_variance import (
@@ -50,13 +50,11 @@ class MotionAndEffort(Criterion):
         """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
         plant.check().require(("excited",), "a stationary controller")
         factors = self.factors(plant)
-        if not plant.is_assembled:
-            return
         parts = []
-        for poi in plant.assembled.ports.z:
+        for poi in plant.ports.z:
             axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
             parts += [poi.replace(axes=axes)] if axes else []
-        seen = plant.assembled.ports.replace(z=parts, references=())
+        seen = plant.ports.replace(z=parts, references=())
         plant.with_ports(seen).check().require(("performance",), f"a controller for {self!r}")
 
     def unit(self, plant: StandardPlant) -> str:
@@ -140,8 +138,7 @@ class PoiLqr(MotionAndEffort):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, self.factors(plant))
         n = A.shape[0]
-        # a plant made elsewhere holds its delay in its states
-        whole, fraction = divmod(plant.delay if plant.is_assembled else 0.0, 1.0)
+        whole, fraction = divmod(plant.delay, 1.0)
         constant = float(np.sum((rows @ noise) ** 2))
         for _ in range(int(whole)):
             noise = A @ noise
@@ -237,23 +234,18 @@ class ClosedLoopH2(MotionAndEffort):
         state predicted d samples ahead, P_d. A fraction of a sample, filters and delays of ports:
         the plant is made anew for each choice.
         """
-        delay = plant.delay if plant.is_assembled else 0.0
-        if delay % 1.0 or not plain(plant, candidates):
+        if plant.delay % 1.0 or not plain(plant, candidates):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, self.factors(plant))
-        own = plant.assembled.ports if plant.is_assembled else None
         given = {side: [p for p in candidates if side_of(p) == side] for side in "yu"}
-        fixed = {
-            side: list(getattr(own, side)) if own else [PlantChannel(n, side) for n in names]
-            for side, names in (("y", sensors(plant)), ("u", plant.u))
-        }
+        fixed = {side: list(getattr(plant.ports, side)) for side in "yu"}
         problem = Separation(
             A,
             noise,
             rows,
             measured_rows(plant, given["y"] or fixed["y"]),
             pushed_columns(plant, given["u"] or fixed["u"]).T / self.effort,
-            int(delay),
+            int(plant.delay),
             np.array([side_of(port) == "y" for port in candidates]),
         )
         if not given["u"]:

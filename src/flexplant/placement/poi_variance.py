@@ -48,14 +48,11 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
 
 
 def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
-    """Return {POI: {axis: z channel}}; of a plant made elsewhere by the channels' names."""
-    if plant.is_assembled:
-        pois = plant.assembled.ports.z
-        return {poi.name: {axis: poi.channel(axis) for axis in poi.axes} for poi in pois}
+    """Return {POI: {axis: z channel}} by the channels' names."""
     found: dict[str, dict[str, str]] = {}
     for name in plant.z:
         poi, _, axis = name.partition(":")
-        if axis not in ("effort", "error"):
+        if axis.rpartition(":")[2] not in ("effort", "error"):
             found.setdefault(poi, {})[axis] = name
     return found
 
@@ -114,8 +111,8 @@ def structure_part(
 
 
 def _own_states(plant: StandardPlant) -> int:
-    """Return how many states are no delay lines: all of a plant made elsewhere."""
-    return (plant.continuous if plant.is_assembled else plant).system.n_states
+    """Return the number of states that are not delay lines."""
+    return plant.continuous.system.n_states
 
 
 def measured_rows(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
@@ -128,7 +125,7 @@ def measured_rows(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArra
 
 def pushed_columns(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     """Return what a unit of each actuator, held over one sample, does to these states."""
-    if not plant.is_assembled:
+    if plant.continuous.dt:  # what it was before sampling is not known
         return np.asarray(plant.B2[:, [plant.u.index(port.name) for port in candidates]])
     silent = np.zeros((0, _own_states(plant)))
     return held_exactly(pushed(plant, candidates, silent), 1.0 / plant.dt).B
@@ -144,14 +141,13 @@ def pushed(plant: StandardPlant, candidates: Sequence[Port], rows: FloatArray) -
 def plain(plant: StandardPlant, candidates: Sequence[Port]) -> bool:
     """Return whether candidates change rows of B or C only: they, y and u have no states."""
     # disturbances may have: a shape, the acceleration of the base
-    if not plant.is_assembled:
-        return not np.any(plant.D22)
-    ports, realisation = plant.assembled.ports, plant.assembled.realisation
+    ports, realisation = plant.ports, plant.realisation
     # what is added to a sensor, and noise of an actuator, come and go with it
     apart = all(port.added_to is None for port in ports.w)
     apart = apart and not any(isinstance(c, Actuator) and c.asd > 0 for c in candidates)
     rigidly = not realisation.static_inputs.size
-    return apart and rigidly and all(map(bare, (*ports.u, *ports.y, *candidates)))
+    apart = apart and rigidly and not np.any(plant.D22)
+    return apart and all(map(bare, (*ports.u, *ports.y, *candidates)))
 
 
 def bare(port: Any) -> bool:
@@ -230,8 +226,7 @@ class PoiVariance(Criterion):
         sizes = {name: noise[i] for i, name in enumerate(plant.y)}
         sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
         require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
-        if plant.is_assembled:
-            _check_direct(plant, candidates)
+        _check_direct(plant, candidates)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
@@ -303,7 +298,7 @@ def _lagged(estimator: KalmanEstimator, rows: FloatArray, lag: Any) -> FloatArra
 
 def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
     """Raise AssumptionError when white noise of a disturbance reaches a sensor at once."""
-    ports, realisation = plant.assembled.ports, plant.assembled.realisation
+    ports, realisation = plant.ports, plant.realisation
     # noise that is shaped first does not arrive at once, and samples of held noise are finite
     white = (port for port in ports.forces if port.asd > 0 and port.name not in plant.held)
     loud = [port for port in white if bare(port)]

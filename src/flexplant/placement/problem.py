@@ -132,10 +132,10 @@ class RigidPart:
     @classmethod
     def of(cls, plant: StandardPlant, side: str, candidates: Sequence[Port]) -> RigidPart:
         """Return the part of candidates on a plant; of one made elsewhere nothing is known."""
-        if not plant.is_assembled:
-            return cls(np.zeros((len(candidates), 0)))
-        realisation = plant.assembled.realisation
+        realisation = plant.realisation
         r = realisation.n_rigid
+        if not r:
+            return cls(np.zeros((len(candidates), 0)))
         parts = np.zeros((len(candidates), len(side), r))
         for part, port in zip(parts, candidates, strict=True):
             own = part[side.index(side_of(port))]

@@ -122,10 +122,10 @@ _SHOWN = 3
 def aliased_modes(plant: PartitionedSystem) -> str:
     """Return, in words, which elastic modes of a sampled plant are not below half its rate."""
     # a mode at f looks like one at |f - m rate|: no controller of that rate distinguishes them
-    if not plant.dt or not plant.is_assembled:
+    if not plant.dt:
         return ""
     rate = 1.0 / plant.dt
-    count = plant.assembled.realisation.n_modes
+    count = plant.realisation.n_modes
     freq = natural(plant.modal_blocks[:count])[0] / (2 * np.pi)
     above = np.flatnonzero(freq >= 0.5 * rate * (1 - SAME))
     if not above.size:
@@ -198,7 +198,7 @@ class ModeVisibility(Value):
 def mode_visibility(plant: PartitionedSystem) -> tuple[ModeVisibility, ...]:
     """Return the visibility of every elastic mode; none for a plant without a structure."""
     given, plant = plant, plant.machine.continuous
-    if not plant.is_assembled:
+    if not plant.realisation.n_modes:
         return ()
     # rigid-body modes and unstable ones come first
     g, count = plant.system, plant.assembled.realisation.n_modes

@@ -268,9 +268,7 @@ def _states(g: StateSpace, s: complex, columns: IntArray) -> ComplexArray:
 
 def elastic(plant: Partition) -> FloatArray:
     """Return the frequencies [Hz] of the modes that oscillate below 0.45 of the rate, in order."""
-    if not plant.is_assembled:
-        return np.zeros(0)
-    pairs = plant.modal_blocks[plant.n_rigid : plant.assembled.realisation.n_modes]
+    pairs = plant.modal_blocks[plant.n_rigid : plant.realisation.n_modes]
     freq = natural(pairs)[0] / (2.0 * np.pi)
     freq = freq[freq > 0]  # unstable pairs do not resonate
     return np.asarray(freq[freq * plant.dt < 0.45])

@@ -6,20 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-from ..checks import FloatArray, Value, instance, positive
+from ..checks import FloatArray, instance, positive
 from ..errors import ModelError, counted
 from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
-from ..lti.sampling import (
-    acting,
-    check_latency,
-    check_rate,
-    held_exactly,
-    light_modes,
-    sample_and_hold,
-)
+from ..lti.sampling import check_latency, check_rate, held_exactly, light_modes, sample_and_hold
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, Structure
@@ -28,7 +20,7 @@ from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
 from .partition import Partition
 from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
-from .ports import Poi, Ports
+from .ports import Ports
 from .realisation import ModalRealisation, natural
 
 
@@ -232,75 +224,6 @@ def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str
     )
 
 
-def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
-    """Return a plant's origin with some of its sensors, actuators and POIs in their order."""
-    # None for ports that are others or in another order, or whose noise the states hold mixed
-    if not _among(ports, own.ports):
-        return None
-    outputs = ports.motions
-    inputs = [*(port.name for port in ports.forces), *ports.input_noises]
-    if not inputs or not outputs:
-        return None
-    modes = np.isin(own.physical.states, own.realisation.names)
-    chosen = own.physical.select(outputs, inputs)
-    reached = acting(own.physical.A != 0)
-    stay = modes | _linked(chosen, reached, modes) | ~_linked(own.physical, reached, modes)
-    factor = own.noise_factor
-    return own.replace(
-        ports=ports,
-        physical=_with_states(chosen, stay),
-        noise_factor=None if factor is None else factor[stay],
-    )
-
-
-def _among(ports: Ports, own: Ports) -> bool:
-    """Return whether the ports are some of a plant's own, in their order, without lost noise."""
-    some = _is_subsequence(ports.u, own.u) and _is_subsequence(ports.y, own.y)
-    same = len(ports.w) == len(own.w) and _is_subsequence(ports.w, own.w)
-    noisy = own.input_noises.keys() == ports.input_noises.keys()
-    known = {poi.name: poi for poi in own.z}
-    return some and same and noisy and all(_is_part(poi, known.get(poi.name)) for poi in ports.z)
-
-
-def _is_subsequence(ports: Sequence[Value], own: Sequence[Value]) -> bool:
-    """Return whether all of some ports are among others, in their order."""
-    left = iter(own)
-    return all(any(port is other for other in left) for port in ports)
-
-
-def _is_part(poi: Poi, own: Poi | None) -> bool:
-    """Return whether a POI is one of the plant's, or has some of its axes."""
-    if own is None or not set(poi.axes) <= set(own.axes):
-        return False
-    return poi is own or own.replace(axes=poi.axes)._fields() == poi._fields()
-
-
-def _linked(
-    g: StateSpace, reached: npt.NDArray[np.bool_], modes: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
-    """Return which states an input or a mode acts on and an output or a mode sees."""
-    driven = reached @ (np.any(g.B, axis=1) | modes)
-    return np.asarray(driven & ((np.any(g.C, axis=0) | modes) @ reached))
-
-
-def _with_states(g: StateSpace, stay: npt.NDArray[np.bool_]) -> StateSpace:
-    """Return a system without some of its states, which nothing reaches or nothing shows."""
-    if np.all(stay):
-        return g
-    blocks = None
-    if g.blocks is not None:
-        owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
-        sizes = np.bincount(owner[stay], minlength=len(g.blocks))
-        blocks = sizes[sizes > 0].tolist()
-    return g.replace(
-        A=g.A[np.ix_(stay, stay)],
-        B=g.B[stay],
-        C=g.C[:, stay],
-        states=[name for name, kept in zip(g.states, stay.tolist(), strict=True) if kept],
-        blocks=blocks,
-    )
-
-
 P = TypeVar("P", bound=Partition)
 
 
@@ -350,12 +273,12 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             f"the plant is sampled already (dt {plant.dt:g} s). Start from plant.continuous."
         )
     check_rate(_elastic_frequencies(plant), rate, delay)
-    for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
+    for name, late in plant.ports.latencies.items():
         check_latency(name, late, rate)
-    if not plant.is_assembled:
+    origin = plant.origin
+    if isinstance(origin, Foreign):
         system = held_exactly(plant.system, rate, delay=delay, delayed=plant.u)
         return plant.replace(system=system, origin=Foreign(None, float(delay), plant))
-    origin = plant.assembled
     held = plant.held
     asd = np.array(
         [0.0 if name in held else plant.asd.get(name, 0.0) for name in origin.physical.inputs]
@@ -377,12 +300,12 @@ def sampled_motions(
     origin = plant.continuous.assembled
     some, found = origin.replace(physical=origin.physical.select(outputs, inputs)), []
     for pairs in blocks:
-        own = _with_modes(some, origin.realisation.replace(pairs=pairs))
+        own = with_modes(some, origin.realisation.replace(pairs=pairs))
         found.append(_held(own, 1.0 / plant.dt, plant.delay)[0] if plant.dt else own.physical)
     return found
 
 
-def _with_modes(origin: Assembled, realisation: ModalRealisation) -> Assembled:
+def with_modes(origin: Assembled, realisation: ModalRealisation) -> Assembled:
     """Return an origin with A of a realisation, whose modes move and are driven as its own do."""
     g = origin.physical
     where = [g.states.index(name) for name in realisation.names]
@@ -391,24 +314,9 @@ def _with_modes(origin: Assembled, realisation: ModalRealisation) -> Assembled:
     return origin.replace(physical=g.replace(A=A), realisation=realisation)
 
 
-def _moves_alike(own: Assembled, realisation: ModalRealisation) -> bool:
-    """Return whether modes differ from a plant's in their poles alone, and its ports by them in A.
-
-    What a velocity or an acceleration shows of a mode hangs on its poles.
-    """
-    before = own.realisation
-    same = all(
-        getattr(realisation, name) is value or np.array_equal(getattr(realisation, name), value)
-        for name, value in before._fields().items()
-        if name != "pairs"
-    )
-    held = set(before.names) <= set(own.physical.states)
-    return same and held and not any(sensor.order for sensor in own.ports.y)
-
-
 def _elastic_frequencies(plant: Partition) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
-    if not plant.is_assembled:
+    if not plant.modal_blocks.size:
         return light_modes(plant.system.poles())
     size, _ = natural(plant.modal_blocks)
     return np.asarray(size[size > 0] / (2.0 * np.pi))
@@ -446,46 +354,6 @@ def loud_like(plant: Partition, fresh: P) -> P:
         if name in fresh.w and fresh.asd.get(name, 0.0) == own.get(name, 0.0)
     }
     return fresh.replace(asd={**fresh.asd, **kept}) if kept else fresh
-
-
-def rebuilt(
-    plant: P, *, ports: Ports | None = None, realisation: ModalRealisation | None = None
-) -> P:
-    """Return a plant with other ports or of other modes, sampled like the old one."""
-    # ports that are among its own are rows and columns of it
-    own, judged = plant.assembled, _evaluation_of_rebuilt(plant, ports, realisation)
-    if isinstance(ports, Ports) and realisation is None and not changed_densities(plant):
-        found = with_ports_of(own, ports)
-        if found is not None:
-            before = own.continuous
-            whole = None if before is None else rebuilt(before, ports=ports)
-            return wired(type(plant), found.replace(continuous=whole), judged)
-    if ports is None and realisation is not None and _moves_alike(own, realisation):
-        fresh = wired(type(plant), _with_modes(plant.continuous.assembled, realisation), judged)
-    else:
-        modes = own.realisation if realisation is None else realisation
-        fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports, judged)
-    return sampled_like(plant, loud_like(plant, fresh))
-
-
-def _evaluation_of_rebuilt(
-    plant: Partition, ports: object, realisation: ModalRealisation | None
-) -> EvaluationModel | None:
-    """Return the evaluation model of a plant that gets other ports or other modes."""
-    judged = plant.evaluation
-    if judged is None:
-        return None
-    if isinstance(ports, Ports):
-        judged = judged.with_ports(ports)
-    if realisation is None:
-        return judged
-    # other modes are another machine, which the evaluation model does not describe. What a reduced
-    # model left out follows a change of that model
-    if judged.source is not plant.model:
-        return None
-    return (
-        judged if realisation.model is plant.model else EvaluationModel.known_to(realisation.model)
-    )
 
 
 def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..tolerances import SAME
-from .building import rebuilt
 from .realisation import ModalRealisation, natural
+from .remade import rebuilt
 from .standard import StandardPlant
 from .uncertainty.delta import Delta
 from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs, modal_realisation

@@ -9,9 +9,10 @@ import numpy as np
 from ..checks import FloatArray
 from ..errors import LabelError, ModelError, some_names, warn
 from ..tolerances import SAME
-from .building import P, continuous_plant, loud_like, rebuilt, sampled_like
+from .building import P, continuous_plant, loud_like, sampled_like
 from .evaluation_model import EvaluationModel
 from .partition import Partition
+from .remade import rebuilt
 from .rigid_motion import rigid_gain, rigid_modes
 
 #: relative difference of rigid-body accelerations above which two models are different bodies; an
@@ -32,8 +33,7 @@ def evaluation_plant(plant: P) -> P | None:
         found = sampled_like(plant, loud_like(plant, found))
         if before is not plant:
             return found  # compared when it was assembled
-    if plant.is_assembled and found.is_assembled:
-        _warn_of_another_body(plant, found)
+    _warn_of_another_body(plant, found)
     return found
 
 
@@ -50,11 +50,6 @@ def check_channels(plant: Partition, other: Partition) -> None:
 
 def _with_ports(plant: P, model: EvaluationModel) -> P:
     """Return the continuous plant of a structure with the ports of the given one."""
-    if not plant.is_assembled:
-        raise ModelError(
-            "the evaluation model is a structure, and this plant was not assembled from one: its "
-            "ports are not known. Pass a plant with the same channels as evaluation=."
-        )
     return continuous_plant(type(plant), model.realisation, plant.assembled.ports, None)
 
 
@@ -82,10 +77,12 @@ def _matched(plant: P, other: P) -> P:
 
 def _warn_of_another_body(own: Partition, other: Partition) -> None:
     """Warn where forces accelerate the rigid body of an evaluation model differently."""
+    if not (own.n_rigid and other.n_rigid):
+        return  # held, on springs, or of foreign matrices: no mode shows the mass alone
     one, two = _rigid_gains(own), _rigid_gains(other)
     size = float(np.linalg.norm(one))
     if not size or not np.any(two):
-        return  # held, or on springs: no mode shows the mass alone
+        return  # no force moves the body
     off = float(np.linalg.norm(two - one)) / size
     if off > _ANOTHER_BODY:
         warn(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, instance, short
+from ..checks import FloatArray, instance, name_list, short
 from ..errors import ModelError, require_known
 from ..labels import Place
 from ..lti.interconnection import append, series
@@ -161,7 +161,9 @@ class GeneralizedPlant(PartitionedSystem):
             if isinstance(step, StateSpace):
                 found = measured_through(found, at_rate(step, "y", machine.dt))
             else:
-                found = weighted(found, *map(dict, step))
+                z, w = map(dict, step)  # a selection may have taken channels away
+                kept = {name: weight for name, weight in z.items() if name in found.z}
+                found = weighted(found, kept, {n: own for n, own in w.items() if n in found.w})
         return found  # type: ignore[no-any-return]
 
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
@@ -183,6 +185,29 @@ class GeneralizedPlant(PartitionedSystem):
     def through(self, block: System) -> GeneralizedPlant:
         """Return the plant whose y are the outputs of a block, as `StandardPlant.through`."""
         return measured_through(self, as_statespace(block))
+
+    def select(
+        self,
+        *,
+        w: Sequence[str] | None = None,
+        u: Sequence[str] | None = None,
+        z: Sequence[str] | None = None,
+        y: Sequence[str] | None = None,
+    ) -> GeneralizedPlant:
+        """Return the plant with some of its channels; all of a side whose names are not given.
+
+        w, z and y are exactly the channels that are named; the effort and the noise of an actuator
+        that is left out leave with it. LabelError when a name is not a channel of that side.
+        """
+        found = self if u is None else self.around(self.unweighted.select(u=u))
+        if w is not None or z is not None:
+            found = weighted(found, _dropped(found, "z", z), _dropped(found, "w", w))
+        if y is not None:
+            names = name_list(y, "y")
+            require_known("channel of y", names, found.y)
+            gain = StateSpace([], [], [], np.eye(len(names)), found.dt, inputs=names, outputs=names)
+            found = measured_through(found, gain)
+        return found
 
     def discretized(self, rate: float, *, delay: float = 0.0) -> GeneralizedPlant:
         """Return the weights and blocks around the machine sampled at a rate (Tustin).
@@ -258,6 +283,15 @@ def weighted(plant: PartitionedSystem, z: Any, w: Any) -> GeneralizedPlant:
         system.replace(name=plant.system.name), tuple(keep_w), plant.u, tuple(keep_z), plant.y, {},
         plant.machine, (*_steps(plant), step),
     )  # fmt: skip
+
+
+def _dropped(plant: PartitionedSystem, side: str, names: Sequence[str] | None) -> dict[str, None]:
+    """Return the weight None of every channel of a side that is not among some names."""
+    own = getattr(plant, side)
+    if names is None:
+        return {}
+    require_known(f"channel of {side}", name_list(names, side), own)
+    return {name: None for name in own if name not in names}
 
 
 def _steps(plant: PartitionedSystem) -> tuple[Any, ...]:

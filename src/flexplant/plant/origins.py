@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
 
 from ..checks import FloatArray, Value
 from ..lti.statespace import StateSpace
@@ -46,13 +48,55 @@ class Assembled(Value):
     continuous: Any = None
 
 
+#: the modes of matrices of which no structure is known
+_NO_MODEL: Any = None
+_NO_MODES = ModalRealisation(
+    _NO_MODEL, np.zeros((0, 2, 2)), np.zeros((0, 0)), np.zeros((0, 0)), (), 0, form="as given"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PlantChannel(Value):
+    """A channel of foreign matrices, as a port: a row of C or a column of B without a place.
+
+    Parameters
+    ----------
+    name : str
+        Name of the channel.
+    side : {"y", "u"}
+        Whether it is a sensor or an actuator.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.placement.PlantChannel("y1", "y")
+    PlantChannel(name='y1', side='y')
+    """
+
+    asd: ClassVar = 0.0
+    latency: ClassVar = 0.0
+    unit: ClassVar = None
+    name: str
+    side: str
+
+    @property
+    def home(self) -> str:
+        """The side of `Ports` that it belongs to."""
+        return self.side
+
+
 @dataclass(frozen=True, eq=False)
 class Foreign(Value):
-    """What is known of a plant that was made elsewhere.
+    """What is known of a plant of foreign matrices: the names of its channels and no modes.
+
+    It answers the same questions as `Assembled`, so that functions need not distinguish them; what
+    needs a structure asks `plant.assembled`.
 
     Parameters
     ----------
     noise_factor, delay, continuous : as for `Assembled`
+    ports : Ports
+        Actuators and sensors by name.
 
     Examples
     --------
@@ -67,9 +111,13 @@ class Foreign(Value):
     noise_factor: FloatArray | None = None
     delay: float = 0.0
     continuous: Any = None
+    ports: Ports = field(default_factory=Ports)
+
+    @property
+    def realisation(self) -> ModalRealisation:
+        """No modes."""
+        return _NO_MODES
 
 
 #: where a plant may have come from
 Origin: TypeAlias = "Assembled | Foreign"
-#: nothing is known but the system
-ELSEWHERE = Foreign()

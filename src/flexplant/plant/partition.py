@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self, TypeGuard
 
 import numpy as np
@@ -12,8 +12,9 @@ from ..checks import FloatArray, mapping, name_list, real_array, short
 from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace, System, as_statespace
 from .evaluation_model import EvaluationModel
-from .origins import ELSEWHERE, Foreign, Origin
+from .origins import Foreign, Origin, PlantChannel
 from .partitioned import PartitionedSystem
+from .ports import Ports
 from .realisation import MODAL
 from .sides import TYPE_THIS, sides_of
 
@@ -32,13 +33,17 @@ def is_plant(given: object) -> TypeGuard[PartitionedSystem | System]:
 class Partition(PartitionedSystem):
     """The data of a standard plant, in the fields of `StandardPlant`, and derived quantities."""
 
-    origin: Origin = ELSEWHERE
+    origin: Origin = field(default_factory=Foreign)
     uncertainty: Any = None
     evaluation: EvaluationModel | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._set(evaluation=EvaluationModel.of(self.evaluation))
+        if isinstance(self.origin, Foreign):  # its ports are the names that it has
+            u: Any = [PlantChannel(name, "u") for name in self.u]
+            y: Any = [PlantChannel(name, "y") for name in self.y if name not in self.w]
+            self._set(origin=self.origin.replace(ports=Ports(u=u, y=y)))
 
     @property
     def machine(self) -> Self:
@@ -52,7 +57,8 @@ class Partition(PartitionedSystem):
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Return changes of fields with the noise of each sample and the plant before sampling."""
         asd = changes.get("asd")
-        if isinstance(asd, Mapping) and self.dt and "origin" not in changes and self.is_assembled:
+        of_sample = self.origin.continuous is not None and self.origin.noise_factor is not None
+        if isinstance(asd, Mapping) and "origin" not in changes and of_sample:
             quiet = {f"{name}:noise" for name in self.y}
             new, old = (
                 {n: a for n, a in d.items() if a and n not in quiet} for d in (asd, self.asd)
@@ -166,7 +172,7 @@ class Partition(PartitionedSystem):
     @property
     def has_own_modes(self) -> bool:
         """Whether it has modes, each with its own frequency and damping."""
-        return self.is_assembled and self.form == MODAL
+        return self.form == MODAL
 
     @property
     def noise_factor(self) -> FloatArray:

@@ -24,6 +24,8 @@ from ..lti.statespace import StateSpace
 from ..structure import FEModel
 from .evaluation_model import NOT_JUDGED
 from .origins import Assembled
+from .ports import Ports
+from .realisation import ModalRealisation
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,12 +121,12 @@ class PartitionedSystem(Value):
             names = getattr(self, side)
             shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
             lines.append(f"  {side} ({len(names)}) {shown}")
-        latencies = self.assembled.ports.latencies if self.is_assembled else {}
+        latencies = self.ports.latencies
         if latencies and not self.dt:
             shown = ", ".join(f"{name} {late:g} s" for name, late in latencies.items())
             lines.append(f"  latencies that act once it is sampled: {shown}")
-        if self.is_assembled and self.assembled.ports.positions:
-            lines.append(f"  at {self.assembled.ports.standing}")
+        if self.ports.positions:
+            lines.append(f"  at {self.ports.standing}")
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
         if self.machine.evaluation is not None:
@@ -134,16 +136,22 @@ class PartitionedSystem(Value):
         return "\n".join(lines)
 
     @property
-    def is_assembled(self) -> bool:
-        """Whether it, or the machine of a generalized plant, was assembled from a structure."""
-        return isinstance(self.machine.origin, Assembled)
+    def ports(self) -> Ports:
+        """The ports of the machine; of foreign matrices the names of actuators and sensors."""
+        found: Ports = self.machine.origin.ports
+        return found
+
+    @property
+    def realisation(self) -> ModalRealisation:
+        """The modes of the machine's structure; foreign matrices have no known modes."""
+        found: ModalRealisation = self.machine.origin.realisation
+        return found
 
     @property
     def assembled(self) -> Assembled:
         """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
 
-        For a `GeneralizedPlant`, what its machine was assembled from. ModelError when it was made
-        elsewhere.
+        All that needs a structure asks here: ModelError for a plant of foreign matrices.
         """
         found = self.machine.origin
         if not isinstance(found, Assembled):
@@ -170,13 +178,12 @@ class PartitionedSystem(Value):
     @property
     def units(self) -> dict[str, str]:
         """The units of the channels, and of what its ports derive: estimates, too."""
-        derived = self.assembled.ports.units if self.is_assembled else {}
-        return derived | dict(self.system.units)
+        return self.ports.units | dict(self.system.units)
 
     @property
     def n_rigid(self) -> int:
         """Number of rigid-body modes."""
-        return self.assembled.realisation.n_rigid if self.is_assembled else 0
+        return self.realisation.n_rigid
 
     @property
     def form(self) -> str:
@@ -184,17 +191,17 @@ class PartitionedSystem(Value):
 
         Weights and filters of the ports add blocks of their own.
         """
-        return self.assembled.realisation.form if self.is_assembled else "as given"
+        return self.realisation.form
 
     @property
     def model(self) -> Any:
         """The structural model that the plant was assembled from, or None."""
-        return self.assembled.realisation.model if self.is_assembled else None
+        return self.realisation.model
 
     @property
     def modal_blocks(self) -> FloatArray:
         """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
-        return self.assembled.realisation.pairs if self.is_assembled else np.zeros((0, 2, 2))
+        return self.realisation.pairs
 
     @property
     def unstable_modes(self) -> dict[int, str]:
@@ -216,9 +223,11 @@ class PartitionedSystem(Value):
     def modal_states(self) -> IntArray:
         """Where the states of the structure's modes are; sensors' filters stand before them.
 
-        ModelError when the plant was not assembled from a structure, or has other states now.
+        ModelError when the plant has other states now.
         """
-        names = self.assembled.realisation.names
+        names = self.realisation.names
+        if not names:
+            return np.zeros(0, dtype=np.int64)
         if names[0] not in self.system.states:
             raise ModelError(f"the plant has lost the states of its modes ({names[0]!r}, ...).")
         first = self.system.states.index(names[0])
@@ -227,8 +236,7 @@ class PartitionedSystem(Value):
     @property
     def held(self) -> tuple[str, ...]:
         """Disturbances whose noise is held over each sample: the last columns of `noise_factor`."""
-        ports = self.assembled.ports.w if self.is_assembled else ()
-        return tuple(p.name for p in ports if getattr(p, "held", False) and p.asd > 0)
+        return tuple(p.name for p in self.ports.w if getattr(p, "held", False) and p.asd > 0)
 
     @property
     def noise_direct(self) -> FloatArray:
@@ -269,7 +277,7 @@ class PartitionedSystem(Value):
         if not isinstance(name, str) or name in names:
             require_known("channel", [name], names)
             return name
-        for poi in self.assembled.ports.z if self.is_assembled else ():
+        for poi in self.ports.z:
             for axis in poi.axes:
                 aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
                 if name in aliases or (name == poi.name and axis == poi.axes[0]):

@@ -51,7 +51,7 @@ class _Pole(NamedTuple):
 def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
     """Return which modes that do not decay w and u reach, and y and z see (Hautus)."""
     bare = plant.machine.continuous
-    if not bare.is_assembled:  # states of a system made elsewhere have any units
+    if not bare.modal_blocks.size:  # states of foreign matrices have any units
         bare = bare.replace(system=evened(bare.system))
     poles = _persistent(bare.system)
     rate = 1.0 / plant.dt if plant.dt and not bare.dt else 0.0
@@ -80,14 +80,12 @@ def _undamped_kinds(plant: PartitionedSystem, poles: list[_Pole]) -> list[str]:
     words = [every] if rigid else []
     words += [counted(pairs, "unstable rigid-body pair")] if pairs else []
     count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
-    known = np.zeros(0)
-    if plant.is_assembled:
-        own = plant.assembled.realisation
-        known = rigid_modes(own, body_of(own)).freq
+    own = plant.realisation
+    known = rigid_modes(own, body_of(own)).freq if own.n_modes else np.zeros(0)
     kinds: dict[str, list[float]] = {"undamped suspension mode": [], "undamped mode": []}
     for pole in poles:
         size = abs(pole.value) / (2 * np.pi)
-        if plant.is_assembled and pole.value.imag and abs(pole.value.real) <= _AXIS * size:
+        if own.n_modes and pole.value.imag and abs(pole.value.real) <= _AXIS * size:
             weak = np.any(np.abs(known - size) <= TYPED * size)
             kind = "undamped suspension mode" if weak else "undamped mode"
             kinds[kind] += [size] * pole.left.shape[1]
@@ -121,7 +119,7 @@ def _cases(bare: PartitionedSystem, poles: list[_Pole], plant: PartitionedSystem
     shown = seeing([name for name in bare.z if name in plant.z])
     z = _Case("performance", "z does not see", shown, False, more)
     u = _Case("stabilisable", "u does not reach", list(plant.u), True, "Add or move an actuator.")
-    return [w, y, z, u] if bare.is_assembled else [u, y]
+    return [w, y, z, u] if bare.modal_blocks.size else [u, y]
 
 
 def _persistent(g: StateSpace) -> list[_Pole]:
@@ -341,7 +339,7 @@ def no_zeros(plant: PartitionedSystem) -> list[Assumption]:
             text = f"{key} has {len(names[1])} inputs {fro} and {len(names[0])} outputs {to}."
             found.append(Assumption(key, False, text, "D12 and D21 cannot have full rank."))
             continue
-        if not plant.is_assembled:
+        if not plant.modal_blocks.size:
             g = evened(g)
         if key != "P12":
             g = StateSpace(g.A.T, g.C.T, g.B.T, g.D.T, g.dt)

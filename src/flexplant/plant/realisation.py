@@ -65,7 +65,8 @@ class ModalRealisation(Value):
 
     def __post_init__(self) -> None:
         for name in ("static_outputs", "static_inputs"):
-            self._set(**{name: getattr(self, name).reshape(self.inputs.shape[0], -1)})
+            given, n = getattr(self, name), self.inputs.shape[0]
+            self._set(**{name: given.reshape(n, given.size // max(n, 1))})
 
     @property
     def n_modes(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -13,7 +13,7 @@ from ..errors import LabelError
 from ..labels import Place
 from ..lti.statespace import System, as_statespace
 from .assumptions import AssumptionReport
-from .building import continuous_plant, rebuilt, sampled
+from .building import continuous_plant, sampled
 from .evaluation_model import EvaluationModel
 from .evaluation_plants import check_channels, evaluation_plant, own_plant
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
@@ -21,6 +21,7 @@ from .moving import PortPath, PositionMap, along, moved_ports, position_map, see
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
+from .remade import rebuilt, selected
 from .rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
@@ -164,6 +165,37 @@ class StandardPlant(Partition):
         not assembled from a structure.
         """
         return self._known(rebuilt(self, ports=ports))
+
+    def select(
+        self,
+        *,
+        w: Sequence[str] | None = None,
+        u: Sequence[str] | None = None,
+        z: Sequence[str] | None = None,
+        y: Sequence[str] | None = None,
+    ) -> StandardPlant:
+        """Return the plant with some of its channels, in the order of the plant.
+
+        A channel that belongs to another one comes and goes with it and needs no name: the noise
+        of a sensor, the effort of an actuator, the reference and the error of an axis of a POI.
+
+        Parameters
+        ----------
+        w, u, z, y : sequence of str, optional
+            Disturbances, actuators, axes of POIs and sensors to keep; all when not given.
+
+        Raises
+        ------
+        LabelError
+            When a name is not a channel of that side.
+
+        Examples
+        --------
+        >>> import flexplant as fx
+        >>> fx.testbeds.three_masses().select(y=["y2"]).y
+        ('y2', 'die:ref')
+        """
+        return self._known(selected(self, {"w": w, "u": u, "z": z, "y": y}))
 
     def at(
         self, poi: Place | Mapping[str, Place] | None = None, **positions: float

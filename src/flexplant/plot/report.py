@@ -128,14 +128,14 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         if forces and any(n.endswith(":error") for n in value):
             over.append((f"{name}: forces over time", partial(response, value, forces)))
         return over
-    if isinstance(value, StandardPlant) and value.is_assembled:
+    if isinstance(value, StandardPlant) and value.model is not None:
         said = "Sensors, actuators and POIs; arrows: along what they act and measure"
         return [
             (said, partial(placed, value)),
             ("The plant, from forces along each axis to the POI", partial(_axis_responses, value)),
         ]
     plant = design.plant
-    if isinstance(value, Placement) and plant is not None and plant.is_assembled:
+    if isinstance(value, Placement) and plant is not None and plant.model is not None:
         return [("The places that were chosen", lambda: placed(value.on(plant.machine)))]
     if isinstance(value, Controller | StateSpace | Frf):
         system: Any = value.system if isinstance(value, Controller) else value
@@ -275,9 +275,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
     caption = f"Where the error of {main} comes from, by frequency and source"
     picture = gallery.picture(lambda: budget(found), caption)
     # without reference an error is as large as the motion
-    errors = [n for n in loop.plant.z if n.endswith(":error")] if loop.plant.is_assembled else []
-    followed = loop.plant.assembled.ports.followed if errors else ()
-    twice = {poi.channel(axis) for poi, axis in followed}
+    twice = {poi.channel(axis) for poi, axis in loop.plant.ports.followed}
     shown = [n for n in loop.plant.z if n not in twice]
     rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in shown]
     motions = table(["channel", "rms under all noises"], rows)

@@ -32,7 +32,7 @@ def warn_beyond_ranges(
     """
     limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
     moves = {name: move for name, move in signals.items() if isinstance(move, SetPointProfile)}
-    if not limits or not moves or not plant.is_assembled:
+    if not limits or not moves or not plant.ports.followed:
         return
     for name, needed in _needed(plant, moves, list(limits), time).items():
         limit = limits[name]

@@ -72,7 +72,7 @@ def unscheduled(loop: ClosedLoop | ScheduledLoop) -> tuple[ClosedLoop, Scheduled
 
 def known_positions(plant: StandardPlant, what: str) -> tuple[Position, ...]:
     """Return the positions of a plant; ModelError where a sampled plant's ports do not move."""
-    found = plant.assembled.ports.positions if plant.dt and plant.is_assembled else ()
+    found = plant.ports.positions if plant.dt else ()
     if not found:
         raise ModelError(
             f"{what} a sampled plant whose ports move: Ports(..., positions=["

@@ -22,7 +22,7 @@ def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     """Warn of steady forces at the end of a run that move none of the axes of the POIs."""
     # whatever the run does, these forces only heat the actuators and bend what is between them
     count = max(_FEWEST, round(_END * run.time.size))
-    if not loop.machine.is_assembled or len(loop.driven) < 2 or run.time.size <= count:
+    if not loop.machine.ports.z or len(loop.driven) < 2 or run.time.size <= count:
         return
     efforts = np.stack([np.atleast_2d(run[name]) for name in loop.driven])  # (m, runs, n_time)
     most = np.abs(efforts).max(axis=(0, 2))

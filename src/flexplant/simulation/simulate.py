@@ -262,9 +262,9 @@ def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, Flo
 
 def _positions(plant: StandardPlant, moving: Any) -> dict[str, Any]:
     """Return what moves of the plant's positions."""
-    if not isinstance(moving, Mapping) or not plant.is_assembled:
+    if not isinstance(moving, Mapping):
         return {}
-    known = [one.name for one in plant.assembled.ports.positions]
+    known = [one.name for one in plant.ports.positions]
     return {name: path for name, path in moving.items() if name in known}
 
 

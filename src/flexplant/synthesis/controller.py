@@ -175,12 +175,12 @@ def certified_norm(
 
 def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
     """Return the largest gain of a loop from each group of w to each group of z, by a sweep."""
-    # groups by the names that `assemble_plant` gives; empty for other plants
-    if not P.is_assembled:
-        return {}
-    gain = respond(_loop_grid(loop))
+    # groups by the names that `assemble_plant` gives; one group on each side says nothing new
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
+    if len(sides[0]) * len(sides[1]) < 2:
+        return {}
+    gain = respond(_loop_grid(loop))
     return {
         f"{to} from {source}": float(largest_gains(gain[rows][:, columns]).max())
         for to, rows in sides[0].items()

@@ -248,7 +248,7 @@ def posed(
 
 
 def _require_body(plant: AnyPlant, what: str) -> None:
-    if plant.is_assembled:  # it can name the rigid-body motion that is missed
+    if plant.modal_blocks.size:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), what)
 
 

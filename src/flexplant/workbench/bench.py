@@ -158,11 +158,9 @@ def _of_model(model: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 def _references(plant: Any, design: LoopDesign) -> dict[str, str]:
     """Return the reference of a plant that each axis follows."""
     plant = getattr(plant, "nominal", plant)
-    if not isinstance(plant, StandardPlant) or not plant.is_assembled:
+    if not isinstance(plant, StandardPlant):
         return {}
-    found = {
-        poi.channel(axis): poi.derived(axis, "ref") for poi, axis in plant.assembled.ports.followed
-    }
+    found = {poi.channel(axis): poi.derived(axis, "ref") for poi, axis in plant.ports.followed}
     return {n: ref for n, ref in found.items() if n in design.axes and ref in plant.y}
 
 

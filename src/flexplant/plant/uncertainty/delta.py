@@ -12,10 +12,11 @@ import numpy as np
 from ...checks import FloatArray, Value
 from ...errors import FlexplantWarning
 from ...lti.statespace import as_statespace
-from ..building import P, rebuilt, sampled
+from ..building import P, sampled
 from ..partition import Partition
 from ..port import ForcePort
 from ..realisation import ModalRealisation, plant_modes
+from ..remade import rebuilt
 from .channels import EvenUnits, Opened, with_parts
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from ...checks import FloatArray, positive, real_array
 from ...errors import ModelError
 from ...tolerances import TINY
-from ..building import rebuilt
 from ..partition import Partition
 from ..realisation import ModalRealisation
+from ..remade import rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts
 from .kind import DEVIATIONS, Known, Uncertainty

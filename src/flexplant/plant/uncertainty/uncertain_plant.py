@@ -147,6 +147,11 @@ class UncertainPlant(Value, Generic[P]):
         plant: Any = self.plant
         return self.replace(plant=plant.at(poi, **positions))
 
+    def select(self, **names: Any) -> Self:
+        """Return the plant with some of its channels with the same uncertainty."""
+        plant: Any = self.plant
+        return self.replace(plant=plant.select(**names))
+
     def through(self, block: Any) -> Any:
         """Return the nominal plant, its uncertainty known, read through a block."""
         nominal: Any = self.nominal

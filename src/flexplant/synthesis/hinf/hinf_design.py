@@ -238,7 +238,7 @@ def _design_one(
         method = method.replace(progress=progress)
     try:
         require_reach(problem)
-        if plant.is_assembled:  # whatever a method makes of it: this motion would drift
+        if plant.modal_blocks.size:  # whatever a method makes of it: this motion would drift
             require_shown(problem)
         found = method.solve(problem)
         answer = _verified(plant, problem, type(method).__name__, found)

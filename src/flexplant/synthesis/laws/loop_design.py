@@ -97,7 +97,7 @@ def axes_of(
     if hasattr(plant, "frdata"):
         plant = Frf.from_control(plant)
     if given is not None:
-        if before is None and after is None and given.is_assembled:
+        if before is None and after is None and given.ports.z:
             axes = decouple(given.machine)
             before, after = axes.to_actuators, axes.to_motions
             errors = [f"{name}:error" for name in after.inputs]
