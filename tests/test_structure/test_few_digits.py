@@ -11,7 +11,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.structure import FEMatrices, FEModel, Spring
-from flexplant.structure.zero_energy import digits_of
+from flexplant.structure.definite import digits_of
 from meshes import dofs_of, solid
 from shared_data import data_file, needs
 

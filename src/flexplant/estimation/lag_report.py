@@ -19,7 +19,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant, standard_plant
 from ..plant.partitioned import require_sampled
-from ..plant.rigid_motion import rigid_rows
+from ..plant.rigid_body import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .filter_model import Sight, Steady

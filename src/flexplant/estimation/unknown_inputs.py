@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ..certificates import Certificate
 from ..checks import FloatArray, Value, checked, instance, positive, sizes_of
-from ..errors import AssumptionError, CertificateError, SolverError, counted
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System

@@ -14,8 +14,8 @@ from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
+from ..structure.definite import digits_of
 from ..structure.matrices import completed
-from ..structure.zero_energy import digits_of
 from .files import USUAL, damaged, file_path, parsing
 from .foreign_parsers import sound
 from .tables import read_dofs

@@ -15,7 +15,7 @@ from ..checks import ComplexArray, FloatArray, Value, name_list, whole
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
-from ..lti.norms import Obstacle, obstacle
+from ..lti.modal_map import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant

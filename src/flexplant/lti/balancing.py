@@ -12,7 +12,8 @@ from ..parallel import one_thread
 from .interconnection import parallel, series
 from .lyapunov import compressed, controllability_factor, observability_factor
 from .modal import StableSplit, split_stable
-from .norms import axis_peak, h2_norm, obstacle, peak_gain
+from .modal_map import obstacle
+from .norms import axis_peak, h2_norm, peak_gain
 from .statespace import StateSpace, System, as_statespace
 
 #: Hankel singular values below this of the largest are rounding

@@ -15,7 +15,7 @@ from .equations import reciprocal, state_scale
 from .joining import block_matrix, is_block_diagonal, joined_blocks
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
-from .norms import DOUBLE, eigenvalues_with_error
+from .modal_map import DOUBLE, eigenvalues_with_error
 from .responses import responses
 from .statespace import StateSpace, System, as_statespace
 

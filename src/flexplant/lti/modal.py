@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, Value, positive
 from ..errors import SolverError, counted
 from .equations import state_scale
 from .joining import block_eigenvalues, is_block_diagonal
-from .norms import eigenvalues_with_error, uncertain_poles
+from .modal_map import eigenvalues_with_error, uncertain_poles
 from .statespace import StateSpace, System, as_statespace
 
 #: speed of a rigid-body pair, relative to A, below which there is none

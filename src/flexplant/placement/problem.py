@@ -15,7 +15,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray, Value
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
-from ..plant.reach_and_sight import ABSENT
+from ..plant.assumptions import ABSENT
 from ..tolerances import SETTLED, divisor
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side

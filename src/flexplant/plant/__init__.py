@@ -73,8 +73,8 @@ Names elsewhere: ``augw``, ``mixsyn``: `mixed_sensitivity`, then `fx.design_hinf
 """
 
 from ..rooms import public_names as _public_names
+from .assumptions import Assumption as Assumption
 from .assumptions import AssumptionReport as AssumptionReport
-from .assumptions import ModeVisibility as ModeVisibility
 from .axes import DrivenAxes as DrivenAxes
 from .axes import driven_axes as driven_axes
 from .decoupling import Decoupling as Decoupling
@@ -89,6 +89,8 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
+from .gravity_axes import GravityAxes as GravityAxes
+from .gravity_axes import gravity_axes as gravity_axes
 from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled
@@ -100,11 +102,8 @@ from .ports import Poi as Poi
 from .ports import Ports as Ports
 from .ports import Reference as Reference
 from .ports import Sensor as Sensor
-from .reach_and_sight import Assumption as Assumption
 from .realisation import FastStates as FastStates
 from .realisation import Feedthrough as Feedthrough
-from .rigid_motion import GravityAxes as GravityAxes
-from .rigid_motion import gravity_axes as gravity_axes
 from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
@@ -132,6 +131,7 @@ from .uncertainty.neglected_modes import neglected_modes as neglected_modes
 from .uncertainty.parameter_amounts import Parameters as Parameters
 from .uncertainty.shape_directions import Shapes as Shapes
 from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
+from .visibility import ModeVisibility as ModeVisibility
 from .weights import StageWeights as StageWeights
 from .weights import mixed_sensitivity as mixed_sensitivity
 from .weights import reference_errors as reference_errors

@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, posit
 from ..errors import AssumptionError, LabelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..tolerances import divisor
-from .partition import Partition
+from .partitioned import Partition
 from .ports import Poi
 from .realisation import natural
 

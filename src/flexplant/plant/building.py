@@ -18,7 +18,7 @@ from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
-from .partition import Partition
+from .partitioned import Partition
 from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural

@@ -13,7 +13,7 @@ from ..lti.statespace import StateSpace
 from ..tolerances import divisor
 from .at_rest import followed_at_rest
 from .axes import DrivenAxes, apart, driven_axes, real_gain
-from .partition import Partition
+from .partitioned import Partition
 
 
 @dataclass(frozen=True, eq=False, repr=False)

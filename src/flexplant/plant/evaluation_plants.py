@@ -11,9 +11,9 @@ from ..errors import LabelError, ModelError, some_names, warn
 from ..tolerances import SAME
 from .building import P, continuous_plant, loud_like, sampled_like
 from .evaluation_model import EvaluationModel
-from .partition import Partition
+from .partitioned import Partition
 from .remade import rebuilt
-from .rigid_motion import rigid_gain, rigid_modes
+from .rigid_body import rigid_gain, rigid_modes
 
 #: relative difference of rigid-body accelerations above which two models are different bodies; an
 #: updated mass stays below it

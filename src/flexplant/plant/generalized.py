@@ -19,7 +19,7 @@ from .building import at_rate
 from .evaluation_model import EvaluationModel
 from .moving import PositionMap, position_map
 from .partitioned import PartitionedSystem
-from .rigid_motion import RigidModes
+from .rigid_body import RigidModes
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 #: fields of the machine, which `replace` changes there

@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, Value, function, instance, number, real_array
 from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_label
-from .assumptions import WEAK, mode_visibility
 from .axes import real_gain
 from .building import P, changed_densities, wired
 from .decoupling import Decoupling, decouple
 from .forces import Actuator, Disturbance
-from .partition import Partition
+from .partitioned import Partition
 from .ports import Poi, Ports, Sensor
 from .remade import rebuilt
 from .scheduling import values_over
+from .visibility import WEAK, mode_visibility
 
 
 @dataclass(frozen=True, eq=False, repr=False)

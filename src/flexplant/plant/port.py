@@ -253,7 +253,7 @@ def checked_port(port: Any) -> dict[str, Any]:
             f"direction, {own!r}. Name the other DOF, "
             f"at='{label.rpartition(':')[0]}:{found['direction']}', or give a point (x, y, z)."
         )
-    if "moves" in given:
+    if given.get("moves") is not None:
         found["moves"] = checked_moves(name, found["at"], given["moves"])
     return found
 

@@ -302,6 +302,12 @@ class Ports(Value):
             "Pass [Position('x', range=(-0.1, 0.1))].",
             least=0,
         )
+        sides = {side: getattr(self, side) for side in "wuzy"}
+        every = [port for ports in sides.values() for port in ports]
+        if not positions and not any(getattr(port, "moves", None) is not None for port in every):
+            require_known("position", self.values, ())
+            self._set(positions=(), values={})
+            return
         known = {one.name: one for one in positions}
         check_names([one.name for one in positions], "positions")
         require_known("position", self.values, known)
@@ -309,8 +315,7 @@ class Ports(Value):
             name: float(one.start if name not in self.values else one.within(self.values[name]))
             for name, one in known.items()
         }
-        sides = {side: getattr(self, side) for side in "wuzy"}
-        require_positions([port for ports in sides.values() for port in ports], positions)
+        require_positions(every, positions)
         there = {side: tuple(port_at(p, values) for p in ports) for side, ports in sides.items()}
         self._set(positions=positions, values=values, **there)
 

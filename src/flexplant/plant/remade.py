@@ -23,7 +23,7 @@ from .building import (
 )
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign, PlantChannel
-from .partition import Partition
+from .partitioned import Partition
 from .ports import Poi, Ports
 from .realisation import ModalRealisation
 

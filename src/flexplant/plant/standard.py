@@ -18,11 +18,11 @@ from .evaluation_model import EvaluationModel
 from .evaluation_plants import check_channels, evaluation_plant, own_plant
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
 from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
-from .partition import Partition
+from .partitioned import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .remade import rebuilt, selected
-from .rigid_motion import RigidModes, rigid_modes_of
+from .rigid_body import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
 from .uncertainty.uncertain_plant import UncertainPlant, uncertain_plant

@@ -42,8 +42,8 @@ from .moving_machine import (
     Trajectory,
     known_positions,
     trajectory,
-    unscheduled,
 )
+from .simulate import unscheduled
 
 #: repetitions of a trajectory after which its errors have to repeat, and to which part
 _REPEATED, _SETTLED = 100, 1e-6

@@ -28,8 +28,8 @@ from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.at_rest import OfS, at_rest, solved
 from ..plant.axes import resting_frequency
 from ..tolerances import divisor
+from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
-from .move_ranges import warn_beyond_ranges
 from .nonlinear_elements import Acts, split_elements
 from .response import Response
 from .simulate import simulate

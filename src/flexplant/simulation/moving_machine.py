@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, instance, real_array
+from ..checks import FloatArray, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.budget import WhiteNoise, continuous_factor, white_noise
@@ -61,13 +61,6 @@ def trajectory(plant: StandardPlant, moving: Mapping[str, Any], time: FloatArray
         for value in (paths[name](ends).min(), paths[name](ends).max()):
             known[name].within(value)
     return Trajectory(tuple(ports.positions), paths, ports.values)
-
-
-def unscheduled(loop: ClosedLoop | ScheduledLoop) -> tuple[ClosedLoop, ScheduledLoop | None]:
-    """Return a loop, that of the standing machine where a schedule is given, and the schedule."""
-    schedule = loop if isinstance(loop, ScheduledLoop) else None
-    own = loop.standing if isinstance(loop, ScheduledLoop) else loop
-    return instance(own, ClosedLoop, "loop", "Pass close_loop(plant, *blocks)."), schedule
 
 
 def known_positions(plant: StandardPlant, what: str) -> tuple[Position, ...]:

@@ -30,11 +30,10 @@ from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
 from ..plant.partitioned import require_sampled
 from ..tolerances import SAME, TYPED
+from .force_warnings import warn_beyond_ranges, warn_of_opposing_forces
 from .motion import SetPointProfile
-from .move_ranges import warn_beyond_ranges
-from .moving_machine import MovingMachine, trajectory, unscheduled
+from .moving_machine import MovingMachine, trajectory
 from .nonlinear_elements import Acting, Acts, split_elements
-from .opposing_forces import warn_of_opposing_forces
 from .response import Response
 from .runs import Conditions, make_runner
 
@@ -534,3 +533,10 @@ def _density_at(asd: Any, freq: FloatArray) -> FloatArray:
     if np.any(values < 0):
         raise ModelError(f"asd must not be negative, got {values.min():.3g}.")
     return np.asarray(values, dtype=np.float64)
+
+
+def unscheduled(loop: ClosedLoop | ScheduledLoop) -> tuple[ClosedLoop, ScheduledLoop | None]:
+    """Return a loop, that of the standing machine where a schedule is given, and the schedule."""
+    schedule = loop if isinstance(loop, ScheduledLoop) else None
+    own = loop.standing if isinstance(loop, ScheduledLoop) else loop
+    return instance(own, ClosedLoop, "loop", "Pass close_loop(plant, *blocks)."), schedule

@@ -406,3 +406,46 @@ def signed(phi: FloatArray) -> FloatArray:
     size = np.abs(phi)
     first = np.argmax(size >= (1 - TYPED) * size.max(axis=0), axis=0)
     return np.asarray(phi * np.where(phi[first, np.arange(phi.shape[1])] < 0, -1.0, 1.0))
+
+
+#: numbers of fewer digits may be exact; those of more cannot be distinguished from computed ones
+_WRITTEN = range(5, 15)
+
+
+#: so many different entries, at least and at most, say with how many digits they were written
+_SAMPLE = (20, 400)
+
+
+#: the part of them that needs every digit: of ten last digits one is zero
+_EVERY_DIGIT = 0.6
+
+
+def digits_of(given: Any) -> int | None:
+    """Return the decimal digits that entries hold, None for double precision."""
+    # rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
+    # digits, in single precision. Entries in double precision that came from a text of few digits
+    # show it: written with as few digits as distinguish them, none has more
+    if not hasattr(given, "dtype"):
+        real_array(given, "K")
+        given = np.asarray(given)
+    kind = np.dtype(given.dtype)
+    if kind.kind not in "fc":
+        return None
+    digits = int(-np.log10(np.finfo(kind).eps / 2))
+    return digits if digits < np.finfo(np.float64).precision else _written_digits(given)
+
+
+def _written_digits(given: Any) -> int | None:
+    """Return with how many digits some numbers were written, None when that does not show."""
+    columns: Any = sp.csc_array
+    held: Any = columns(given).data if sp.issparse(given) else np.ravel(given)
+    entries = np.abs(held.real)
+    step = max(1, entries.size // (20 * _SAMPLE[1]))
+    some = np.unique(entries[::step])
+    some = some[(some > 0) & np.isfinite(some)]
+    if some.size < _SAMPLE[0]:
+        return None
+    chosen = some[:: max(1, some.size // _SAMPLE[1])]
+    count = [len(f"{x!r}".partition("e")[0].replace(".", "").strip("0")) for x in chosen.tolist()]
+    most = max(count)
+    return most if most in _WRITTEN and count.count(most) >= _EVERY_DIGIT * len(count) else None

@@ -26,12 +26,12 @@ from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
-from .definite import SEMIDEFINITE, are_swapped, square, symmetric_matrix
+from .definite import SEMIDEFINITE, are_swapped, digits_of, square, symmetric_matrix
 from .model import FEModel
 from .natural_frequencies import MOST, natural_frequencies
 from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
-from .zero_energy import digits_of, endangered, freed, held_by_rounding, shown_digits
+from .zero_energy import endangered, freed, held_by_rounding, shown_digits
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -21,6 +21,7 @@ from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (
     MatrixLike,
     check_semidefinite,
+    digits_of,
     has_negative_springs,
     slow,
     symmetric_matrix,
@@ -29,7 +30,7 @@ from .definite import (
 )
 from .rigid import Placed, body_motions, force_parts, nearest_free, rigid_body_basis
 from .units import units
-from .zero_energy import digits_of, endangered, held_by_rounding
+from .zero_energy import endangered, held_by_rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -14,8 +14,7 @@ from ..structure.model import FEModel
 from ..tolerances import TINY
 from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
-from .judgement.goodness import chi_square, covariance, is_bad, worst
-from .judgement.identifiability import resolution
+from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual

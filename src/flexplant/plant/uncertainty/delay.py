@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from ...checks import positive
 from ...errors import ModelError
-from ..partition import Partition
+from ..partitioned import Partition
 from .channels import Opened
 from .delta import Delta, MachineParts
 from .kind import Uncertainty

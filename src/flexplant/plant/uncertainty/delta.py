@@ -13,7 +13,7 @@ from ...checks import FloatArray, Value
 from ...errors import FlexplantWarning
 from ...lti.statespace import as_statespace
 from ..building import P, sampled
-from ..partition import Partition
+from ..partitioned import Partition
 from ..port import ForcePort
 from ..realisation import ModalRealisation, plant_modes
 from ..remade import rebuilt

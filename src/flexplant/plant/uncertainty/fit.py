@@ -16,7 +16,7 @@ from ...sparse.symmetric import dense
 from ...tolerances import SAME
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
-from ..partition import Partition
+from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .kind import DEVIATIONS, Known, Uncertainty
 from .mode_delta import (

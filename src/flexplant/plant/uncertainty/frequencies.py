@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..partition import Partition
+from ..partitioned import Partition
 from .delta import Delta
 from .kind import Uncertainty
 from .mode_delta import FrequencyDelta, stated_by_mode

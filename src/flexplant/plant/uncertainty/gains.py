@@ -11,7 +11,7 @@ import numpy as np
 from ...checks import positive
 from ...errors import ModelError, require_known
 from ...lti.statespace import StateSpace
-from ..partition import Partition
+from ..partitioned import Partition
 from .channels import Opened, with_channels
 from .delta import Delta, MachineParts
 from .kind import Uncertainty

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...checks import FloatArray, Value
-from ..partition import Partition
+from ..partitioned import Partition
 from .delta import Delta
 
 #: standard deviations at which a Delta is 1, where nothing else is said

@@ -12,7 +12,7 @@ from ...checks import FloatArray, real_array
 from ...errors import ModelError, require_known, unknown_label
 from ...tolerances import TINY
 from ...updating.matrix_parameters import MatrixParameter
-from ..partition import Partition
+from ..partitioned import Partition
 from ..realisation import MODAL, ModalRealisation
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts, with_changes

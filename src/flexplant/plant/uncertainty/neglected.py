@@ -7,7 +7,7 @@ from typing import Any
 
 from ...checks import whole
 from ...errors import ModelError
-from ..partition import Partition, is_plant
+from ..partitioned import Partition, is_plant
 from .delta import Delta, MachineParts
 from .kind import Uncertainty
 from .neglected_modes import NeglectedModes, neglected_modes

@@ -19,7 +19,7 @@ from ...lti.statespace import StateSpace, System
 from ...tolerances import ROUNDING, TINY
 from ..building import sampled_like
 from ..evaluation_plants import evaluation_plant
-from ..partition import Partition, is_plant
+from ..partitioned import Partition, is_plant
 
 #: a plant and the larger one, without rigid-body motions
 Pair: TypeAlias = tuple[StateSpace, StateSpace]

@@ -16,7 +16,7 @@ from ...sparse.symmetric import dense, orthonormalised
 from ...tolerances import ROUNDING
 from ...updating.parameters import Parameter
 from ..building import continuous_plant
-from ..partition import Partition
+from ..partitioned import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .channels import Opened

@@ -11,7 +11,7 @@ import numpy as np
 from ...checks import FloatArray, positive, real_array
 from ...errors import ModelError
 from ...tolerances import TINY
-from ..partition import Partition
+from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from ..remade import rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each

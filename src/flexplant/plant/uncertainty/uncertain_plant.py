@@ -16,7 +16,7 @@ from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
 from ...updating import ModalUncertainty, UpdateResult
 from ..building import P
-from ..partition import Partition
+from ..partitioned import Partition
 from .channels import Opened, require_exact
 from .delta import Delta, with_changes
 from .fit import Fit

@@ -19,7 +19,7 @@ from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.minimal import minimal
 from ...lti.modal import modal_form
-from ...lti.norms import eigenvalues_with_error
+from ...lti.modal_map import eigenvalues_with_error
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import RANK, ROUNDING, divisor
 

@@ -23,13 +23,17 @@ from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
 from .loop_design import Axes, axes_controller, connected
-from .servo_axis import POWERS, Axis, combinations, gains_at, lines_of
 from .servo_loop import (
+    POWERS,
     TARGET,
+    Axis,
     Reading,
     ServoLaw,
     ServoLoop,
+    combinations,
+    gains_at,
     highest_bandwidth,
+    lines_of,
     observer_system,
     reading_of,
     seeing,

@@ -18,7 +18,7 @@ from ...checks import ComplexArray, FloatArray, Value, generator
 from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
-from ...lti.norms import obstacle
+from ...lti.modal_map import obstacle
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick

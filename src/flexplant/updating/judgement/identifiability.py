@@ -7,27 +7,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import scipy.linalg as la
 
 from ...checks import FloatArray, Value
 from ...errors import counted
-from ...tolerances import TINY, divisor
-from ..family import Point, repeated_groups
+from ...tolerances import TINY
+from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
-from .goodness import LOST
+from .goodness import LOST, resolution
 
 #: correlations beyond this are listed
 CORRELATED = 0.99
-#: a relative change of the data below this part of the relative change of an eigenvalue that the
-#: parameter can cause at most is rounding
-ROUNDING = 1e-12
 #: an eigenvalue that changes by less than this part of what the parts of a combination change it
 #: by does not determine the combination
 CANCELS = 1e-3
-#: part of a combination below which a parameter is not printed in it
-MINOR = 1e-3
 #: number of modes that are named as missing
 NAMED = 3
 
@@ -167,71 +160,6 @@ def identifiability(
         mixed=tuple(mixed),
         missing=_missing_modes(objective, point, names, poor, lost),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Resolution:
-    """What residuals determine of q parameters at a point: a singular value decomposition.
-
-    The sensitivities have columns of length one: ``J diag(1/length) = U diag(values) axes``.
-    """
-
-    values: FloatArray
-    axes: FloatArray
-    #: (q,) one where a parameter is not seen
-    length: FloatArray
-    #: (q,) whether any residual depends on a parameter
-    seen: npt.NDArray[np.bool_]
-
-    @property
-    def clear(self) -> npt.NDArray[np.bool_]:
-        """Which combinations (q,) are determined."""
-        return np.asarray(self.values > LOST * self.values[0])
-
-    def combinations(self, names: Sequence[str]) -> list[str]:
-        """Return the determined combinations in words, each of as few parameters as possible."""
-        # the rows that span them, solved for as many parameters: each of these appears once
-        rows = self.axes[self.clear] * self.length
-        rank = len(rows)
-        pivots = la.qr(self.axes[self.clear], mode="r", pivoting=True)[1][:rank]
-        reduced = np.linalg.solve(rows[:, pivots], rows)
-        felt = np.abs(reduced) / self.length > MINOR / self.length[pivots][:, None]
-        return [
-            " ".join(
-                [
-                    names[pivot],
-                    *(
-                        f"{'-' if reduced[i, j] < 0 else '+'} {abs(reduced[i, j]):.3g} {names[j]}"
-                        for j in np.flatnonzero(felt[i]).tolist()
-                        if j not in pivots
-                    ),
-                ]
-            )
-            for i, pivot in sorted(enumerate(pivots.tolist()), key=lambda pair: pair[1])
-        ]
-
-
-def resolution(
-    objective: Objective, point: Point, pinned: npt.NDArray[np.bool_] | None = None
-) -> Resolution:
-    """Return what the residuals determine at a point; `pinned`: known anyhow, by a prior, say."""
-    J = objective.slopes(point, prior=False)
-    length = np.linalg.norm(J, axis=0)
-    own = np.abs(J).max(initial=0.0) * ROUNDING
-    omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
-    reach = objective.family.strength(omega)
-    # a column far below what the parameter can do to this model is rounding: compared with the
-    # strongest one, and, as a single one is its own strongest, as a relative change of the data
-    strongest = float(np.max(length / reach, initial=0.0))
-    change = np.linalg.norm(J / divisor(objective.size(point)[: len(J)])[:, None], axis=0)
-    # nine decades below the strongest nothing is seen but rounding
-    seen = (length > own) & (length > 1e-9 * strongest * reach)
-    seen &= change > ROUNDING * reach / omega
-    length = np.where(seen, length, 1.0)
-    known = np.eye(seen.size)[[] if pinned is None else pinned]
-    _, s, Vt = np.linalg.svd(np.vstack([np.where(seen, J / length, 0.0), known]))
-    s = np.concatenate([s, np.zeros(seen.size - s.size)])
-    return Resolution(s, Vt, length, seen)
 
 
 def _missing_modes(
