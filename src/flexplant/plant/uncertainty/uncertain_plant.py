@@ -147,10 +147,10 @@ class UncertainPlant(Value, Generic[P]):
         plant: Any = self.plant
         return self.replace(plant=plant.at(poi, **positions))
 
-    def select(self, **names: Any) -> Self:
+    def select(self, *, w: Any = None, u: Any = None, z: Any = None, y: Any = None) -> Self:
         """Return the plant with some of its channels with the same uncertainty."""
         plant: Any = self.plant
-        return self.replace(plant=plant.select(**names))
+        return self.replace(plant=plant.select(w=w, u=u, z=z, y=y))
 
     def through(self, block: Any) -> Any:
         """Return the nominal plant, its uncertainty known, read through a block."""
