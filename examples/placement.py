@@ -41,9 +41,9 @@ SENSORS = [fx.Sensor(f"s{i}", at=place, asd=ENCODER) for i, place in enumerate(G
 PLACES = [(x, y, 0.0) for x in np.linspace(0.1, L - 0.1, 3) for y in np.linspace(0.1, L - 0.1, 3)]
 ACTUATORS = [fx.Actuator(f"a{i}", at=place) for i, place in enumerate(PLACES)]
 #: nobody can measure on the die, nor near its edge
-DIE = fx.structure.Disc((L / 2, L / 2), radius=0.05)
+DIE = fx.placement.Disc((L / 2, L / 2), radius=0.05)
 #: nor here, where a cable is
-CABLE = fx.structure.Rectangle((-0.01, 0.15), (0.25, 0.45))
+CABLE = fx.placement.Rectangle((-0.01, 0.15), (0.25, 0.45))
 #: z at the die, and its rotations at the edge of a field, 13 mm away
 AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 

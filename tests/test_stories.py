@@ -10,7 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse.linalg as spla
 from matplotlib import image
+
+import flexplant as fx
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 STORIES = sorted(EXAMPLES.glob("*.py"))
@@ -153,3 +156,21 @@ def test_from_nastran(example, tmp_path, monkeypatch):
     # files of one's own are taken as they are
     other = story.main(tmp_path / "stage.pch", tmp_path / "stage.bdf")
     np.testing.assert_array_equal(other["modes"].freq, result["modes"].freq)
+
+
+@pytest.mark.slow
+def test_from_skfem(example):
+    """Mass by geometry, frequencies by ARPACK and of a finer mesh."""
+    pytest.importorskip("skfem")
+    story = example("from_skfem")
+    result = story.main()
+    model, freq = result["model"], result["modes"].freq
+    volume = (story.SIDE**2 - np.pi * story.RADIUS**2) * story.DEPTH
+    assert model.mass == pytest.approx(story.DENSITY * volume, rel=2e-3)
+    squares = spla.eigsh(model.K, 12, model.M, sigma=-1e6, return_eigenvectors=False)
+    other = np.sqrt(np.sort(squares)[6:]) / (2 * np.pi)
+    np.testing.assert_allclose(freq[6:12], other, rtol=1e-6)
+    fine = fx.solve_modes(story.model_of(story.plate_with_hole(4, 9)), count=12).freq
+    np.testing.assert_allclose(freq[6:12], fine[6:], rtol=6e-3)
+    assert np.all(fine[6:] < freq[6:12])
+    np.testing.assert_allclose(result["reduced"].modes().freq, freq, rtol=1e-6, atol=1e-6)

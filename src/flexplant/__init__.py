@@ -59,6 +59,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - see what a model of this machine buys: `examples/wafer_stage.py`
 - read matrices of a finite-element program: `examples/from_nastran.py`; an imported solid in six
   axes: `examples/solid_stage.py`
+- mesh a body with holes by scikit-fem: `examples/from_skfem.py`
 - reduce: `examples/reduction_methods.py`, twelve ways in one table
 - solve a large model: `examples/million_dofs.py`
 - identify and update: `examples/measured_frf.py`; a real record: `examples/ruler.py`; the paper's
@@ -154,6 +155,8 @@ lower bound too, by a perturbation that reaches it.
 | ``synthesis.fixed_point`` | gone: `synthesis.write_c` computes in float or double |
 | ``design_hinf_filter``, ``design_minimax_filter`` | `design_kalman`; `plant.uncertain` |
 | ``simulation.certify_speed`` | gone: `simulation.rms_along(..., repeats=True)`, one path |
+| ``kirchhoff_plate(holes=, ribs=)`` | gone: a mesh of scikit-fem, `examples/from_skfem.py` |
+| ``structure.Disc``, ``structure.Rectangle`` | `placement.Disc`, `placement.Rectangle` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

@@ -163,7 +163,7 @@ def made():
         placement.Exchange(),
         placement.BranchAndBound(gap=0.1),
     )
-    disc = structure.Disc((0.1, 0.1), 0.05)
+    disc = fx.placement.Disc((0.1, 0.1), 0.05)
     yield from (
         placement.Excluded(disc),
         placement.ZoneLimits(disc, at_most=1),
@@ -284,8 +284,7 @@ def of_structures():
         0.02, regions={"foot": (0.3, fx.Spring("1:z", 2.0)), "K": (0.1, np.eye(2))}
     )
     yield from (law, *law.regions.values())
-    yield from (fx.structure.Rectangle((0, 0), (1, 1)), fx.structure.Disc((0, 0), 1.0))
-    yield fx.structure.Rib((0, 0), (1, 0), width=0.01, height=0.02)
+    yield from (fx.placement.Rectangle((0, 0), (1, 1)), fx.placement.Disc((0, 0), 1.0))
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
     corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))
     yield corner.dofs.interpolation

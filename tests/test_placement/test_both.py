@@ -12,6 +12,7 @@ from flexplant.modes import solve_modes
 from flexplant.placement import (
     BranchAndBound,
     ClosedLoopH2,
+    Disc,
     Exchange,
     Excluded,
     Exhaustive,
@@ -38,7 +39,7 @@ from flexplant.plant import (
     StandardPlant,
     assemble_plant,
 )
-from flexplant.structure import Disc, FEModel, ModalDamping
+from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import design_h2
 from placement_plate import plate_modes
 

@@ -11,6 +11,7 @@ from flexplant.placement import (
     BranchAndBound,
     Budget,
     CountLimits,
+    Disc,
     Exchange,
     Excluded,
     Exhaustive,
@@ -20,6 +21,7 @@ from flexplant.placement import (
     OffPoi,
     PoiLqr,
     PoiVariance,
+    Rectangle,
     ZoneLimits,
     place_actuators,
     place_sensors,
@@ -27,7 +29,6 @@ from flexplant.placement import (
 )
 from flexplant.placement.problem import layouts_of
 from flexplant.plant import Poi, Sensor
-from flexplant.structure import Disc, Rectangle
 
 GRID = [(x, y, 0.0) for x in (0.0, 0.2, 0.3, 0.5) for y in (0.0, 0.175, 0.35)]
 COSTS = {0: 5.0, 2: 4.0, 9: 3.0, 11: 3.0}

@@ -5,9 +5,8 @@ import pytest
 
 from flexplant import load
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
-from flexplant.placement import Excluded, PoiVariance, sensor_map
+from flexplant.placement import Disc, Excluded, PoiVariance, Rectangle, sensor_map
 from flexplant.plant import Sensor
-from flexplant.structure import Disc, Rectangle
 
 GRID = np.array([(x, y, 0.0) for y in (0.0, 0.2, 0.35) for x in (0.0, 0.25, 0.5)])
 

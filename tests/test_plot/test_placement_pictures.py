@@ -5,9 +5,8 @@ import pytest
 
 from flexplant import plot
 from flexplant.errors import ModelError
-from flexplant.placement import Exchange, PoiVariance, pareto_curve, place_sensors, sensor_map
+from flexplant.placement import Disc, Exchange, PoiVariance, pareto_curve, place_sensors, sensor_map
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
-from flexplant.structure import Disc
 from placement_plate import SIZE, plate_modes
 
 

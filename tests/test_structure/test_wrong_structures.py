@@ -59,8 +59,6 @@ CALLS = [
     ("plate elements", lambda x: of_plate(elements=x), ()),
     ("plate density", lambda x: of_plate(density=x), ("fraction",)),
     ("plate poisson_ratio", lambda x: of_plate(poisson_ratio=x), ()),
-    ("plate holes", lambda x: of_plate(holes=x), ("none",)),
-    ("plate ribs", lambda x: of_plate(ribs=x), ()),
     ("beam length", lambda x: of_beam(length=x), ("fraction",)),
     ("beam elements", lambda x: of_beam(elements=x), ()),
     ("beam inertia", lambda x: of_beam(inertia=x), ("fraction",)),
@@ -142,7 +140,7 @@ def test_wrong_kinds_are_refused_with_a_next_step(function):
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("option", ["thickness", "density", "poisson_ratio", "holes"])
+@pytest.mark.parametrize("option", ["thickness", "density", "poisson_ratio"])
 def test_a_function_of_too_few_arguments_is_told_what_it_is_asked(option):
     with pytest.raises(
         ModelError, match=rf"{option} is evaluated at the centre \(x, y\).*lambda x, y"

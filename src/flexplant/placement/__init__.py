@@ -73,5 +73,7 @@ from .wrapping import LeftOutModes as LeftOutModes
 from .wrapping import OverMachines as OverMachines
 from .wrapping import OverPositions as OverPositions
 from .wrapping import Penalised as Penalised
+from .zones import Disc as Disc
+from .zones import Rectangle as Rectangle
 
 __dir__ = _public_names(__name__)

@@ -14,8 +14,8 @@ from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..plant.origins import PlantChannel as PlantChannel
 from ..plant.partitioned import require_sampled
 from ..plant.scheduling import port_at, require_positions
-from ..structure import Disc, Rectangle
 from ..tolerances import TYPED
+from .zones import Zone
 
 Port: TypeAlias = SensorPort | Actuator | PlantChannel
 
@@ -82,9 +82,6 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
                 "Rename one."
             )
     return found
-
-
-Zone = Rectangle | Disc
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,10 +25,10 @@ from ..checks import (
     whole,
 )
 from ..errors import LabelError, ModelError, some_names
-from ..structure import Disc
 from ..tolerances import TINY
-from .candidates import Places, Zone
+from .candidates import Places
 from .convex import Branch, chosen_rows
+from .zones import Disc, Zone
 
 #: what rounding may have added to a sum
 _SLACK = 1e-9
@@ -352,7 +352,7 @@ def _checked_zones(given: Any, name: str) -> tuple[Zone, ...]:
         if not isinstance(zone, Zone):
             raise ModelError(
                 f"{name} is a Rectangle or a Disc, got {short(zone)}. Type "
-                "fx.structure.Disc((0.3, 0.3), radius=0.05)."
+                "fx.placement.Disc((0.3, 0.3), radius=0.05)."
             )
     if not listed:
         raise ModelError(f"there is no zone: {name} is a Rectangle or a Disc. Give one.")
@@ -372,7 +372,7 @@ class Excluded(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> first_mass = fx.structure.Disc((0.0, 0.0), radius=0.5)
+    >>> first_mass = fx.placement.Disc((0.0, 0.0), radius=0.5)
     >>> off = fx.placement.Excluded(first_mass)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=off).chosen
     ('y2',)
@@ -446,7 +446,7 @@ class ZoneLimits(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> right = fx.placement.ZoneLimits(fx.structure.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
+    >>> right = fx.placement.ZoneLimits(fx.placement.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=right).chosen
     ('y2',)
     """

@@ -14,12 +14,12 @@ from ..checks import FloatArray, IntArray, Value, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted
 from ..plant import Sensor, StandardPlant
 from ..plant.port import Quantity
-from ..structure import Disc, Rectangle
 from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
 from .constraints import Constraint, all_of, constraint_rows, constraints_of
 from .criterion import Criterion, in_words
 from .problem import Placement, layouts_of
+from .zones import Zone
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -356,7 +356,7 @@ class SensorMap(Value):
     values: FloatArray
     without: float
     criterion: str
-    excluded: Sequence[Rectangle | Disc] = ()
+    excluded: Sequence[Zone] = ()
     unit: str = ""
 
     def __repr__(self) -> str:

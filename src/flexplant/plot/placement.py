@@ -14,11 +14,11 @@ from matplotlib.patches import Rectangle as Box
 
 from ..checks import FloatArray, IntArray, in_unit, instance, whole
 from ..errors import ModelError
-from ..placement import ParetoCurve, SensorMap
-from ..placement.candidates import Zone, candidate_places
+from ..placement import Disc, ParetoCurve, SensorMap
+from ..placement.candidates import candidate_places
 from ..placement.mode_shapes import shapes_of
+from ..placement.zones import Zone
 from ..plant import Ports, PositionMap, StandardPlant
-from ..structure import Disc
 from ._axes import (
     BLUE,
     CYCLE,

@@ -3,8 +3,8 @@ r"""What the machine is: finite-element matrices with labelled degrees of freedo
 An `FEModel` holds M, D and K with the DOFs they belong to; ``"41:z"`` is the motion of node 41 in
 z. It is read from files (`fx.read_model`), or meshed here:
 
-- `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `chain`,
-  `solid_block`: meshes.
+- `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), both with fields of thickness
+  and modulus; `beam`, `chain`, `solid_block`: meshes.
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
 - `ModalDamping` (of measured poles too), `Rayleigh`, `Hysteretic` (loss factors, by region too).
 - `check`: symmetry, definiteness, rigid-body motions, mechanisms, mass: what is wrong with a model.
@@ -34,9 +34,6 @@ from .attachments import Spring as Spring
 from .damping import Damping as Damping
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
-from .grid_fields import Disc as Disc
-from .grid_fields import Rectangle as Rectangle
-from .grid_fields import Rib as Rib
 from .hysteretic import Hysteretic as Hysteretic
 from .hysteretic import LossRegion as LossRegion
 from .inspection import ModelCheck as ModelCheck

@@ -45,20 +45,6 @@ def beam_mass(length: float) -> FloatArray:
     return _mirror_upper(half * h / 420)
 
 
-def beam_rotary(length: float) -> FloatArray:
-    """Return the inertia (4, 4) of the cross sections turning with the slope, for rho I = 1."""
-    h = length
-    half = np.array(
-        [
-            [36, 3 * h, -36, 3 * h],
-            [0, 4 * h**2, -3 * h, -(h**2)],
-            [0, 0, 36, -3 * h],
-            [0, 0, 0, 4 * h**2],
-        ]
-    )
-    return _mirror_upper(half / (30 * h))
-
-
 def plate_terms(s: Any, t: Any, dp: int, dq: int) -> FloatArray:
     """Return the d^dp/ds^dp d^dq/dt^dq derivatives (..., 12) of the terms s^p t^q."""
     return _monomials(_P, s, dp) * _monomials(_Q, t, dq)

@@ -79,8 +79,6 @@ class PlateShape(GridShape):
         Points between the two surfaces belong to the plate.
     elements : (int, int)
         Number of elements in x and y.
-    present : (ny, nx) array of bool, optional
-        Which elements exist; None: all.
 
     Examples
     --------
@@ -93,10 +91,9 @@ class PlateShape(GridShape):
     size: tuple[float, float]
     thickness: float | FloatArray
     elements: tuple[int, int]
-    present: Any = None
 
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
-        return self.elements, self.present, 3
+        return self.elements, None, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all DOFs in the motion z, rx or ry at a point.
@@ -109,7 +106,7 @@ class PlateShape(GridShape):
         slack = SAME * max(self.size)
         if not _is_inside(point[:2], self.size, slack):
             raise self._off(point, float(np.max(self.thickness)))
-        element, (s, t), _ = self._located(point, self.size, lambda: self._in_hole(point))
+        element, (s, t), _ = self._located(point, self.size, lambda: LabelError("no element"))
         thick: Any = self.thickness
         depth = thick if np.ndim(thick) == 0 else float(thick[element[::-1]])
         if abs(point[2]) > 0.5 * depth + slack:
@@ -136,9 +133,9 @@ class PlateShape(GridShape):
         place = np.where(np.abs(place - nearest) < SAME * count, nearest, place)
         x, y = element = np.minimum(place.astype(np.int64), count - 1).T
         slack = SAME * max(self.size)
-        depth = np.broadcast_to(np.asarray(self.thickness), grid.present.shape)[y, x]
+        depth = np.broadcast_to(np.asarray(self.thickness), tuple(count[::-1]))[y, x]
         plain = np.all((points[:, :2] >= -slack) & (points[:, :2] <= size + slack), axis=1)
-        plain &= grid.present[y, x] & (np.abs(points[:, 2]) <= 0.5 * depth + slack)
+        plain &= np.abs(points[:, 2]) <= 0.5 * depth + slack
         found = np.zeros((len(points), grid.n_dof))
         if plain.any() and direction in ("z", "rx", "ry"):
             s, t = (place.T - element)[:, plain]
@@ -149,7 +146,7 @@ class PlateShape(GridShape):
             )
         else:
             plain[:] = False
-        for i in np.flatnonzero(~plain):  # at holes and off the plate
+        for i in np.flatnonzero(~plain):  # off the plate
             found[i] = self.row(points[i], direction)
         return found
 
@@ -158,15 +155,6 @@ class PlateShape(GridShape):
             f"the point {tuple(point.tolist())} is off the plate, which reaches from "
             f"(0, 0) to ({self.size[0]:g}, {self.size[1]:g}) m at |z| <= "
             f"{0.5 * depth:g} m: its motion is not known. Coordinates are in metres."
-        )
-
-    def _in_hole(self, point: FloatArray) -> LabelError:
-        nodes = self._grid.nodes
-        xy = self._grid.coordinates(self.size)
-        near = int(np.argmin(np.linalg.norm(xy - point[:2], axis=1)))
-        return LabelError(
-            f"the point {tuple(point.tolist())} is in a hole of the plate: nothing moves there. "
-            f"The nearest node is {nodes[near] + 1}, at {tuple(xy[near].tolist())} m."
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ import scipy.sparse as sp
 from ..checks import (
     FloatArray,
     frozen,
-    members,
     one_of,
     positive,
     positive_array,
@@ -30,20 +29,7 @@ from .element_matrices import (
     plate_mass,
     plate_stiffness,
 )
-from .grid_fields import (
-    Field,
-    Hole,
-    Rib,
-    Skin,
-    counts_of,
-    dofs_of,
-    field_of,
-    lengths_of,
-    poisson_of,
-    present_of,
-    rib_matrices,
-    share_of,
-)
+from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
 from .model import FEModel
 from .shapes import BeamShape, BlockShape
 from .shapes import PlateShape as PlateShape
@@ -247,8 +233,6 @@ def kirchhoff_plate(
     density: Field,
     youngs_modulus: Field,
     poisson_ratio: Field,
-    holes: Iterable[Hole] | Hole | FloatArray | Callable[[float, float], bool] | None = None,
-    ribs: Iterable[Rib] | Rib = (),
     name: str | None = None,
 ) -> FEModel:
     """Return a free rectangular thin plate in bending: no shear, no rotary inertia (`plate` has).
@@ -256,8 +240,7 @@ def kirchhoff_plate(
     Four-node non-conforming elements with the complete cubic and x^3 y, x y^3 (Adini, Clough and
     Melosh), stiffness and consistent mass integrated exactly. The plate lies in the x-y plane with
     one corner at the origin and its middle plane at z = 0. Nodes are numbered from 1, x fastest;
-    each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad]. Beside holes, nodes keep the numbers
-    of the full plate.
+    each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad].
 
     Thickness and material are one number, an array (nx, ny) with one for each element, or a
     function of the centre (x, y) of an element.
@@ -274,12 +257,6 @@ def kirchhoff_plate(
     youngs_modulus : float, (nx, ny) array or function [Pa]
     poisson_ratio : float, (nx, ny) array or function [-]
         Above -1 and below 0.5.
-    holes : Rectangle, Disc, list of them, (nx, ny) array of bool or function of (x, y), optional
-        Which elements are missing (True). Elements that the edge of a Rectangle or Disc cuts have
-        their stiffness and mass times the part of their area that is left: frequencies of a plate
-        with a disc of a third of its length are within 0.4 % at 24 x 16 elements, 0.2 % at 48 x 32.
-    ribs : Rib or list of them
-        Beams along edges of elements.
     name : str, optional
 
     Returns
@@ -290,8 +267,7 @@ def kirchhoff_plate(
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, there is not one for each element, the plate falls apart, or
-        a rib is not along edges.
+        When a number is not physical, or there is not one for each element.
 
     Examples
     --------
@@ -300,30 +276,18 @@ def kirchhoff_plate(
     <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
     """
     lengths, counts = lengths_of(size, 2), counts_of(elements, 2)
-    if isinstance(holes, Iterator | Set):
-        holes = list(holes)
-    present = present_of(holes, lengths, counts, corners=True)
-    skin = Skin(
-        field_of(thickness, "thickness", lengths, counts, present),
-        field_of(density, "density", lengths, counts, present),
-        field_of(youngs_modulus, "youngs_modulus", lengths, counts, present),
-        poisson_of(poisson_ratio, lengths, counts, present),
-    )
-    there = np.ones(counts[::-1], dtype=bool) if present is None else present
-    grid = Grid(counts, 3, there)
+    h = field_of(thickness, "thickness", lengths, counts)
+    rho = field_of(density, "density", lengths, counts)
+    E = field_of(youngs_modulus, "youngs_modulus", lengths, counts)
+    nu = poisson_of(poisson_ratio, lengths, counts)
+    grid = Grid(counts, 3, np.ones(counts[::-1], dtype=bool))
     a, b = lengths[0] / counts[0], lengths[1] / counts[1]
-    share = share_of(holes, lengths, counts)
-    M = grid.matrix([(plate_mass(a, b), share * skin.density * skin.thickness)])
-    bending = share * skin.youngs_modulus * skin.thickness**3 / (12 * (1 - skin.poisson_ratio**2))
-    K = grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, skin.poisson_ratio))
-    listed = _ribs(ribs)
-    if listed:
-        M, K = rib_matrices(grid, lengths, skin, listed, M, K)
-    shape = PlateShape((lengths[0], lengths[1]), skin.thickness, (counts[0], counts[1]), present)
+    bending = E * h**3 / (12 * (1 - nu**2))
+    shape = PlateShape((lengths[0], lengths[1]), h, (counts[0], counts[1]))
     # sums of definite elements are definite: nothing to check again
     return FEModel._proven(
-        M=M,
-        K=K,
+        M=grid.matrix([(plate_mass(a, b), rho * h)]),
+        K=grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, nu)),
         D=None,
         dofs=dofs_of(grid, lengths, ("z", "rx", "ry"), shape),
         name="plate" if name is None else name,
@@ -335,12 +299,6 @@ def _plate_stiffness(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any
     if np.ndim(nu) == 0:
         return [(plain + nu * cross, bending)]
     return [(plain, bending), (cross, bending * nu)]
-
-
-def _ribs(ribs: Any) -> list[Rib]:
-    listed = [ribs] if isinstance(ribs, Rib) else ribs
-    hint = "Rib((0, 0.3), (0.6, 0.3), width=0.01, height=0.02), say."
-    return list(members(listed, Rib, "ribs", hint, least=0))
 
 
 def solid_block(
@@ -390,10 +348,10 @@ def solid_block(
     <FEModel 'block': 120 DOFs, sparse, 6 rigid-body motions, D not given>
     """
     lengths, counts = lengths_of(size, 3), counts_of(elements, 3)
-    present = present_of(holes, lengths, counts, corners=False)
+    present = present_of(holes, lengths, counts)
     rho = field_of(density, "density", lengths, counts, present)
     E = field_of(youngs_modulus, "youngs_modulus", lengths, counts, present)
-    nu = poisson_of(real_array(poisson_ratio, "poisson_ratio", ()).item(), lengths, counts, present)
+    nu = poisson_of(real_array(poisson_ratio, "poisson_ratio", ()).item(), lengths, counts)
     there = np.ones(counts[::-1], dtype=bool) if present is None else present
     grid = Grid(counts, 3, there)
     a, b, c = (n / k for n, k in zip(lengths, counts, strict=True))

@@ -22,7 +22,7 @@ class ThickPlateShape(PlateShape):
 
     Parameters
     ----------
-    size, thickness, elements, present
+    size, thickness, elements
         As for `PlateShape`.
     softness : float or (ny, nx) array [m^2]
         Bending stiffness over shear stiffness of the elements; 0: nothing shears.
@@ -124,7 +124,7 @@ def plate(
             (youngs_modulus, "youngs_modulus"),
         )
     )
-    nu = poisson_of(poisson_ratio, lengths, counts, None)
+    nu = poisson_of(poisson_ratio, lengths, counts)
     soft = 0.0
     if shear_factor is not None:  # E h^3 / 12 (1 - nu^2) over k E h / 2 (1 + nu)
         soft = h**2 / (6.0 * positive(shear_factor, "shear_factor") * (1.0 - nu))
