@@ -220,7 +220,6 @@
    Hall, 1992.
 .. [Tibshirani1996] Tibshirani, Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B
    58, 1996.
-.. [TimoshenkoGoodier1970] Timoshenko, Goodier, Theory of Elasticity, 3rd ed., McGraw-Hill, 1970.
 .. [TombsPostlethwaite1987] Tombs, Postlethwaite, Truncated balanced realization of a stable
    non-minimal state-space system, Int. J. Control 46, 1987.
 .. [vanderSeijs2013] van der Seijs, van den Bosch, Rixen, de Klerk, An improved methodology for the
@@ -241,7 +240,5 @@
 .. [WolkowiczStyan1980] Wolkowicz, Styan, Bounds for eigenvalues using traces, Linear Algebra Appl.
    29, 1980.
 .. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.
-.. [YoungBudynas2002] Young, Budynas, Roark's Formulas for Stress and Strain, 7th ed., McGraw-Hill,
-   2002.
 .. [ZhouDoyleGlover1996] Zhou, Doyle, Glover, Robust and Optimal Control, Prentice Hall, 1996.
 """
