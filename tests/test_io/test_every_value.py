@@ -279,11 +279,7 @@ def of_structures():
     bar = fx.beam(length=1.0, elements=2, area=1e-4, inertia=1e-9, **steel)
     yield bar.fixed(["1:z"]).dofs.interpolation
     yield from (fx.PointMass((0.1, 0, 0), 0.5, inertia=0.1), fx.Damper("1:z", 2.0))
-    yield from (fx.Spring("1:z", 2.0, to="2:z"), fx.structure.Hysteretic(0.02))
-    law = fx.structure.Hysteretic(
-        0.02, regions={"foot": (0.3, fx.Spring("1:z", 2.0)), "K": (0.1, np.eye(2))}
-    )
-    yield from (law, *law.regions.values())
+    yield fx.Spring("1:z", 2.0, to="2:z")
     yield from (fx.placement.Rectangle((0, 0), (1, 1)), fx.placement.Disc((0, 0), 1.0))
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
     corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))

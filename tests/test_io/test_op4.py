@@ -178,7 +178,11 @@ def test_digits_and_names(op4, tmp_path):
     with pytest.raises(ModelError, match="none of which has a usual name"):
         read_op4(path)
     op4.write(path, {"KAA": K * (1 + 0.1j)})
-    with pytest.raises(ModelError, match="complex"):
+    lossy = read_op4(path)
+    np.testing.assert_allclose(lossy.K.toarray(), K)
+    assert lossy.loss_factor == pytest.approx(0.1)
+    op4.write(path, {"KAA": K, "MAA": np.eye(2) * 1j})
+    with pytest.raises(ModelError, match=r"MAA.*complex"):
         read_op4(path)
 
 

@@ -1,7 +1,6 @@
 """Damping laws."""
 
 import pickle
-import warnings
 
 import numpy as np
 import pytest
@@ -9,12 +8,10 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 import flexplant as fx
-import oracles_grids as grids
-import oracles_structure as oracle
 from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.modes import solve_modes
-from flexplant.structure import Hysteretic, LossRegion, ModalDamping, Rayleigh, chain
+from flexplant.structure import FEMatrices, ModalDamping, Rayleigh, chain
 
 
 def test_modal_damping():
@@ -126,7 +123,7 @@ def test_bad_fits(freq, zeta, error, says):
 def test_rigid_body_modes_are_damped_only_when_asked():
     model = chain(masses=[1, 2, 3], stiffnesses=[5e3, 7e3])
     M, R = model.M.toarray(), model.rigid_body
-    for quiet in (ModalDamping(0.02), Rayleigh(2.0, 1e-3), Hysteretic(0.04)):
+    for quiet in (ModalDamping(0.02), Rayleigh(2.0, 1e-3)):
         D = model.with_damping(quiet).D
         assert np.abs(D @ R).max() < 1e-12 * np.abs(D).max()
     drag = model.with_damping(ModalDamping(0.02, rigid=3.0)).D
@@ -151,124 +148,10 @@ def held_chain():
     return chain(masses=[1, 2, 1.5], stiffnesses=[5e4, 7e4], ground=[3e4, 0, 1e4])
 
 
-def test_hysteretic_is_half_the_loss_factor():
-    law = Hysteretic(0.06)
-    np.testing.assert_array_equal(law.zeta([0.0, 3.0, 9.0]), [0, 0.03, 0.03])
-    assert repr(law) == "Hysteretic(loss_factor=0.06)"
-    model = held_chain()
-    M, K = model.M.toarray(), model.K.toarray()
-    expected = oracle.modal_damping_matrix(M, K, 0.03, n_rigid=0)
-    np.testing.assert_allclose(model.with_damping(law).D, expected, atol=1e-12 * expected.max())
-
-
-def test_the_error_of_the_equivalence_is_that_of_dense_responses():
-    """One mass: equality at every frequency. Three: a bound that is not idle."""
-    eta, freq = 0.08, np.linspace(1.0, 90.0, 200)
-    law = Hysteretic(eta)
-    k, m = 4e4, 1.7
-    natural = np.sqrt(k / m) / 2 / np.pi
-    w = 2 * np.pi * freq
-    true = 1 / (k * (1 + 1j * eta) - m * w**2)
-    ours = 1 / (k - m * w**2 + 1j * w * eta * np.sqrt(k * m))
-    np.testing.assert_allclose(
-        law.error(freq, [natural])[:, 0], np.abs(ours / true - 1), rtol=1e-9, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        law.response_error(freq, [natural], [1 / m]), np.abs(ours - true), rtol=1e-9, atol=1e-15
-    )
-    assert law.error([0.0], [natural]) == pytest.approx(eta)
-    assert law.error([natural], [natural]) == pytest.approx(0, abs=1e-12)
-
-    model = held_chain()
-    M, K = model.M.toarray(), model.K.toarray()
-    out, force = np.eye(3)[0], np.eye(3)[2]
-    true = grids.receptance(M, 0 * M, K * (1 + 1j * eta), out, force, freq)
-    ours = grids.receptance(M, model.with_damping(law).D, K, out, force, freq)
-    omega, phi = oracle.undamped(M, K, 0)
-    bound = law.response_error(freq, omega / 2 / np.pi, phi[0] * phi[2])
-    error = np.abs(ours - true)
-    assert np.all(error <= bound * (1 + 1e-9))
-    assert np.median(error / bound) > 0.5
-
-
-def test_without_loss_there_is_no_error():
-    np.testing.assert_array_equal(Hysteretic(0.0).error([0, 5.0, 7.0], [5.0]), 0)
-
-
-def test_bad_loss_factors():
-    for eta in (-0.1, 2.0, np.nan, "a"):
-        with pytest.raises(ModelError, match="loss_factor"):
-            Hysteretic(eta)
-    with pytest.raises(ModelError, match="negative"):
-        Hysteretic(0.1).error([-1.0], [1.0])
-    with pytest.raises(ShapeError, match="gains"):
-        Hysteretic(0.1).response_error([1.0], [1.0, 2.0], [1.0])
-
-
-def test_loss_factors_by_region():
-    """A plate of which a part and the feet have their own, by the dense complex eigenproblem."""
-
-    def build(E):
-        return fx.kirchhoff_plate(
-            size=(0.6, 0.4), thickness=0.02, elements=(3, 2), density=2702, youngs_modulus=E,
-            poisson_ratio=0.3,
-        )  # fmt: skip
-
-    E, mask = np.full((3, 2), 70e9), np.array([[True, True], [False, False], [False, False]])
-    feet = [fx.Spring(at, 2e5) for at in ((0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0.6, 0.4, 0))]
-    model = build(E).with_parts(feet)
-    left = LossRegion.of_elements(0.02, build, mask, youngs_modulus=E)
-    law = Hysteretic(0.001, regions={"left": left, "feet": (0.3, feet)})
-    assert repr(law).startswith("Hysteretic(loss_factor=0.001, regions={'left': LossRegion(")
-    K, M = model.K.toarray(), model.M.toarray()
-    soft = sum(2e5 * np.outer(*2 * [model.row(foot.at)]) for foot in feet)
-    part = (build(E * (1 + mask)).K - build(E).K).toarray()
-    H = 0.3 * soft + 0.02 * part + 0.001 * (K - soft - part)
-    squares = la.eigvals(K + 1j * H, M)
-    squares = squares[np.argsort(squares.real)][:9]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        modes = solve_modes(model, count=9, damping=law)
-    np.testing.assert_allclose(2 * modes.zeta, squares.imag / squares.real, rtol=0.01)
-    assert modes.zeta[0] > 10 * modes.zeta[-1]
-    # the error that is known: strain energy beside the coupled modes, here all of them
-    whole = solve_modes(model, damping=ModalDamping(0.0))
-    errors = law.coupling_errors(whole.omega, whole.phi, model.dofs)[:9]
-    own = 2 * law.ratios(whole.omega, whole.phi, K, model.dofs)[:9]
-    true = squares.imag / squares.real
-    np.testing.assert_allclose(errors, np.abs(own / true - 1), rtol=1e-6, atol=1e-9)
-    assert 1e-4 < modes.certificate["loss_coupling"] < 0.01
-    # the same ratios in time, by D, and in reduced models
-    damped = solve_modes(model.with_damping(law), count=9)
-    np.testing.assert_allclose(damped.zeta, modes.zeta, rtol=1e-6)
-    for method in (
-        fx.reduction.Rubin(["1:z"], 9, damping=law),
-        fx.reduction.ModalTruncation(9, damping=law),
-    ):
-        np.testing.assert_allclose(fx.reduce(model, method).modes().zeta[:9], modes.zeta, rtol=1e-6)
-    boxed = fx.reduce(model, fx.reduction.CraigBampton(["1:z", "12:z"], 25, damping=law))
-    np.testing.assert_allclose(boxed.modes().zeta[:6], modes.zeta[:6], rtol=0.01)
-    # modes of near frequencies are coupled most
-    square = fx.chain(masses=[1.0, 1.0], stiffnesses=[1.0], ground=[1e5, 1e5])
-    one = Hysteretic(0.001, regions={"one": (0.1, fx.Spring("1:x", 1e5))})
-    with pytest.warns(FlexplantWarning, match=r"the loss factor of mode [12] at 50.3\d* Hz"):
-        solve_modes(square, damping=one)
-    with pytest.raises(ModelError, match=r"feet' and those before it hold 1.* they overlap"):
-        solve_modes(model, damping=Hysteretic(0.0, regions={"a": (0.1, K), "feet": (0.1, feet)}))
-    with pytest.raises(ModelError, match="by where it bends"):
-        law.zeta([1.0])
-    with pytest.raises(ShapeError, match="shape \\(2, 2\\), the structure has"):
-        solve_modes(model, damping=Hysteretic(0.0, regions={"a": (0.1, np.eye(2))}))
-    with pytest.raises(ModelError, match=r"must be \(loss factor, stiffness\)"):
-        Hysteretic(0.0, regions={"feet": 0.3})
-    with pytest.raises(ModelError, match="at least one Spring"):
-        Hysteretic(0.0, regions={"feet": (0.3, [])})
-
-
 def test_laws_in_solve_modes():
     model = held_chain()
     for law, zeta in (
-        (Hysteretic(0.04), [0.02] * 3),
+        (ModalDamping(0.02), [0.02] * 3),
         (
             ModalDamping.from_measured([-3 + 200j], modes=[2], others=0.01),
             [0.01, 3 / 200.0225, 0.01],
@@ -310,3 +193,22 @@ def test_damped_rigid_body_motions_go_all_the_way_into_a_plant(law, rate):
     slow = plant.system.poles()
     assert np.sort(slow[np.abs(slow) < 10].real) == pytest.approx([-rate] * 3 + [0] * 3, abs=1e-6)
     assert fx.design_kalman(plant.discretized(rate=10e3, delay=1)).rms("die:z") > 0
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_a_complex_stiffness_is_read_as_half_its_loss_factor(kind):
+    """Modes of ``K (1 + i eta)`` by the dense complex eigenproblem."""
+    eta, model = 0.04, held_chain()
+    K, M = model.K.toarray(), model.M.toarray()
+    given = K * (1 + 1j * eta)
+    read = FEMatrices(sp.csc_array(given) if kind == "sparse" else given, M, dofs=model.dofs)
+    np.testing.assert_array_equal(read.K.toarray(), K)
+    assert read.loss_factor == pytest.approx(eta)
+    assert "damping=fx.ModalDamping(0.02)" in read.notes[-1]
+    with pytest.warns(FlexplantWarning, match=r"loss factor of 0\.04 is read .* ratio of 0\.02"):
+        again = read.converted("mm", "t", "s").model()
+    modes = solve_modes(again, damping=ModalDamping(read.loss_factor / 2))
+    squares = la.eigvals(1e3 * given, 1e3 * M)
+    true = np.sort(squares.imag / squares.real)
+    np.testing.assert_allclose(2 * modes.zeta, true, rtol=1e-9)
+    assert FEMatrices(K, M, dofs=model.dofs).loss_factor == 0.0

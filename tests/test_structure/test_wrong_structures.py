@@ -91,7 +91,6 @@ CALLS = [
     ("ModalDamping rigid", lambda x: fx.ModalDamping(0.01, rigid=x), ("fraction",)),
     ("Rayleigh", lambda x: fx.structure.Rayleigh(x, 0.0), ("fraction",)),
     ("Rayleigh rigid", lambda x: fx.structure.Rayleigh(1.0, 0.0, rigid=x), ("bool",)),
-    ("Hysteretic", lambda x: fx.structure.Hysteretic(x), ()),
     ("reduce", lambda x: fx.reduce(x, fx.reduction.Guyan(["1:z"])), ()),
     ("reduce method", lambda x: fx.reduce(plate(), x), ()),
     ("Guyan", lambda x: fx.reduce(plate(), fx.reduction.Guyan(x)), ()),

@@ -430,7 +430,7 @@ def read_op4(
     FlexplantError
         When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
     ModelError
-        When which matrix is meant is not clear, or it is complex.
+        When which matrix is meant is not clear, or M or D is complex.
 
     Notes
     -----
@@ -454,7 +454,8 @@ def read_op4(
     found = _read(path)
     given = {"stiffness": stiffness, "mass": mass, "damping": damping}
     chosen = named_matrices(found, given, _ENDINGS, str(path))
-    K, M, D = (_real_matrix(found, name, path) for name in chosen)
+    K = _named_matrix(found, chosen[0], path, stiffness=True)
+    M, D = (_named_matrix(found, name, path) for name in chosen[1:])
     assert K is not None  # noqa: S101 - its name is known
     M, D = (None if _is_absent(part, K.shape[0]) else part for part in (M, D))
     digits = found[str(chosen[0])][2]
@@ -505,14 +506,17 @@ def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
     return matrix is None or (n > 1 and matrix.shape == (1, 1) and not matrix.count_nonzero())
 
 
-def _real_matrix(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
+def _named_matrix(
+    found: dict[str, Any], name: str | None, path: str | Path, *, stiffness: bool = False
+) -> sp.csc_array | None:
+    """Return a matrix, both triangles; that of the stiffness may be complex."""
     if name is None:
         return None
     matrix, form, _ = found[name]
-    if np.iscomplexobj(matrix):
+    if np.iscomplexobj(matrix) and not stiffness:
         raise ModelError(
-            f"matrix {name} of {str(path)!r} is complex: a structure's M, D and K are real. "
-            "Structural damping belongs into a damping matrix; read_op4_matrices reads it."
+            f"matrix {name} of {str(path)!r} is complex: a structure's M and D are real. "
+            "read_op4_matrices reads it."
         )
     sparse = sp.csc_array(matrix)
     if form == 6 and sparse.shape[0] == sparse.shape[1]:

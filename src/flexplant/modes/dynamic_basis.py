@@ -15,7 +15,7 @@ from ..errors import ModelError, SolverError
 from ..lti.frequency_sweep import FLOOR
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
-from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
+from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
 from ..tolerances import TINY, divisor
 from .modes import Modes
@@ -42,14 +42,13 @@ _LEFT, _NOTHING = 0.2, 1e-9
 
 @dataclass(frozen=True)
 class DampingTerms:
-    """``K (1 + i eta) + i H + i omega (a M + b K + D + M V R V^T M)``, R diagonal, of shapes V."""
+    """``K (1 + i eta) + i omega (a M + b K + D + M V R V^T M)``, R diagonal, of shapes V."""
 
     own: FloatArray
     eta: float = 0.0
     a: float = 0.0
     b: float = 0.0
     D: Any = None
-    H: Any = None
 
 
 class DynamicBasis:
@@ -62,19 +61,25 @@ class DynamicBasis:
     """
 
     def __init__(
-        self, model: FEModel, modes: Modes, loads: FloatArray, damping: Damping | None = None
+        self,
+        model: FEModel,
+        modes: Modes,
+        loads: FloatArray,
+        damping: Damping | None = None,
+        *,
+        loss: float | None = None,
     ) -> None:
         self.model = model
         self.n_modes, self.n_rigid = modes.n_modes, modes.n_rigid
         phi = np.real(modes.phi)
-        dampers = damper_forces(model) if damping is None else None
+        dampers = damper_forces(model) if damping is None and loss is None else None
         static = static_shapes(model, loads, dampers)
         shapes, squares = _diagonalise_shapes(model, beyond(model.M, phi, static))
         self.V = np.hstack([phi, shapes])
         self.squares = np.concatenate([modes.basis_squares[: modes.n_modes], squares])
         #: shapes that a damping law by modes is of
         self._inertia = np.asarray(model.M @ self.V)
-        self.losses = self._losses(damping)
+        self.losses = self._losses(damping, loss)
         self._damped()
 
     @property
@@ -136,7 +141,7 @@ class DynamicBasis:
             if not self._coupled:
                 found[part] = (left * (1 / main)[:, None]) @ right
                 continue
-            whole = 1j * (omega[:, :, None] * self._C + self._L)
+            whole = 1j * (omega[:, :, None] * self._C + np.diag(self._loss))
             at = np.arange(self.squares.size)
             whole[:, at, at] = main
             found[part] = left @ np.linalg.solve(whole, right[None].astype(np.complex128))
@@ -182,8 +187,6 @@ class DynamicBasis:
         force -= pushed(self.model.M) * (omega**2 - 1j * omega * law.a)
         if law.D is not None:
             force += 1j * omega * pushed(law.D)
-        if law.H is not None:
-            force += 1j * pushed(law.H)
         chosen = np.flatnonzero(law.own)
         U = self._inertia[:, chosen]
         force += 1j * omega * (U @ (law.own[chosen, None] * (U.T @ motion)))
@@ -197,14 +200,12 @@ class DynamicBasis:
         matrix: Any = K * stiff - (omega**2 - 1j * omega * law.a) * M
         if law.D is not None:
             matrix = matrix + 1j * omega * _as_like(law.D, matrix)
-        if law.H is not None:
-            matrix = matrix + 1j * _as_like(law.H, matrix)
         chosen = np.flatnonzero(law.own)
         U = self._inertia[:, chosen]
         size: ComplexArray = np.asarray(1j * omega * law.own[chosen], dtype=np.complex128)
         if sp.issparse(matrix) and model.n_dof > DENSE_LIMIT:
             # a D may join DOFs that K and M do not
-            order = dissection_of(model) if law.D is None and law.H is None else None
+            order = dissection_of(model) if law.D is None else None
             solve = _with_rank(ComplexSymmetricFactor(matrix, order).solve, U, size)
         else:
             full = _dense_complex(matrix) + (U * size) @ U.T
@@ -232,13 +233,12 @@ class DynamicBasis:
             )
         return np.asarray(found, dtype=np.complex128)
 
-    def _losses(self, damping: Damping | None) -> DampingTerms:
+    def _losses(self, damping: Damping | None, loss: float | None) -> DampingTerms:
         r, none = self.n_rigid, np.zeros(self.squares.size)
+        if loss is not None:
+            return DampingTerms(none, eta=loss)
         if damping is None:
             return DampingTerms(none, D=self.model.D)
-        if isinstance(damping, Hysteretic):
-            more = damping.loss_stiffness(self.model.dofs)
-            return DampingTerms(none, eta=damping.loss_factor, H=more)
         if isinstance(damping, Rayleigh):
             own = none.copy()
             own[:r] = 0.0 if damping.rigid else -damping.alpha
@@ -253,17 +253,15 @@ class DynamicBasis:
     def _damped(self) -> None:
         """Set what the losses are in the coordinates: rates, and what couples them."""
         law = self.losses
-        C, L = np.diag(law.a + law.b * self.squares), np.diag(law.eta * self.squares)
+        C = np.diag(law.a + law.b * self.squares)
         if law.D is not None:
             C = C + self.V.T @ np.asarray(law.D @ self.V)
         if np.any(law.own):
             turned = self.V.T @ self._inertia
             C = C + (turned * law.own) @ turned.T
-        if law.H is not None:
-            L = L + self.V.T @ np.asarray(law.H @ self.V)
-        self._C, self._L = C, L
-        self._rates, self._loss = np.diag(C).copy(), np.diag(L).copy()
-        self._coupled = _couples(C) or _couples(L)
+        self._C, self._rates = C, np.diag(C).copy()
+        self._loss = law.eta * self.squares
+        self._coupled = _couples(C)
 
 
 def _couples(C: FloatArray) -> bool:

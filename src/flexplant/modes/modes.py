@@ -259,9 +259,8 @@ class Modes(Placed, Value):
         `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
         `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
         rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free),
-        for a large model the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz],
-        and of loss factors by region `loss_coupling` (their largest relative error, as the complex
-        stiffness couples these modes).
+        and for a large model the modes `counted` (Sturm) and `found` below the frequency `shift`
+        [Hz].
     notes : sequence of str
         What to know of modes that a file held: what was assumed, changed, and is missing.
     calibration : MeasuredModes, optional

@@ -26,7 +26,7 @@ from ..sparse.symmetric import (
     diagonal,
     rounding_of,
 )
-from ..structure import Damping, FEModel, Hysteretic, ModalDamping
+from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
 from ..tolerances import ROUNDING, TINY, divisor
 from .modes import Modes
@@ -44,8 +44,6 @@ from .statics import (
 
 #: elastic modes that responses are made of at least
 _FEW = 6
-#: relative error of a loss factor that is worth a warning
-_COUPLED = 0.1
 #: modes of models that are in use
 _solved: weakref.WeakKeyDictionary[FEModel, weakref.ref[Modes]] = weakref.WeakKeyDictionary()
 #: with a larger part of all modes wanted, a dense solution of a model of this size is faster
@@ -73,7 +71,7 @@ def solve_modes(
         arbitrary half of it.
     below : float [Hz], optional
         Keep modes up to this frequency. With neither, all modes (of a model that is not large).
-    damping : ModalDamping, Rayleigh or Hysteretic, optional
+    damping : ModalDamping or Rayleigh, optional
         In place of the model's D. None: its D, and no damping when it has none.
     compliance_at : place or sequence of places
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
@@ -105,8 +103,7 @@ def solve_modes(
     Warns
     -----
     FlexplantWarning
-        When loss factors of regions couple modes, which their damping ratios leave out; when
-        overdamped motions have real poles among the modes, which no modes express.
+        When overdamped motions have real poles among the modes, which no modes express.
 
     References
     ----------
@@ -168,9 +165,7 @@ def solve_modes(
     if damping is None:
         zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])
     else:
-        zeta = damping.ratios(omega, phi, model.K, model.dofs)
-    if isinstance(damping, Hysteretic) and damping.regions:
-        certificate["loss_coupling"] = _loss_coupling(model, omega, phi, damping)
+        zeta = damping.zeta(omega)
     found = Modes(
         omega,
         zeta,
@@ -235,7 +230,7 @@ def _vector_zeta(
         return np.zeros(0)
     if given is not None:
         law = given if isinstance(given, Damping) else ModalDamping(given)
-        return law.ratios(omega, vectors, model.K, model.dofs)
+        return law.zeta(omega)
     if damping is None:
         return projected_zeta(model.D, vectors, omega)
     if isinstance(damping, ModalDamping) and not isinstance(damping.ratio, float):
@@ -243,21 +238,7 @@ def _vector_zeta(
             "damping is given mode by mode, so that the attachment vectors have none: "
             "pass compliance_damping=, a ratio."
         )
-    return damping.ratios(omega, vectors, model.K, model.dofs)
-
-
-def _loss_coupling(model: FEModel, omega: FloatArray, phi: FloatArray, law: Hysteretic) -> float:
-    """Return the relative error of loss factors by strain energy, warned of when large."""
-    errors = law.coupling_errors(omega, phi, model.dofs)
-    worst = int(np.argmax(errors))
-    if errors[worst] > _COUPLED:
-        warn(
-            f"{law!r} couples modes: the loss factor of mode {worst + 1} at "
-            f"{omega[worst] / (2 * np.pi):.5g} Hz, by its strain energy, is "
-            f"{100 * errors[worst]:.0f} % off that of the complex stiffness. Take the law itself "
-            "where this mode matters: frequency_response(model, ports, freq, damping=law)."
-        )
-    return float(errors.max(initial=0.0))
+    return damping.zeta(omega)
 
 
 def _undamped(

@@ -126,9 +126,8 @@ def frequency_response(
     freq : (n_freq,) array [Hz]
         Increasing. Of a system None gives `default_freq`.
     damping : Damping, optional
-        Of an FEModel, in place of its D: a `Hysteretic` is the complex stiffness ``K (1 + i eta)``
-        itself, by regions too, a Rayleigh its matrix; modal damping is that of the modes and static
-        shapes used, beyond them motions decay at the rate of the last mode.
+        Damping of an FEModel, in place of its D. A Rayleigh is its matrix; modal damping is that
+        of the modes and static shapes used; motions beyond them decay as the last mode does.
     checks : int
         How many direct solutions of an FEModel; 0 for none.
     tolerance : float

@@ -394,9 +394,9 @@ class _FreeInterface(ReductionMethod):
         K = (back.T * modes.basis_omega**2) @ back
         if self.damping is not None:
             count = k if massless else light.size
-            shapes, omega = np.real(modes.basis)[:, :count], modes.basis_omega[:count]
+            omega = modes.basis_omega[:count]
             rate = np.zeros(light.size)
-            rate[:count] = 2 * self.damping.ratios(omega, shapes, model.K, model.dofs) * omega
+            rate[:count] = 2 * self.damping.zeta(omega) * omega
             D = (back.T * rate) @ back
         elif model.D is None:
             D = np.zeros_like(M)

@@ -34,7 +34,7 @@ from ..modes.matching import pair_modes
 from ..modes.modes import Modes
 from ..modes.solve import modes_reaching
 from ..modes.statics import held_factor, labels_of, places, static_response
-from ..structure import FEModel, Hysteretic
+from ..structure import FEModel
 from ..tolerances import SAME, divisor
 from .ranking import ErrorBound
 
@@ -237,8 +237,7 @@ class FullResponses:
         self.full, self.modes, self.B, self.C, self.loss = full, modes, B, C, loss
         self.basis: DynamicBasis | None = None
         if isinstance(full, FEModel):
-            law = None if loss is None else Hysteretic(loss)
-            self.basis = DynamicBasis(full, modes, np.hstack([B, C.T]), law)
+            self.basis = DynamicBasis(full, modes, np.hstack([B, C.T]), loss=loss)
         self.check: DirectCheck | None = None
 
     def at(self, freq: FloatArray) -> ComplexArray:

@@ -140,7 +140,7 @@ def projected_model(
     if damping is not None:  # modes with the ratios of the law
         omega, phi = elastic_modes(M, K, rigid)
         omega, phi = np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
-        zeta = damping.ratios(omega, T @ phi, model.K, model.dofs)
+        zeta = damping.zeta(omega)
         D = inner(np.diag(2 * zeta * omega), (M @ phi).T)
     else:
         D = np.zeros_like(M) if model.D is None else inner(model.D, T)

@@ -98,12 +98,11 @@ class ModalTruncation(ReductionMethod):
         solved = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         law = self.damping
         if law is not None:
-            phi = np.real(solved.phi)
-            solved = solved.replace(zeta=law.ratios(solved.omega, phi, model.K, model.dofs))
+            solved = solved.replace(zeta=law.zeta(solved.omega))
         kept = solved.select(kept_columns(numbers, solved))
         if static:
             vectors, omega = attachment_vectors(model, np.real(kept.phi), static)
-            zeta = 0.0 * omega if law is None else law.ratios(omega, vectors, model.K, model.dofs)
+            zeta = 0.0 * omega if law is None else law.zeta(omega)
             kept = kept.replace(
                 vectors=vectors,
                 vector_omega=omega,

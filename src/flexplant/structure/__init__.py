@@ -6,7 +6,7 @@ z. It is read from files (`fx.read_model`), or meshed here:
 - `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), both with fields of thickness
   and modulus; `beam`, `chain`, `solid_block`: meshes.
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
-- `ModalDamping` (of measured poles too), `Rayleigh`, `Hysteretic` (loss factors, by region too).
+- `ModalDamping` (of measured poles too), `Rayleigh`; a complex K is read as modal damping.
 - `check`: symmetry, definiteness, rigid-body motions, mechanisms, mass: what is wrong with a model.
 - `interpolated`: shapes between the nodes of foreign matrices, so that a POI may be anywhere.
 
@@ -34,8 +34,6 @@ from .attachments import Spring as Spring
 from .damping import Damping as Damping
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
-from .hysteretic import Hysteretic as Hysteretic
-from .hysteretic import LossRegion as LossRegion
 from .inspection import ModelCheck as ModelCheck
 from .inspection import check as check
 from .interpolation import ScatteredShape as ScatteredShape

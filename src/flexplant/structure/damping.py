@@ -24,7 +24,6 @@ from ..checks import (
     whole,
 )
 from ..errors import ModelError, ShapeError
-from ..labels import DofSet
 from ..sparse.symmetric import dense
 from ..tolerances import ROUNDING, divisor
 from .definite import elastic_modes
@@ -49,22 +48,6 @@ class Damping(Value):
         omega : (k,) array [rad/s]
             Undamped frequencies.
         """
-
-    def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
-        """Return the damping ratios of shapes: those of their frequencies, for most laws.
-
-        Parameters
-        ----------
-        omega : (k,) array [rad/s]
-            Undamped frequencies.
-        shapes : (n, k) array
-            The motions, real.
-        K : (n, n) matrix
-            The stiffness of the structure.
-        dofs : DofSet
-            Its DOFs.
-        """
-        return self.zeta(omega)
 
 
 #: field: one ratio of many modes
@@ -302,7 +285,6 @@ def damping_matrix(
     rigid: FloatArray,
     damping: Damping,
     motions: Callable[[], FloatArray],
-    dofs: DofSet,
 ) -> FloatArray:
     """Return the full D of a damping law, ``M Phi 2 Z Omega Phi^T M`` over all modes."""
     n = rigid.shape[0]
@@ -318,8 +300,7 @@ def damping_matrix(
         return np.asarray(0.5 * (D + D.T), dtype=np.float64)
     elastic, phi = elastic_modes(M, K, rigid, motions=motions)
     r = rigid.shape[1]
-    every = np.hstack([rigid, phi])
-    zeta = damping.ratios(np.concatenate([np.zeros(r), elastic]), every, K, dofs)[r:]
+    zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
     forces = M @ phi
     D = (forces * (2 * zeta * np.abs(elastic))) @ forces.T
     if isinstance(damping, ModalDamping) and damping.rigid:

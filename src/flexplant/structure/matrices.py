@@ -14,10 +14,12 @@ from ..checks import (
     FloatArray,
     IntArray,
     Value,
+    checked,
     flag,
     instance,
     name_list,
     one_of,
+    positive,
     real_array,
     whole,
 )
@@ -44,7 +46,9 @@ class FEMatrices(Value):
     Parameters
     ----------
     K : (n, n) array or sparse matrix
-        Stiffness, both triangles.
+        Stiffness, both triangles. Its real part is kept where it is complex, ``K (1 + i eta)``: the
+        loss factor eta is read as a modal damping ratio of eta / 2, which a note says and `model`
+        warns of. At resonance the two have the same response; elsewhere they differ by at most eta.
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping; M may be singular.
     dofs : DofSet, optional
@@ -60,6 +64,8 @@ class FEMatrices(Value):
         Whether the coordinates in `dofs` are real ones. False: the file has none and they are zero.
     notes : sequence of str
         What the reader did: completed a triangle, dropped empty rows.
+    loss_factor : float
+        The eta of a complex K; where it differs over the structure, the mean over the rows.
 
     Raises
     ------
@@ -87,11 +93,18 @@ class FEMatrices(Value):
     constrained: tuple[str, ...] = field(default=(), kw_only=True)
     located: bool = field(default=True, kw_only=True)
     notes: tuple[str, ...] = field(default=(), kw_only=True)
+    loss_factor: float = field(default=0.0, kw_only=True, metadata=checked(positive, zero=True))
 
     def __post_init__(self) -> None:
-        K = square(self.K, "K")
+        stiff: Any = self.K
+        notes = name_list(self.notes, "notes")
+        eta = positive(self.loss_factor, "loss_factor", zero=True)
+        if not eta and np.iscomplexobj(stiff):
+            eta = _loss_factor(square(stiff.real, "K"), square(stiff.imag, "imaginary part of K"))
+            notes = (*notes, _modal_damping_note(eta))
+        K = square(stiff.real if np.iscomplexobj(stiff) else stiff, "K")
         n = K.shape[0]
-        others: dict[str, Any] = {}
+        others: dict[str, Any] = {"loss_factor": eta}
         for name, given in (("M", self.M), ("D", self.D)):
             others[name] = None if given is None else square(given, name)
             if others[name] is not None and others[name].shape != (n, n):
@@ -112,7 +125,7 @@ class FEMatrices(Value):
             **others,
             digits=digits,
             constrained=name_list(self.constrained, "constrained DOFs"),
-            notes=name_list(self.notes, "notes"),
+            notes=notes,
         )
 
     def __repr__(self) -> str:
@@ -387,6 +400,8 @@ class FEMatrices(Value):
         except ModelError as error:
             held = None if free else ready._held_by_rounding(None)
             raise ModelError(f"{error} {held[0].upper()}{held[1:]}") if held else error from None
+        if self.loss_factor:
+            warn(f"{self.source or 'K'}: {_modal_damping_note(self.loss_factor)}")
         if self.digits is not None:
             held = None if free else ready._held_by_rounding(model)
             if held and model.n_unstable and not is_positive_definite(model.K, SEMIDEFINITE):
@@ -471,3 +486,17 @@ def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
     which = which or ("upper triangle only" if upper.nnz else "lower triangle only")
     full: Any = sp.csc_array(half + half.T + sp.diags_array(matrix.diagonal()))
     return full, f"{name}: {which}, completed"
+
+
+def _loss_factor(K: sp.csc_array, H: sp.csc_array) -> float:
+    """Return the mean of the loss factors of the rows of ``K + i H``."""
+    stiff, loss = K.diagonal(), H.diagonal()
+    there = stiff > 0
+    return float(np.mean(loss[there] / stiff[there])) if there.any() else 0.0
+
+
+def _modal_damping_note(eta: float) -> str:
+    return (
+        f"K is complex: its loss factor of {eta:.4g} is read as a modal damping ratio of "
+        f"{eta / 2:.4g}. Pass damping=fx.ModalDamping({eta / 2:.4g}) to solve_modes"
+    )

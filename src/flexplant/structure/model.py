@@ -229,13 +229,13 @@ class FEModel(Placed, Value):
     def with_damping(self, damping: Damping | MatrixLike) -> FEModel:
         """Return the model with the matrix D of a damping law, or with a measured D.
 
-        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix; so is the
-        viscous equivalent of a loss factor. Rayleigh damping is ``alpha M + beta K``. Rigid-body
-        motions are undamped in all of them unless the law says so (`rigid`).
+        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix. Rayleigh
+        damping is ``alpha M + beta K``. Rigid-body motions are undamped in both unless the law says
+        so (`rigid`).
 
         Parameters
         ----------
-        damping : ModalDamping, Rayleigh, Hysteretic or (n, n) matrix [N s/m, ...]
+        damping : ModalDamping, Rayleigh or (n, n) matrix [N s/m, ...]
             The law, or D itself. It takes the place of the D that was there, and of its dampers.
 
         Raises
@@ -247,7 +247,7 @@ class FEModel(Placed, Value):
         if not isinstance(damping, Damping):
             if not (sp.issparse(damping) or isinstance(damping, np.ndarray | list)):
                 raise ModelError(
-                    f"damping must be a ModalDamping or Rayleigh (or Hysteretic, or a matrix D), "
+                    f"damping must be a ModalDamping, a Rayleigh or a matrix D, "
                     f"got {type(damping).__name__}. Give ModalDamping(0.01) for 1 % in all modes."
                 )
             D = symmetric_matrix(damping, "D", self.n_dof)
@@ -261,9 +261,7 @@ class FEModel(Placed, Value):
             )
         if isinstance(damping, Rayleigh) and not (free and damping.alpha and not damping.rigid):
             return self._with(D=frozen(damping.alpha * self.M + damping.beta * self.K))
-        D = damping_matrix(
-            self.K, self.M, self.rigid_body, damping, lambda: self.body_motions, self.dofs
-        )
+        D = damping_matrix(self.K, self.M, self.rigid_body, damping, lambda: self.body_motions)
         return self._with(D=frozen(D))
 
     def with_parts(self, parts: Iterable[Part] | Part) -> FEModel:
