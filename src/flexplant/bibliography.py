@@ -70,7 +70,6 @@
 .. [EmamiNaeiniVanDooren1982] Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable
    systems, Automatica 18, 1982.
 .. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.
-.. [Ewins2000] Ewins, Modal Testing, 2nd ed., Research Studies Press, 2000.
 .. [Fan1991] Fan, Tits, Doyle, Robustness in the presence of mixed parametric uncertainty and
    unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
 .. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
@@ -126,8 +125,6 @@
    CDC, 1991.
 .. [Imamovic1998] Imamovic, Validation of large structural dynamics models using modal test data,
    PhD thesis, Imperial College, 1998.
-.. [JohnsonKienholz1982] Johnson, Kienholz, Finite element prediction of damping in structures with
-   constrained viscoelastic layers, AIAA Journal 20, 1982.
 .. [JoshiBoyd2009] Joshi, Boyd, Sensor selection via convex optimization, IEEE Trans. Signal
    Process. 57, 2009.
 .. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large

@@ -473,6 +473,9 @@ def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
     """Return a symmetric matrix of which a file holds one triangle, and a note of what was done."""
     # a matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
     # one that stores both is left as it is, for `check` to compare them
+    if np.iscomplexobj(given):
+        (real, note), (imaginary, _) = completed(given.real, name), completed(given.imag, name)
+        return sp.csc_array(real + 1j * imaginary), note
     matrix = square(given, name)
     lower: Any = sp.tril(matrix, -1, format="csc")
     upper: Any = sp.triu(matrix, 1, format="csc")

@@ -191,7 +191,7 @@ def beam(
     if poisson_ratio is None:
         M, K = [(beam_mass(h), rho * A)], [(beam_stiffness(h), turns)]
     else:
-        nu = poisson_of(poisson_ratio, lengths, counts, None)
+        nu = poisson_of(poisson_ratio, lengths, counts)
         sheared = positive(shear_factor, "shear_factor") * A
         softness = 2.0 * (1.0 + nu) * inertia_of / sheared
         f = edge_share(softness, h)
