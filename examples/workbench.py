@@ -78,7 +78,9 @@ def shaped(frf: fx.Frf, plant: fx.StandardPlant) -> LoopDesign:
 def main(*, browser: bool = False) -> dict[str, Any]:
     """Return the design, as it was when the page was left, and its loops on both plants."""
     frf, plant = measured(), drawn()
-    bench = fx.workbench(frf, design=shaped(frf, plant), model=plant, open_browser=browser)
+    bench = fx.workbench.open_page(
+        frf, design=shaped(frf, plant), model=plant, open_browser=browser
+    )
     design = bench.design
     closed = fx.close_loop(plant, design.controller())
     OUT.mkdir(exist_ok=True)

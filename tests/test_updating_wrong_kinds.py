@@ -1,4 +1,4 @@
-"""Wrong kinds given to updating: our errors with a next step, never Python's."""
+"""Wrong values given to updating are refused; see `test_wrong_kinds`."""
 
 from functools import cache
 

@@ -207,21 +207,6 @@ def unknown_attribute(owner: str, name: str, known: Iterable[str]) -> AttributeE
     return AttributeError(f"{owner} has no {name!r}.{near} dir() of it lists all.")
 
 
-def unknown_keyword(owner: str, name: str, known: Iterable[str]) -> TypeError:
-    """Return the TypeError for an argument that a kind does not take, with those near to it.
-
-    Examples
-    --------
-    >>> print(unknown_keyword("Pid", "kp", ["p", "i", "d", "pole"]))
-    Pid takes no argument 'kp'. Close matches: p. It takes p, i, d, pole.
-    """
-    listed = list(known)
-    near = f" Close matches: {', '.join(close)}." if (close := _similar_names(name, listed)) else ""
-    return TypeError(
-        f"{owner} takes no argument {name!r}.{near} It takes {', '.join(listed) or 'none'}."
-    )
-
-
 def _similar_names(name: str, listed: list[str]) -> list[str]:
     """Return up to four names of a list that look like another, or contain it."""
     stem = name.rstrip("s").lower()

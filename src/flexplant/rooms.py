@@ -1,7 +1,4 @@
-"""What the package and its rooms show: public names, what others call them, versions.
-
-Functions are replaced in the module that defines them too, where pickling looks for them.
-"""
+"""What the package and its rooms show: public names, what others call them, versions."""
 
 from __future__ import annotations
 
@@ -11,22 +8,13 @@ import sys
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import FunctionType, ModuleType
-from typing import Any
+from types import ModuleType
 
-from .calls import answering
 from .errors import counted
 
 
 def public_names(room: str) -> Callable[[], list[str]]:
-    """Return the `__dir__` of a package, the names that it re-exports; its functions answer."""
-    for name, item in [*vars(sys.modules[room]).items()]:
-        if not isinstance(item, FunctionType) or name.startswith("_"):
-            continue
-        module, made = sys.modules[item.__module__], answering(item)
-        setattr(sys.modules[room], name, made)
-        if vars(module).get(name) is item:
-            setattr(module, name, made)
+    """Return the `__dir__` of a package: the names that it re-exports, not its modules."""
 
     def names() -> list[str]:
         shown = vars(sys.modules[room]).items()
@@ -37,20 +25,6 @@ def public_names(room: str) -> Callable[[], list[str]]:
         ]
 
     return names
-
-
-class _CalledRoom(ModuleType):
-    """A room with one main function, whose name it has: `flexplant.workbench(...)` calls that."""
-
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        """Call the function."""
-        return getattr(self, self.__name__.rpartition(".")[2])(*args, **options)
-
-
-def called_names(room: str) -> Callable[[], list[str]]:
-    """Return the `__dir__` of a package that is called itself, by its function of that name."""
-    sys.modules[room].__class__ = _CalledRoom
-    return public_names(room)
 
 
 #: what is called otherwise in MATLAB and python-control: its name here, and theirs

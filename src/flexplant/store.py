@@ -7,23 +7,21 @@ import os
 import re
 import sys
 import uuid
-from abc import ABCMeta
+from abc import ABC
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from html import escape
 from importlib import import_module
-from inspect import Signature, signature
 from itertools import groupby
 from pathlib import Path
 from pkgutil import iter_modules
-from types import FunctionType, MappingProxyType
+from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 import scipy.sparse as sp
 
-from .calls import FAILURES, answering, explanation
 from .errors import FlexplantError, unknown_attribute
 
 _HEADER = "__flexplant__"
@@ -40,46 +38,7 @@ def _annotated(cls: type) -> Mapping[str, Any]:
     return cast("Mapping[str, Any]", vars(cls).get("__annotations__", {}))
 
 
-class _Kind(ABCMeta):
-    """The class of the kinds of values: calls of them and of their methods name what does not fit.
-
-    See `calls`.
-    """
-
-    if not TYPE_CHECKING:  # a type checker would take any argument for known
-
-        def __new__(
-            cls, name: str, bases: tuple[type, ...], own: dict[str, Any], **named: Any
-        ) -> Any:
-            """Return a kind with its public methods as `answering` ones."""
-            for key, item in own.items():
-                if key.startswith("_"):
-                    continue
-                if isinstance(item, FunctionType):
-                    own[key] = answering(item)
-                elif isinstance(item, classmethod | staticmethod):
-                    own[key] = type(item)(answering(item.__func__))
-            return super().__new__(cls, name, bases, own, **named)
-
-        @property
-        def __signature__(cls) -> Signature:
-            if cls.__init__ is object.__init__:  # a base without fields
-                return Signature()
-            made = signature(cls.__init__)
-            return made.replace(parameters=[*made.parameters.values()][1:])
-
-        def __call__(cls, *args: Any, **named: Any) -> Any:
-            """Return a value of this kind."""
-            try:
-                return super().__call__(*args, **named)
-            except FAILURES as error:
-                found = explanation(cls, args, named, error, sys._getframe(1).f_globals)
-                if found is None:
-                    raise
-                raise found from error
-
-
-class Value(metaclass=_Kind):
+class Value(ABC):  # noqa: B024, kinds declare the abstract methods
     """A frozen dataclass whose arrays are read-only copies, also after pickling and loading.
 
     What is no such field as its kind describes is refused at construction: by ShapeError where

@@ -56,7 +56,7 @@ def test_a_slider_step(axes, machines, limit, monkeypatch):
     monkeypatch.setattr(Page, "draw", timed)
     fleet = [coupled(axes, seed=i) for i in range(machines)]
     made = design(fleet[0], law(30.0), rate=RATE, hold=False)
-    bench = fx.workbench(fleet, design=made, open_browser=False).serve()
+    bench = fx.workbench.open_page(fleet, design=made, open_browser=False).serve()
     try:
         with sync.sync_playwright() as play:
             browser = browser_of(play)

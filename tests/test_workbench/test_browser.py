@@ -59,7 +59,7 @@ def plant():
 @pytest.fixture(scope="module")
 def served(plant):
     frf = measured(plant, deviation=1e-3)
-    bench = fx.workbench(
+    bench = fx.workbench.open_page(
         frf, model=plant, hold=False, source='plant = fx.load("a.npz")', open_browser=False
     )
     bench.serve()
@@ -296,7 +296,7 @@ def test_a_fleet_of_coupled_axes(browser):
     """Its verdict in words, another axis, another machine, in a narrow window."""
     first = coupled(2, count=600)
     fleet = [first * (1.0 + 0.01 * i) for i in range(4)]
-    bench = fx.workbench(
+    bench = fx.workbench.open_page(
         fleet, design=design(first, rate=RATE, hold=False), open_browser=False
     ).serve()
     try:

@@ -41,7 +41,7 @@ def frf():
 
 @pytest.fixture
 def page(frf):
-    return Page(fx.workbench(frf, **SAMPLED, open_browser=False))
+    return Page(fx.workbench.open_page(frf, **SAMPLED, open_browser=False))
 
 
 def verdict(page):
@@ -55,7 +55,7 @@ def numbers(page, i):
 
 def test_it_begins_with_a_law_that_is_stable_far_below_the_modes():
     for plant in (coupled(2), coupled(2) * -1.0):
-        bench = fx.workbench(plant, **SAMPLED, open_browser=False)
+        bench = fx.workbench.open_page(plant, **SAMPLED, open_browser=False)
         assert bench.design.loops(plant).report.is_stable
         assert {type(e).__name__ for e in bench.design.axes["y1"].elements} == {"Pid", "LowPass"}
 
@@ -146,7 +146,7 @@ def test_what_is_wrong_is_said_and_the_last_good_design_stands(page):
 
 @pytest.mark.slow
 def test_two_tabs_do_not_disturb_each_other(frf):
-    bench = fx.workbench(frf, **SAMPLED, open_browser=False)
+    bench = fx.workbench.open_page(frf, **SAMPLED, open_browser=False)
     one, two = Page(bench), Page(bench)
     one.gain.text.value = "2"
     assert two.design.axes["y1"].gain == bench.start.axes["y1"].gain != 2.0
@@ -156,7 +156,7 @@ def test_two_tabs_do_not_disturb_each_other(frf):
 @pytest.mark.slow
 def test_what_is_refused_is_not_shown(frf):
     """The boxes hold the design's numbers; corners do not change places; a reload goes on."""
-    bench = fx.workbench(frf, **SAMPLED, open_browser=False)
+    bench = fx.workbench.open_page(frf, **SAMPLED, open_browser=False)
     page = Page(bench)
     (_, integrator), (_, zero), *_ = page.cards._numbers[0]
     kept = page.design.axes["y1"].elements[0].as_corners()
@@ -185,7 +185,7 @@ def test_what_is_refused_is_not_shown(frf):
 @pytest.mark.slow
 def test_a_handle_is_dragged_a_machine_is_clicked(frf):
     fleet = {f"stage {i}": measured(light(MODE * f)) for i, f in enumerate((1.0, 1.02, 1.3), 1)}
-    page = Page(fx.workbench(fleet, **SAMPLED, open_browser=False))
+    page = Page(fx.workbench.open_page(fleet, **SAMPLED, open_browser=False))
     page.kind.value = "notch"
     page._add()
 
@@ -213,7 +213,7 @@ def test_a_handle_is_dragged_a_machine_is_clicked(frf):
 
 @pytest.mark.slow
 def test_limits_are_drawn_and_judged():
-    page = Page(fx.workbench(light(), open_browser=False))
+    page = Page(fx.workbench.open_page(light(), open_browser=False))
     box = page.views._boxes[0]
     assert box.bottom == pytest.approx(20 * np.log10(2.0))
     page.side.limits[0].value = "4 dB"
@@ -317,7 +317,7 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     ports = fx.testbeds.three_masses().assembled.ports
     plant = fx.assemble_plant(modes.select([0, 1]), ports, evaluation=modes)
     plant = plant.discretized(2e3, delay=1)
-    bench = fx.workbench(plant, open_browser=False)
+    bench = fx.workbench.open_page(plant, open_browser=False)
     page = Page(bench)
     assert bench.design.references == {"die:x": "die:ref"}
     K = page.design.controller()
@@ -344,7 +344,9 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
 def test_a_measurement_over_its_model():
     plant = fx.testbeds.three_masses()
     frf = fx.frequency_response(plant.Gyu.select(["y1"]), np.linspace(0.5, 900.0, 1800))
-    bench = fx.workbench(frf, model=plant.Gyu.select(["y1"]), hold=False, open_browser=False)
+    bench = fx.workbench.open_page(
+        frf, model=plant.Gyu.select(["y1"]), hold=False, open_browser=False
+    )
     page = Page(bench)
     main, model = (page.views.sources[f"magnitude {n}"].data for n in ("main", "model"))
     shown = np.interp(np.log(main["x"]), np.log(model["x"]), model["y"])
@@ -355,7 +357,7 @@ def test_a_measurement_over_its_model():
 @pytest.mark.long
 def test_tuning_reports_can_be_stopped_and_is_taken():
     plant = light()
-    page = Page(fx.workbench(measured(plant), **SAMPLED, open_browser=False))
+    page = Page(fx.workbench.open_page(measured(plant), **SAMPLED, open_browser=False))
     page.tune(1)
     page.tuning.stop()
     assert not page.tuning.is_running
@@ -471,7 +473,7 @@ def test_the_command_takes_what_its_refusals_ask_for(frf, tmp_path, capsys, monk
 
 @pytest.mark.slow
 def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
-    bench = fx.workbench(frf, **SAMPLED, open_browser=False)
+    bench = fx.workbench.open_page(frf, **SAMPLED, open_browser=False)
     import panel as pn
 
     monkeypatch.setattr(pn.extension, "_loaded", True)  # as pn.extension() does in a notebook
@@ -491,6 +493,6 @@ def test_wrong_options_are_refused(frf):
         ({"design": design(frf, **SAMPLED), "rate": 2e3}, "are in the design already"),
     ):  # fmt: skip
         with pytest.raises(fx.FlexplantError, match=said):
-            fx.workbench(frf, open_browser=False, **options)
+            fx.workbench.open_page(frf, open_browser=False, **options)
     with pytest.raises(fx.FlexplantError, match="needs a plant"):
-        fx.workbench([], open_browser=False)
+        fx.workbench.open_page([], open_browser=False)

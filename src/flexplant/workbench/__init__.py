@@ -1,7 +1,7 @@
 """The workbench: loops shaped by hand in a browser, on measured responses and on models.
 
-- `workbench`: ``fx.workbench(plant)`` opens the page on this machine; ``python -m
-  flexplant.workbench measured.uff`` on a file; in a notebook what it returns is the page.
+- `open_page`: ``fx.workbench.open_page(plant)`` opens the page on this machine, and ``python -m
+  flexplant.workbench measured.uff`` opens it on a file. In a notebook the answer is the page.
 - `WorkbenchServer`: ``design``, what was shaped last; ``serve``, ``close``.
 - `LoopLimits`: what the page draws as forbidden, and judges.
 - `open_file`: what the page opens by its path: a plant, or a design to go on with.
@@ -14,18 +14,18 @@ pickle, and opens no file but those whose path it was given. `examples/workbench
 
 >>> import flexplant as fx
 >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
->>> bench = fx.workbench(mass, open_browser=False)
+>>> bench = fx.workbench.open_page(mass, open_browser=False)
 >>> design = bench.design.with_axis("out", fx.synthesis.ShapedAxis([fx.Pid(9e4), fx.Lead(50.0)]))
 >>> design.loops(mass).report.is_stable
 True
 
-Names elsewhere (MATLAB): ``controlSystemDesigner``, ``sisotool``: `workbench`; ShapeIt likewise.
+Names elsewhere (MATLAB): ``controlSystemDesigner``, ``sisotool``: `open_page`; ShapeIt likewise.
 """
 
-from ..rooms import called_names as _called_names
+from ..rooms import public_names as _public_names
 from .launch import WorkbenchServer as WorkbenchServer
 from .launch import open_file as open_file
-from .launch import workbench as workbench
+from .launch import open_page as open_page
 from .verdict import LoopLimits as LoopLimits
 
-__dir__ = _called_names(__name__)
+__dir__ = _public_names(__name__)

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import FlexplantError
 from ..lti.frequency import ORDERS, Frf
-from .launch import open_file, workbench
+from .launch import open_file, open_page
 
 
 def main(words: list[str] | None = None) -> int:
@@ -53,7 +53,7 @@ def main(words: list[str] | None = None) -> int:
                 "--continuous to look only.\n"
             )
             return 2
-        bench = workbench(
+        bench = open_page(
             plants, design=designs[-1] if designs else None,
             model=open_file(given.model)[0] if given.model else None, rate=given.rate,
             delay=given.delay, hold=False if given.sampled else None, rigid=given.rigid,

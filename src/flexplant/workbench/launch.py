@@ -111,7 +111,7 @@ class Served:
 
 
 class WorkbenchServer(Bench):
-    """The page of `flexplant.workbench`: it serves itself, and shows itself in a notebook.
+    """The page that `open_page` returns: it serves itself, and shows itself in a notebook.
 
     Parameters
     ----------
@@ -119,13 +119,13 @@ class WorkbenchServer(Bench):
         The first is shaped.
     design : LoopDesign
         To begin with; `design` is what was shaped last in any tab.
-    model, channel, move, limits, source : as for `workbench`
+    model, channel, move, limits, source : as for `open_page`
 
     Examples
     --------
     >>> import flexplant as fx
     >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
-    >>> fx.workbench(mass, open_browser=False).top < 1e3  # frequencies of sliders [Hz]
+    >>> fx.workbench.open_page(mass, open_browser=False).top < 1e3  # frequencies of sliders [Hz]
     True
     """
 
@@ -190,7 +190,7 @@ class WorkbenchServer(Bench):
             self._server = None
 
 
-def workbench(
+def open_page(
     plant: Any,
     *,
     design: LoopDesign | None = None,
@@ -256,7 +256,7 @@ def workbench(
     --------
     >>> import flexplant as fx
     >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
-    >>> bench = fx.workbench(mass, open_browser=False)
+    >>> bench = fx.workbench.open_page(mass, open_browser=False)
     >>> bench.design.loops(mass).report.is_stable
     True
     """
