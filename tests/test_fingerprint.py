@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.fingerprint import fingerprint
+from flexplant.fingerprints import fingerprint
 
 MODULE = '''
 """A user's module."""

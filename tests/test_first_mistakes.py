@@ -21,7 +21,7 @@ from flexplant.errors import (
     attempted,
 )
 from flexplant.rooms import OURS
-from flexplant.structure import zero_energy
+from flexplant.structure import zero_energy_motions
 
 
 def test_records_with_time_as_first_axis():
@@ -151,9 +151,9 @@ def test_a_check_that_fails_itself_is_in_the_log(caplog, monkeypatch):
     def failing(*_, **__):
         raise SolverError("no convergence")
 
-    monkeypatch.setattr(zero_energy, "lowest_modes", failing)
+    monkeypatch.setattr(zero_energy_motions, "lowest_modes", failing)
     one = sp.csc_array(np.eye(2))
     with caplog.at_level("INFO", logger="flexplant"):
-        assert zero_energy.endangered(one, one, 6) is None
+        assert zero_energy_motions.endangered(one, one, 6) is None
     said = "the check of the digits of K by its lowest modes failed and is dropped: no convergence"
     assert caplog.messages == [said]

@@ -335,3 +335,40 @@ def test_module_names_are_unique():
     """Also where rooms differ; a picture's module is called as what it shows."""
     names = [p.stem for p in MODULES if room_of(p) != "plot" and p.stem != "__init__"]
     assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
+def named_alike(modules):
+    """Return the modules whose name is also that of something they define or their room shows."""
+    found = []
+    for dotted, tree in modules.items():
+        package, _, name = dotted.removesuffix(".__init__").rpartition(".")
+        room = tree if dotted.endswith("__init__") else modules.get(f"{package}.__init__", tree)
+        shown = {
+            alias.asname or alias.name
+            for node in room.body
+            if room is not tree or dotted.endswith("__init__")
+            if isinstance(node, ast.ImportFrom) and node.level and node.module
+            for alias in node.names
+        }
+        own = {n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+        if name in shown | own:
+            found.append(dotted)
+    return found
+
+
+def test_no_module_has_the_name_of_a_function_that_it_defines():
+    """`flexplant.estimation.kalman` is a module, and nothing hides it."""
+    assert named_alike(modules_of(ROOT)) == []
+
+
+def test_names_alike_are_found(tmp_path):
+    room = tmp_path / "room"
+    room.mkdir()
+    (tmp_path / "__init__.py").write_text("")
+    (tmp_path / "alone.py").write_text("def alone(): pass\n")
+    (room / "__init__.py").write_text(
+        "from .one import two as two\nfrom .one import room as room\n"
+    )
+    (room / "one.py").write_text("def room(): pass\ntwo = 2\n")
+    (room / "two.py").write_text("")
+    assert named_alike(modules_of(tmp_path)) == ["alone", "room.__init__", "room.two"]

@@ -21,7 +21,7 @@ from flexplant.lti import (
     controllability_gramian,
     lyapunov,
     norms,
-    responses,
+    response_solvers,
     solve_lyapunov,
     solve_stein,
 )
@@ -225,8 +225,12 @@ def loaded(g):
 @pytest.mark.parametrize(
     ("module", "inner", "call"),
     [
-        (responses, "points", lambda g: flexplant.frequency_response(g, [1.0])),
-        (responses, "points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
+        (response_solvers, "points", lambda g: flexplant.frequency_response(g, [1.0])),
+        (
+            response_solvers,
+            "points",
+            lambda g: flexplant.frequency_response(g.replace(blocks=None), [1]),
+        ),
         (norms, "_proved", flexplant.hinf_norm),
         (h2_norms, "controllability_gramian", flexplant.h2_norm),
         (doubling, "stable_subspace", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),

@@ -8,7 +8,7 @@ from test_unknown_inputs import by_hand
 
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import check_bias, design_kalman
-from flexplant.estimation.filter_model import filter_model
+from flexplant.estimation.filter_models import filter_model
 from flexplant.loop import close_loop
 from flexplant.plant import Disturbance, RandomWalk, RigidForce, Sensor, assemble_plant
 from flexplant.simulation import simulate

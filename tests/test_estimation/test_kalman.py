@@ -19,7 +19,7 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.estimation import Filter, Smoother, check_gain, design_kalman, kalman
-from flexplant.estimation.filter_model import noise_root
+from flexplant.estimation.filter_models import noise_root
 from flexplant.lti import StateSpace
 from flexplant.lti.lyapunov import difference_of
 from flexplant.lti.riccati import riccati_root

@@ -7,7 +7,7 @@ import pytest
 
 from flexplant.errors import FlexplantWarning
 from flexplant.estimation import design_kalman
-from flexplant.estimation.left_out import nodes_per_wavelength
+from flexplant.estimation.left_out_modes import nodes_per_wavelength
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.reduction import ModalTruncation, reduce

@@ -6,7 +6,7 @@ from test_kalman import one_state, plate_plant
 
 from flexplant.errors import LabelError, ModelError, SolverError
 from flexplant.estimation import design_kalman, design_multirate
-from flexplant.estimation.filter_model import filter_model
+from flexplant.estimation.filter_models import filter_model
 from oracles_estimation import periodic_variances
 
 EVERY = {"y3": 4, "y4": (6, 1)}

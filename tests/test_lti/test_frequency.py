@@ -16,7 +16,7 @@ from flexplant.lti import (
     frequency_response,
     series,
 )
-from flexplant.lti.responses import diagonal_form
+from flexplant.lti.response_solvers import diagonal_form
 from oracles_lti import sweep
 from systems_lti import machine
 

@@ -19,7 +19,7 @@ from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.lti import frequency_response, low_pass_filter
 from flexplant.modes import normal_form, solve_modes
-from flexplant.modes.normal_form import modal, real_form
+from flexplant.modes.normal_forms import modal, real_form
 from flexplant.plant import (
     Actuator,
     Disturbance,

@@ -26,7 +26,7 @@ from flexplant.plant import (
     neglected_modes,
 )
 from flexplant.plant.drawn_machines import damped_less, draws_with_left_out
-from flexplant.plant.uncertainty.neglected_modes import _log_fit
+from flexplant.plant.uncertainty.neglected_dynamics import _log_fit
 from flexplant.testbeds import wafer_stage
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from oracles_plant import machine, motion_row, undamped, z_row

@@ -17,7 +17,7 @@ import pytest
 import flexplant as fx
 from flexplant.checks import with_unit
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
-from flexplant.plot.page import neighbours
+from flexplant.plot.html_page import neighbours
 from stages import RATE, ports, reduced, some_modes
 
 CHROMIUM = next(

@@ -12,7 +12,7 @@ from flexplant.loop.budget import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
 from flexplant.simulation.runs import Conditions, InBlocks, SampleBySample, make_runner
-from flexplant.simulation.simulate import finer_loop
+from flexplant.simulation.sampled_runs import finer_loop
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage
 from stages import L, ports, some_modes

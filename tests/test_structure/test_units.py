@@ -6,7 +6,7 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.structure.units import units
+from flexplant.structure.unit_systems import units
 
 DOFS = fx.DofSet([1, 1], ["z", "rx"], [[1000.0, 0, 0], [1000.0, 0, 0]])
 

@@ -439,7 +439,7 @@ def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_every_state_of_a_schedule_follows_the_place(order):
     """Also where there are so few that one system's would be a pair."""
-    from flexplant.lti.responses import responses
+    from flexplant.lti.response_solvers import responses
     from flexplant.synthesis.aftercare.forms import TwoStateForm, scheduled_form
 
     A = np.array([[0.9, 0.1, 0.0], [-0.1, 0.9, 0.1], [0.0, 0.0, 0.5]])[:order, :order]

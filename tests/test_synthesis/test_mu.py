@@ -9,7 +9,7 @@ import scipy.linalg as la
 from flexplant.errors import AssumptionError, ModelError, ShapeError
 from flexplant.lti import StateSpace, append, discretized, lft, series
 from flexplant.synthesis import FullBlock, RepeatedScalar, mu
-from flexplant.synthesis.robustness.power_iterations import power_iterations
+from flexplant.synthesis.robustness.power_starts import power_iterations
 from flexplant.synthesis.robustness.uncertainty_blocks import block_places, matrix_of
 
 

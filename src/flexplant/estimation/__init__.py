@@ -30,18 +30,18 @@ Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 """
 
 from ..rooms import public_names as _public_names
-from .consistency import ConsistencyReport as ConsistencyReport
-from .consistency import consistency as consistency
+from .consistency_tests import ConsistencyReport as ConsistencyReport
+from .consistency_tests import consistency as consistency
 from .error import MachineTable as MachineTable
 from .error import errors_on_machines as errors_on_machines
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
-from .filter_model import FilterModel as FilterModel
-from .filter_model import KalmanCertificate as KalmanCertificate
-from .filter_model import check_gain as check_gain
-from .invertibility import InvertibilityReport as InvertibilityReport
-from .invertibility import check_bias as check_bias
-from .invertibility import invertibility as invertibility
+from .filter_models import FilterModel as FilterModel
+from .filter_models import KalmanCertificate as KalmanCertificate
+from .filter_models import check_gain as check_gain
+from .invertible_inputs import InvertibilityReport as InvertibilityReport
+from .invertible_inputs import check_bias as check_bias
+from .invertible_inputs import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
 from .lag_report import Filter as Filter
 from .lag_report import FixedLag as FixedLag
@@ -50,8 +50,8 @@ from .lag_report import Predictor as Predictor
 from .lag_report import Smoother as Smoother
 from .lag_report import StaticEstimator as StaticEstimator
 from .lag_report import design_static as design_static
-from .left_out import LeftOut as LeftOut
-from .moved_modes import MovedModes as MovedModes
+from .left_out_modes import LeftOut as LeftOut
+from .mode_changes import MovedModes as MovedModes
 from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate

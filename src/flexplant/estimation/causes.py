@@ -11,9 +11,9 @@ from ..errors import counted
 from ..plant import AnyPlant
 from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
-from .filter_model import innovation_root
+from .filter_models import innovation_root
 from .innovations import ExcessPeak, InnovationLines, InnovationParts, impulse, steady_gain
-from .moved_modes import ModeChange, explained_by_change, peak_band
+from .mode_changes import ModeChange, explained_by_change, peak_band
 
 Cause = Literal[
     "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"

@@ -28,7 +28,7 @@ from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from .estimator_channels import ChannelError, estimates, recorded
-from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
+from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import SETTLED, Moment, Start, Walk, stationary_start
 

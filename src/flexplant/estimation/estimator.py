@@ -18,9 +18,9 @@ from ..plant.evaluation_model import NOT_JUDGED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
-from .filter_model import FilterModel, KalmanCertificate, Sight, filter_model
+from .filter_models import FilterModel, KalmanCertificate, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
-from .left_out import NODES, NOTED, LeftOut, left_out
+from .left_out_modes import NODES, NOTED, LeftOut, left_out
 
 #: relative difference between two ways to a variance from which it is stated beside the rms: six
 #: digits are more than any model holds

@@ -12,7 +12,7 @@ from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from .estimator import KalmanEstimator
-from .filter_model import innovation_root
+from .filter_models import innovation_root
 
 #: bands of lines over which the spectrum is averaged to find an excess, beside the narrowest one
 _WIDTHS = (1, 8, 64)

@@ -18,7 +18,7 @@ from ..plant.partitioned import require_sampled
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
-from .filter_model import (
+from .filter_models import (
     ROUNDED,
     FilterModel,
     KalmanCertificate,
@@ -31,7 +31,7 @@ from .filter_model import (
     stable_radius,
     weigh,
 )
-from .left_out import LeftOut, left_out, unresolved_share
+from .left_out_modes import LeftOut, left_out, unresolved_share
 
 #: least part of R that is the sensors' own: of less, six digits and more are lost in covariances
 _OWN = 1e-10

@@ -22,7 +22,7 @@ from ..plant.partitioned import require_sampled
 from ..plant.rigid_body import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
-from .filter_model import Sight, Steady
+from .filter_models import Sight, Steady
 
 #: lags of the table [s]
 LAGS = (1e-4, 1e-3, 1e-2)

@@ -18,7 +18,7 @@ from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..tolerances import TINY
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
-from .filter_model import (
+from .filter_models import (
     AGREEMENT,
     FilterModel,
     check_noises,

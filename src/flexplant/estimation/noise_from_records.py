@@ -15,7 +15,7 @@ from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..tolerances import SETTLED, TINY
 from .causes import settling
-from .consistency import consistency
+from .consistency_tests import consistency
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike, sensors

@@ -15,7 +15,7 @@ from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
 from .error import ON_CIRCLE
 from .estimator_channels import Recorded
-from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
+from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances

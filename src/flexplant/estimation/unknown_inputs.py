@@ -20,7 +20,7 @@ from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, poi_channels, row_of
-from .filter_model import (
+from .filter_models import (
     AGREEMENT,
     FilterModel,
     check_noises,
@@ -29,7 +29,7 @@ from .filter_model import (
     noise_root,
     weigh,
 )
-from .invertibility import (
+from .invertible_inputs import (
     InputEntry,
     InvertibilityReport,
     input_entry,

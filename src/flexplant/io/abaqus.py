@@ -15,7 +15,6 @@ from ..dof_columns import LARGEST_NODE, at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from .assembled import from_triplets
 from .files import (
     FORMATS,
     Format,
@@ -30,6 +29,7 @@ from .files import (
     unread,
     wrong_line_of,
 )
+from .triplets import from_triplets
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35

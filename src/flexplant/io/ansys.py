@@ -13,11 +13,11 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure import FEMatrices
-from .assembled import assembled, missing_extra
 from .fe_modes import MODE_READERS, FileShapes
 from .files import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
 from .foreign_parsers import in_child
 from .tables import read_nodes_table
+from .triplets import assembled, missing_extra
 
 #: a local coordinate system turned less than this [deg] is none
 _STRAIGHT = 1e-9

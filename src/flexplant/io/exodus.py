@@ -15,9 +15,9 @@ from ..checks import FloatArray, Matrix, mapping, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..modes import Modes
-from .assembled import extra_module
 from .fe_modes import MODE_READERS, FileShapes, check_mass, damping_ratios, frequencies
 from .files import ELSEWHERE, Elsewhere, damaged, file_path, parsing
+from .triplets import extra_module
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 

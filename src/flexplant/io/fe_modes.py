@@ -14,8 +14,8 @@ from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import FEMatrices, FEModel
-from ..structure.units import Units
-from ..structure.units import units as unit_system
+from ..structure.unit_systems import Units
+from ..structure.unit_systems import units as unit_system
 from .files import damaged, file_path, three_units, unread
 
 #: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits

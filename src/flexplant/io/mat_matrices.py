@@ -13,9 +13,9 @@ import scipy.sparse as sp
 from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
-from .assembled import assembled, chosen, extra_module
 from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
 from .foreign_parsers import in_child
+from .triplets import assembled, chosen, extra_module
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100

@@ -18,7 +18,6 @@ from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
-from .assembled import one_matrix_each
 from .files import (
     FORMATS,
     Format,
@@ -35,6 +34,7 @@ from .files import (
     wrong_line_of,
 )
 from .foreign_parsers import sound
+from .triplets import one_matrix_each
 
 #: lines whose digits are counted
 _SAMPLE = 4000

@@ -14,7 +14,7 @@ from ..checks import FloatArray, IntArray
 from ..dof_columns import LARGEST_NODE, at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet, node_dofs
-from ..structure.units import units
+from ..structure.unit_systems import units
 from .files import decimal, file_path, refused, text_of
 
 #: what other programs call the six directions

@@ -13,7 +13,7 @@ from ..errors import FlexplantError, LabelError, ModelError, counted, require_kn
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..lti.frequency import ORDERS, Frf
-from ..structure.units import Units
+from ..structure.unit_systems import Units
 from .coordinate_systems import turned_motions
 from .fe_modes import MODE_READERS, FileShapes
 from .files import ELSEWHERE, ONCE, Elsewhere, file_path, refused, unread

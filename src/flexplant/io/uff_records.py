@@ -13,9 +13,9 @@ from ..checks import ComplexArray, FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS
-from ..structure.units import GRAVITY, POUND
-from .assembled import extra_module
+from ..structure.unit_systems import GRAVITY, POUND
 from .files import damaged, file_path, parsing, refused, unread
+from .triplets import extra_module
 from .unit_labels import plain_label, unit_of
 
 

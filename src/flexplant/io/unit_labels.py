@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from ..structure.units import GRAVITY, LENGTHS, POUND
+from ..structure.unit_systems import GRAVITY, LENGTHS, POUND
 
 _LENGTHS = {**LENGTHS, "nm": 1e-9}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}

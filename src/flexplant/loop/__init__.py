@@ -42,11 +42,11 @@ from .report import compare_loops as compare_loops
 from .report import report_loops as report_loops
 from .scheduled import ScheduledLoop as ScheduledLoop
 from .scheduled import schedule_loops as schedule_loops
-from .sensitivity import bandwidth as bandwidth
-from .sensitivity import complementary_sensitivity as complementary_sensitivity
-from .sensitivity import control_sensitivity as control_sensitivity
-from .sensitivity import loop_gain as loop_gain
-from .sensitivity import modulus_margin as modulus_margin
-from .sensitivity import sensitivity as sensitivity
+from .sensitivity_functions import bandwidth as bandwidth
+from .sensitivity_functions import complementary_sensitivity as complementary_sensitivity
+from .sensitivity_functions import control_sensitivity as control_sensitivity
+from .sensitivity_functions import loop_gain as loop_gain
+from .sensitivity_functions import modulus_margin as modulus_margin
+from .sensitivity_functions import sensitivity as sensitivity
 
 __dir__ = _public_names(__name__)

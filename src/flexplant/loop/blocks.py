@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, inner_names
 from ..errors import AssumptionError, LabelError, ModelError, unknown_label
 from ..lti.interconnection import among, connect
 from ..lti.joining import equal_matrices
-from ..lti.responses import Responder, responder
+from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..tolerances import SAME

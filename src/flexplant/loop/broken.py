@@ -13,7 +13,7 @@ from ..checks import ComplexArray, FloatArray, short
 from ..errors import LabelError
 from ..lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
-from ..lti.responses import Responder, responder
+from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..tolerances import TINY

@@ -20,7 +20,7 @@ from ..errors import (
 )
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
-from ..lti.responses import responder
+from ..lti.response_solvers import responder
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant

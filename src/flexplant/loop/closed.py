@@ -16,10 +16,10 @@ from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
 from ..lti.modal_map import Obstacle, obstacle
-from ..lti.responses import Responder, remembered, responder
+from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
-from ..plant.uncertainty.uncertain_plant import UncertainPlant
+from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (

@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.frequency import Frf
 from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
-from ..lti.responses import Responder
+from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import TINY
 from .broken import BrokenLoop

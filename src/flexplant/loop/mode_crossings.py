@@ -25,7 +25,7 @@ import numpy as np
 
 from ..checks import BoolArray, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from ..lti.responses import Responder, points, responder
+from ..lti.response_solvers import Responder, points, responder
 from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant

@@ -28,7 +28,7 @@ from ..plant import AnyPlant, standard_plant
 from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
-from ..plant.uncertainty.uncertain_plant import UncertainPlant
+from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..tolerances import TINY
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached

@@ -17,7 +17,7 @@ from .blocks import references
 from .broken import BrokenLoop, inverted
 from .closed import ClosedLoop
 from .measured_loop import broken_count
-from .sensitivity import Loop, first_crossing, taken_apart
+from .sensitivity_functions import Loop, first_crossing, taken_apart
 
 #: a loop gain at the first or last line that counts as real
 _REAL = 0.05

@@ -79,7 +79,7 @@ from .lyapunov import controllability_gramian as controllability_gramian
 from .lyapunov import observability_gramian as observability_gramian
 from .lyapunov import solve_lyapunov as solve_lyapunov
 from .lyapunov import solve_stein as solve_stein
-from .minimal import minimal as minimal
+from .minimal_realisations import minimal as minimal
 from .modal import ModalForm as ModalForm
 from .modal import StableSplit as StableSplit
 from .modal import modal_form as modal_form

@@ -33,7 +33,7 @@ from .frequency_sweep import default_freq as default_freq
 from .frequency_sweep import sampled_freq as sampled_freq
 from .joining import chosen_pair, rows_of, short_list
 from .measured_lines import checked_correlation, checked_overlap, checked_window, line_correlation
-from .responses import responses
+from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
 #: multiplications below which a response takes no time

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
 from ..tolerances import ROUNDING, SPLIT, TINY
-from .responses import continuous_poles, responder
+from .response_solvers import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
 #: [rad] most turn of a phase between neighbours; a dip between them turns it by more

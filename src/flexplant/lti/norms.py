@@ -20,7 +20,7 @@ from .lyapunov import (
 )
 from .modal_map import obstacle
 from .peaks import Residues, proved_peak, residues
-from .responses import points, responder
+from .response_solvers import points, responder
 from .statespace import StateSpace, System, as_statespace
 
 #: the norm lies between the gain found and (1 + TOLERANCE) times it

@@ -13,7 +13,7 @@ from ..checks import FloatArray, Value, known_units, one_of, positive, real_arra
 from ..errors import ModelError, ShapeError, counted, require_known
 from ..tolerances import SPLIT, TYPED
 from .discretisation import Recursion
-from .responses import continuous_poles
+from .response_solvers import continuous_poles
 from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace
 

@@ -26,7 +26,7 @@ from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
 from .matching import pair_modes
-from .normal_form import pole_pairs
+from .normal_forms import pole_pairs
 
 #: places at which shapes of two meshes are compared, at most
 _PLACES = 300

@@ -30,7 +30,7 @@ from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
 from ..tolerances import ROUNDING, TINY, divisor
 from .modes import Modes
-from .normal_form import PROPORTIONAL, NormalForm, check_drag, normal_form
+from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
 from .sparse_modes import counted_modes
 from .statics import (
     attachment_vectors,

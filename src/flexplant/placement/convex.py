@@ -15,7 +15,7 @@ import scipy.linalg as la
 
 from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError, attempted
-from ..estimation.filter_model import weigh
+from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.lyapunov import square_root
 from ..lti.riccati import control_dare, riccati_root

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..checks import FloatArray, Rng, Value, checked, instance, name_list, positive, short, whole
 from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known, some_names
-from ..fingerprint import fingerprint
+from ..fingerprints import fingerprint
 from ..plant import Actuator, StandardPlant
 from ..work import Work
 from .branch_and_bound import Exchange

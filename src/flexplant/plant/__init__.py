@@ -126,11 +126,11 @@ from .uncertainty.gains import Gains as Gains
 from .uncertainty.kind import Known as Known
 from .uncertainty.kind import Uncertainty as Uncertainty
 from .uncertainty.neglected import Neglected as Neglected
-from .uncertainty.neglected_modes import NeglectedModes as NeglectedModes
-from .uncertainty.neglected_modes import neglected_modes as neglected_modes
+from .uncertainty.neglected_dynamics import NeglectedModes as NeglectedModes
+from .uncertainty.neglected_dynamics import neglected_modes as neglected_modes
 from .uncertainty.parameter_amounts import Parameters as Parameters
 from .uncertainty.shape_directions import Shapes as Shapes
-from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
+from .uncertainty.uncertain_plants import UncertainPlant as UncertainPlant
 from .visibility import ModeVisibility as ModeVisibility
 from .weights import StageWeights as StageWeights
 from .weights import mixed_sensitivity as mixed_sensitivity

@@ -11,9 +11,9 @@ from ..checks import FloatArray, Value
 from ..errors import AssumptionError, counted, some_names
 from ..lti.statespace import StateSpace
 from ..tolerances import divisor
-from .at_rest import followed_at_rest
 from .axes import DrivenAxes, apart, driven_axes, real_gain
 from .partitioned import Partition
+from .rest_expansion import followed_at_rest
 
 
 @dataclass(frozen=True, eq=False, repr=False)

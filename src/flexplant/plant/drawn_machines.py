@@ -15,7 +15,7 @@ from .remade import rebuilt
 from .standard import StandardPlant
 from .uncertainty.delta import Delta
 from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs, modal_realisation
-from .uncertainty.uncertain_plant import UncertainPlant
+from .uncertainty.uncertain_plants import UncertainPlant
 
 #: std of the logarithm of the damping of a mode that was not measured (one structure's modes
 #: scatter by 20 to 40 %)

@@ -14,7 +14,7 @@ from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..lti.joining import block_diagonal
 from ..modes import Modes, NormalForm
-from ..modes.normal_form import PROPORTIONAL, RealForm, modal, pole_pairs, real_form
+from ..modes.normal_forms import PROPORTIONAL, RealForm, modal, pole_pairs, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.rigid import Structure as Structure

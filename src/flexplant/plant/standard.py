@@ -25,7 +25,7 @@ from .remade import rebuilt, selected
 from .rigid_body import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
-from .uncertainty.uncertain_plant import UncertainPlant, uncertain_plant
+from .uncertainty.uncertain_plants import UncertainPlant, uncertain_plant
 
 
 @dataclass(frozen=True, eq=False, repr=False)

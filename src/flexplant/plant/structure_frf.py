@@ -15,7 +15,7 @@ from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
 from ..lti.frequency_sweep import sampled_freq
-from ..lti.responses import responses
+from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..modes.dynamic_basis import DynamicBasis, checked_response

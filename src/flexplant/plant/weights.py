@@ -15,9 +15,9 @@ from ..lti.filters import inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import divisor
-from .at_rest import followed_at_rest
 from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
+from .rest_expansion import followed_at_rest
 from .standard import AnyPlant, StandardPlant, plant_of, standard_plant
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:

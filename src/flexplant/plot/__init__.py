@@ -40,9 +40,9 @@ Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB
 from ..rooms import public_names as _public_names
 from ._axes import CYCLE as CYCLE
 from ._axes import STYLES as STYLES
-from .bode import bode as bode
-from .bode import frf as frf
-from .bode import singular_values as singular_values
+from .bode_diagrams import bode as bode
+from .bode_diagrams import frf as frf
+from .bode_diagrams import singular_values as singular_values
 from .errors import budget as budget
 from .errors import error_map as error_map
 from .errors import exposures as exposures
@@ -51,6 +51,7 @@ from .estimation import consistency as consistency
 from .estimation import estimate as estimate
 from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
+from .html_report import report as report
 from .identification import PolePicker as PolePicker
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
@@ -62,9 +63,8 @@ from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import position_map as position_map
 from .placement import sensor_map as sensor_map
-from .report import report as report
-from .response import response as response
-from .response import step as step
+from .run_pictures import response as response
+from .run_pictures import step as step
 from .shapes import animate_mode as animate_mode
 from .shapes import layout as layout
 from .shapes import mode_shape as mode_shape

@@ -30,7 +30,7 @@ from ._axes import (
     shown_in,
     styles,
 )
-from .response import shade, time_axis
+from .run_pictures import shade, time_axis
 
 #: of the areas, which differ without colour too
 _HATCHES = ("", "//", "", "\\\\", "", "..")

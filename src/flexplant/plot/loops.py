@@ -17,7 +17,7 @@ from ..loop.blocks import references
 from ..loop.report import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.measured_lines import LINES, on_lines, steps_between
-from ..lti.responses import continuous_poles
+from ..lti.response_solvers import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..tolerances import SAME, SPLIT
 from ._axes import (

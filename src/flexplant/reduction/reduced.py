@@ -24,7 +24,7 @@ from ..checks import (
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
-from ..modes.normal_form import normal_form
+from ..modes.normal_forms import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
 from ..sparse.symmetric import orthonormalised

@@ -82,7 +82,6 @@ from .exposure import settling_time as settling_time
 from .feedforward import Feedforward as Feedforward
 from .feedforward import design_feedforward as design_feedforward
 from .feedforward import known_forces as known_forces
-from .inverse_forces import inverse_forces as inverse_forces
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline
@@ -98,15 +97,16 @@ from .nonlinear_elements import Hysteresis as Hysteresis
 from .nonlinear_elements import Jitter as Jitter
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
+from .plant_inverse import inverse_forces as inverse_forces
 from .response import Response as Response
-from .simulate import simulate as simulate
-from .simulate import spectral_noise as spectral_noise
+from .sampled_runs import simulate as simulate
+from .sampled_runs import spectral_noise as spectral_noise
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
-from .study import EstimatorComparison as EstimatorComparison
-from .study import StudyTable as StudyTable
-from .study import compare_estimators as compare_estimators
-from .study import reading_along as reading_along
-from .study import study as study
+from .studies import EstimatorComparison as EstimatorComparison
+from .studies import StudyTable as StudyTable
+from .studies import compare_estimators as compare_estimators
+from .studies import reading_along as reading_along
+from .studies import study as study
 
 __dir__ = _public_names(__name__)

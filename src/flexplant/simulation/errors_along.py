@@ -43,7 +43,7 @@ from .moving_machine import (
     known_positions,
     trajectory,
 )
-from .simulate import unscheduled
+from .sampled_runs import unscheduled
 
 #: repetitions of a trajectory after which its errors have to repeat, and to which part
 _REPEATED, _SETTLED = 100, 1e-6

@@ -13,7 +13,7 @@ from ..errors import LabelError, ModelError, ShapeError, aligned, counted, requi
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
 from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
-from .simulate import Signal, simulate
+from .sampled_runs import Signal, simulate
 
 #: share of the windows in the third column of the table: three standard deviations of a Gaussian
 SHARE = 0.997

@@ -25,14 +25,14 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
-from ..plant.at_rest import OfS, at_rest, solved
 from ..plant.axes import resting_frequency
+from ..plant.rest_expansion import OfS, at_rest, solved
 from ..tolerances import divisor
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements
 from .response import Response
-from .simulate import simulate
+from .sampled_runs import simulate
 
 #: how long a loop is watched after the beginning of a move, relative to it, for gains of the move
 _AFTER = 1.5

@@ -11,8 +11,8 @@ from ..checks import ComplexArray, FloatArray, several
 from ..errors import AssumptionError, some_names, warn
 from ..loop import ClosedLoop
 from ..plant import StandardPlant, driven_axes
-from ..plant.at_rest import at_rest, followed_at_rest, solved
 from ..plant.axes import complex_gain, opposing_part, resting_frequency
+from ..plant.rest_expansion import at_rest, followed_at_rest, solved
 from .motion import SetPointProfile
 from .nonlinear_elements import Saturation
 from .response import Response

@@ -36,7 +36,7 @@ from ..structure import Damping, FEModel
 from ..synthesis import design_stage
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
 from .response import Response
-from .simulate import simulate
+from .sampled_runs import simulate
 from .specification import Specification, Verdict
 
 #: times that measured modes are paired with those of a model, at most

@@ -47,8 +47,8 @@ from .simple_models import beam as beam
 from .simple_models import chain as chain
 from .simple_models import kirchhoff_plate as kirchhoff_plate
 from .simple_models import solid_block as solid_block
-from .slides import slides as slides
-from .slides import sliding as sliding
+from .sliding_motions import slides as slides
+from .sliding_motions import sliding as sliding
 from .thick_plate import ThickPlateShape as ThickPlateShape
 from .thick_plate import plate as plate
 

@@ -19,7 +19,7 @@ from .matrices import FEMatrices
 from .model import FEModel
 from .rigid import RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
-from .zero_energy import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
+from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
 _MODES, _FEW = 10, 4

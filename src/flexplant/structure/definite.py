@@ -24,7 +24,7 @@ from ..sparse.symmetric import (
     unit_diagonal,
 )
 from ..tolerances import SAME, TYPED
-from .zero_energy import most_moved, nonrigid
+from .zero_energy_motions import most_moved, nonrigid
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix

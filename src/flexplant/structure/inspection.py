@@ -19,8 +19,8 @@ from .check_facts import Facts, facts
 from .matrices import FEMatrices
 from .model import FEModel
 from .rigid import rigid_motions
-from .units import unusual
-from .zero_energy import ZeroEnergy, held_by_rounding, most_moved, nearly_free, verdict
+from .unit_systems import unusual
+from .zero_energy_motions import ZeroEnergy, held_by_rounding, most_moved, nearly_free, verdict
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -30,10 +30,10 @@ from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
 from .definite import SEMIDEFINITE, are_swapped, digits_of, square, symmetric_matrix
 from .model import FEModel
-from .natural_frequencies import MOST, natural_frequencies
 from .singular_mass import empty_rows, held_rows, inertial
-from .units import units
-from .zero_energy import endangered, freed, held_by_rounding, shown_digits
+from .undamped_frequencies import MOST, natural_frequencies
+from .unit_systems import units
+from .zero_energy_motions import endangered, freed, held_by_rounding, shown_digits
 
 
 @dataclass(frozen=True, eq=False, repr=False)

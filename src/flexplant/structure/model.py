@@ -29,8 +29,8 @@ from .definite import (
     without_inertia,
 )
 from .rigid import Placed, body_motions, force_parts, nearest_free, rigid_body_basis
-from .units import units
-from .zero_energy import endangered, held_by_rounding
+from .unit_systems import units
+from .zero_energy_motions import endangered, held_by_rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -77,8 +77,8 @@ from .robustness.guarantees import RobustStability as RobustStability
 from .robustness.guarantees import WorstCaseGain as WorstCaseGain
 from .robustness.guarantees import robust_stability as robust_stability
 from .robustness.guarantees import worst_case_gain as worst_case_gain
-from .robustness.mu import MuBounds as MuBounds
-from .robustness.mu import mu as mu
+from .robustness.mu_bounds import MuBounds as MuBounds
+from .robustness.mu_bounds import mu as mu
 from .robustness.uncertainty_blocks import FullBlock as FullBlock
 from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
 from .structured.structured_design import design_structured as design_structured

@@ -16,7 +16,7 @@ from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
-from ..lti.responses import Responder, responder
+from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from .preparation import Prepared

@@ -24,7 +24,7 @@ from ..lti.joining import Matrices
 from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
-from ..plant.uncertainty.uncertain_plant import UncertainPlant
+from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..tolerances import ROUNDING, TINY
 from .scaling import (
     POINT,

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..checks import ComplexArray, FloatArray
 from ..lti.equations import bordered_scale, state_scale
 from ..lti.modal_map import eigenvalues_with_error
-from ..lti.responses import responses
+from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace
 from ..tolerances import TINY, divisor
 

@@ -23,7 +23,7 @@ from ..plant import (
     suspend,
 )
 from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
-from .lumped import Stretch, along_leg, lumped, two_points
+from .lumped_machines import Stretch, along_leg, lumped, two_points
 
 
 def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:

@@ -30,10 +30,10 @@ from noisy responses to a model, ``examples/paper_plate.py`` has the paper's num
 from ..rooms import public_names as _public_names
 from .discrepancy import Discrepancy as Discrepancy
 from .discrepancy import ModalUncertainty as ModalUncertainty
-from .judgement.identifiability import IdentifiabilityReport as IdentifiabilityReport
-from .judgement.identifiability import identifiability as identifiability
-from .judgement.localise import Localisation as Localisation
-from .judgement.localise import localise as localise
+from .judgement.candidate_search import Localisation as Localisation
+from .judgement.candidate_search import localise as localise
+from .judgement.identifiability_tests import IdentifiabilityReport as IdentifiabilityReport
+from .judgement.identifiability_tests import identifiability as identifiability
 from .judgement.posterior import Posterior as Posterior
 from .judgement.posterior import sample_posterior as sample_posterior
 from .judgement.validation import Correlation as Correlation
@@ -65,9 +65,9 @@ from .search import TrustRegion as TrustRegion
 from .search import UpdateMethod as UpdateMethod
 from .sensitivities import Sensitivities as Sensitivities
 from .sensitivities import eigenvalue_sensitivities as eigenvalue_sensitivities
-from .update import update as update
 from .update_result import History as History
 from .update_result import Starts as Starts
 from .update_result import UpdateResult as UpdateResult
+from .updates import update as update
 
 __dir__ = _public_names(__name__)

@@ -19,7 +19,7 @@ from ..errors import (
     counted,
 )
 from ..tolerances import TINY, divisor
-from .changed_model import changed_model
+from .changed_models import changed_model
 from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
 from .parameters import PointParameter, checked_values

@@ -24,7 +24,7 @@ from ..checks import (
 from ..errors import ModelError, counted, require_known
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
-from .changed_model import applied
+from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .judgement.goodness import chance, is_bad
 from .parameters import AddedMass, Parameter

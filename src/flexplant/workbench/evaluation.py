@@ -17,12 +17,12 @@ from ..loop import LoopMargins
 from ..loop.broken import BrokenLoop
 from ..loop.measured_loop import NyquistCount, broken_count
 from ..loop.report import broken_margins
-from ..loop.sensitivity import broken_bandwidth
+from ..loop.sensitivity_functions import broken_bandwidth
 from ..lti.frequency import Frf
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.interconnection import loop_poles, side_by_side
 from ..lti.measured_lines import low_slope, on_lines
-from ..lti.responses import Responder, responder
+from ..lti.response_solvers import Responder, responder
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from ..synthesis.laws.law import Law

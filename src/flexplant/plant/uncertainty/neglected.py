@@ -10,7 +10,7 @@ from ...errors import ModelError
 from ..partitioned import Partition, is_plant
 from .delta import Delta, MachineParts
 from .kind import Uncertainty
-from .neglected_modes import NeglectedModes, neglected_modes
+from .neglected_dynamics import NeglectedModes, neglected_modes
 
 
 @dataclass(frozen=True, eq=False)

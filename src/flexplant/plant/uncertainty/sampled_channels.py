@@ -13,8 +13,8 @@ from ...lti.discretisation import bilinear, tustin
 from ...lti.sampling import discretized
 from ...lti.statespace import StateSpace
 from .channels import Change, DeltaPart, EvenUnits, Opened, with_parts
-from .neglected_modes import NeglectedModes, with_neglected
-from .uncertain_plant import UncertainPlant
+from .neglected_dynamics import NeglectedModes, with_neglected
+from .uncertain_plants import UncertainPlant
 
 #: relative curvature over a Delta above which another mapping is tried
 _CURVED = 0.01

@@ -17,7 +17,7 @@ from ...loop.anti_windup import recovery_gain
 from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
-from ...lti.minimal import minimal
+from ...lti.minimal_realisations import minimal
 from ...lti.modal import modal_form
 from ...lti.modal_map import eigenvalues_with_error
 from ...lti.statespace import StateSpace, as_statespace

@@ -19,11 +19,11 @@ from ...errors import (
 )
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
-from ...lti.responses import remembered, responder
+from ...lti.response_solvers import remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant, stage_weights
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import (
     Controller,
     SolvedController,
@@ -37,9 +37,9 @@ from ..preparation import Prepared, posed, prepared, require_reach
 from ..scaling import departure_from_normal
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
-from .mode_channels import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 from .moved_design import over_positions
 from .singular import require_shown
+from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3

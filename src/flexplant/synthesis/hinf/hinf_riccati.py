@@ -14,7 +14,7 @@ from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
-from ...lti.responses import responses
+from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...tolerances import ROUNDING

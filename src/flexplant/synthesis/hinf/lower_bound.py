@@ -13,7 +13,7 @@ from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.joining import axis_zeros
-from ...lti.responses import responses
+from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...tolerances import divisor
 from ..preparation import Prepared

@@ -13,7 +13,7 @@ from ...lti.balancing import hankel_norm
 from ...lti.discretisation import bilinear, tustin
 from ...lti.frequency import Frf, frequency_response
 from ...lti.interconnection import connect, series
-from ...lti.minimal import minimal
+from ...lti.minimal_realisations import minimal
 from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace, System, as_statespace

@@ -16,8 +16,8 @@ from ...lti.discretisation import tustin
 from ...lti.filters import low_pass_filter
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import connect, loop_poles, series, side_by_side
-from ...lti.minimal import minimal
-from ...lti.responses import responses
+from ...lti.minimal_realisations import minimal
+from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant

@@ -26,11 +26,11 @@ from ...parallel import Progress
 from ...plant import AnyPlant, StandardPlant, reference_errors, stage_weights, standard_plant
 from ...plant.drawn_machines import damped_less, draws_with_left_out
 from ...plant.realisation import natural
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import Controller, with_left_out
 from .hinf_design import Evened, evened, solved, tolerant
 from .hinf_riccati import Riccati
-from .mode_channels import with_mode_channels
+from .tolerated_modes import with_mode_channels
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
 _CROSSES = 2.0 / 3.0

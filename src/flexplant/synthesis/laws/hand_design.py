@@ -22,7 +22,7 @@ from ...checks import (
     whole,
 )
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
-from ...fingerprint import fingerprint
+from ...fingerprints import fingerprint
 from ...loop.blocks import DERIVATIVES
 from ...loop.measured_loop import static_map
 from ...lti.frequency import Frf

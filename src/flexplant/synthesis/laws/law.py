@@ -25,7 +25,7 @@ from ...checks import (
 from ...errors import ModelError
 from ...lti.frequency import sampled_freq
 from ...lti.joining import Matrices, block_matrix, cascaded, trapezoidal
-from ...lti.responses import responder
+from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 
 

@@ -12,13 +12,13 @@ from ...checks import FloatArray, Value, name_list, short
 from ...errors import LabelError, ModelError, counted, require_known, warn
 from ...loop import LoopReport, ModeTolerances, SpillOver, in_axes, report_loops
 from ...loop.measured_loop import static_map
-from ...loop.sensitivity import taken_apart
+from ...loop.sensitivity_functions import taken_apart
 from ...lti.frequency import Frf
 from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant, decouple
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import checked_loop
 from .law import Law, LawElement
 

@@ -20,10 +20,10 @@ from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
 from ...plant.axes import driven_axes
 from ...plant.partitioned import require_sampled
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
 from .loop_design import Axes, axes_controller, connected
-from .servo_loop import (
+from .servo_loops import (
     POWERS,
     TARGET,
     Axis,

@@ -17,16 +17,16 @@ from ...loop.broken import inverted
 from ...lti.frequency import Frf
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles, series
-from ...lti.responses import responder
+from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.axes import real_gain
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
 from .loop_design import Axes, DesignedLoops, axes_of, made
-from .servo_loop import TARGET
+from .servo_loops import TARGET
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6

@@ -14,7 +14,7 @@ import numpy as np
 from ...checks import FloatArray, Value, between, checked, name_list, positive
 from ...errors import SolverError, require_known
 from ...lti.norms import h2_norm, peak_gain
-from ...lti.responses import continuous_poles
+from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...tolerances import TINY

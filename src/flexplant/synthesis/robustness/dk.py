@@ -22,16 +22,16 @@ from ...lti.discretisation import tustin
 from ...lti.filters import zpk
 from ...lti.frequency_sweep import largest_gains, resonance_grid
 from ...lti.interconnection import lft, series, side_by_side
-from ...lti.responses import responder
+from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import quick_answer
-from ..hinf.mode_channels import (
+from ..hinf.tolerated_modes import (
     ModeChannel,
     ModeLoop,
     mode_channels,
@@ -39,8 +39,8 @@ from ..hinf.mode_channels import (
     with_mode_channels,
 )
 from ..preparation import prepared
-from .mu import Cover
-from .uncertain_loop import (
+from .mu_bounds import Cover
+from .uncertain_loops import (
     UncertainLoop,
     open_plant,
     require_uncertain,

@@ -19,12 +19,12 @@ from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, smallest_with_block
-from .mu import INTERVALS, Cover, Covered, sought
-from .power_iterations import power_iterations
-from .uncertain_loop import UncertainLoop, uncertain_loop
+from .mu_bounds import INTERVALS, Cover, Covered, sought
+from .power_starts import power_iterations
+from .uncertain_loops import UncertainLoop, uncertain_loop
 from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
 #: mu below this is not resolved

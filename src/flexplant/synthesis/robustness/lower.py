@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...tolerances import SPLIT, TINY
-from .power_iterations import power_iterations
+from .power_starts import power_iterations
 from .uncertainty_blocks import (
     Block,
     FullBlock,

@@ -15,7 +15,7 @@ from ...errors import AssumptionError
 from ...lti.frequency_sweep import climbed_grid, local_maxima, resonance_grid
 from ...lti.lyapunov import solve_lyapunov
 from ...lti.norms import peak_gain
-from ...lti.responses import responses
+from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...tolerances import ROUNDING, TINY

@@ -12,7 +12,7 @@ from ...certificates import stability_name
 from ...checks import MOST, FloatArray, Rng, generator, short, whole
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
 from ...lti.interconnection import lft
-from ...lti.responses import responder
+from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant

@@ -21,8 +21,8 @@ from ..residuals.modal_residuals import ModeShapes
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
 from ..search.objective import UpdateMethod, compared_modes
-from ..update import update
 from ..update_result import UpdateResult
+from ..updates import update
 from .goodness import chance, is_bad
 
 #: groups of modes in a repr

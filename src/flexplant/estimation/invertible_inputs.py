@@ -17,7 +17,7 @@ from ..plant import AnyPlant
 from ..plant.partitioned import require_sampled
 from ..tolerances import SPLIT, TINY, divisor
 from .estimator_channels import checked_plant
-from .filter_model import FilterModel, filter_model
+from .filter_models import FilterModel, filter_model
 
 #: singular values below this part of the largest one, inputs and sensors of unit size, are rounding
 _RANK = 1e-9

@@ -16,7 +16,7 @@ from ..checks import FloatArray, Value, instance, mapping, positive, seed_sequen
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label, warn
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
-from ..fingerprint import fingerprint
+from ..fingerprints import fingerprint
 from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
 from ..work import Checkpoint

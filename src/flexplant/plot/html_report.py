@@ -34,14 +34,14 @@ from ..store import written
 from ..synthesis import Controller
 from ..updating import Localisation, UpdateResult
 from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
-from .bode import bode, singular_values
+from .bode_diagrams import bode, singular_values
 from .errors import budget, error_map
 from .estimation import lag_report
+from .html_page import Chapter, Gallery, moving_shapes, note, page, table, tiles
 from .identification import stabilisation
 from .loops import nyquist, sensitivity
-from .page import Chapter, Gallery, moving_shapes, note, page, table, tiles
 from .placement import pareto_curve, placed, sensor_map
-from .response import response
+from .run_pictures import response
 from .updating import localisation, parameters, residual
 
 #: headings in the order of the page, and the rooms whose values stand below them

@@ -8,14 +8,14 @@ from ..checks import ComplexArray, FloatArray, instance, positive
 from ..errors import CertificateError, ModelError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
-from ..lti.responses import responder
+from ..lti.response_solvers import responder
 from ..plant import driven_axes
 from ..plant.axes import resting_frequency
 from ..plant.partitioned import require_sampled
 from ..tolerances import divisor
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
 from .motion import SetPointProfile
-from .simulate import simulate
+from .sampled_runs import simulate
 
 #: gradient of what forces minimise, of that without forces; 2e-13 was seen
 AGREEMENT = 1e-7

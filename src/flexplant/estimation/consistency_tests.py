@@ -44,8 +44,8 @@ from .innovations import (
     ljung_box,
 )
 from .kalman import design_kalman
-from .left_out import left_out
-from .moved_modes import ModeChange, MovedModes, moved_modes
+from .left_out_modes import left_out
+from .mode_changes import ModeChange, MovedModes, moved_modes
 
 #: fewest samples for a verdict
 _FEWEST = 200

@@ -19,12 +19,12 @@ from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
 from ...lti.modal_map import obstacle
-from ...lti.responses import responder
+from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
 from ...tolerances import ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
-from .power_iterations import power_iterations
+from .power_starts import power_iterations
 from .uncertainty_blocks import (
     Block,
     Perturbation,

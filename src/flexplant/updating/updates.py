@@ -12,7 +12,7 @@ from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
-from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
+from .changed_models import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst
 from .parameters import Parameter, checked_parameters, checked_values

@@ -14,7 +14,7 @@ from ...errors import LabelError
 from ...loop.blocks import as_block
 from ...loop.broken import inverted, largest_sensitivity
 from ...lti.frequency_sweep import resonance_grid
-from ...lti.responses import responses
+from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
 from ...plant.axes import DrivenAxes, complex_gain, elastic, real_gain

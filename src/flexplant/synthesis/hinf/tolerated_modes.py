@@ -13,11 +13,11 @@ from ...checks import ComplexArray, FloatArray, Value
 from ...errors import AssumptionError, ModelError
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
-from ...lti.responses import points, responder
+from ...lti.response_solvers import points, responder
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant, StandardPlant
 from ...plant.realisation import natural
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import RANK, TINY
 from ..robustness.uncertainty_blocks import FullBlock, block_places, evened
 

@@ -12,7 +12,7 @@ from ..checks import FloatArray, Matrix
 from ..errors import ModelError, ShapeError, attempted, warn
 from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
-from ..modes.normal_form import RIGID_DRAG
+from ..modes.normal_forms import RIGID_DRAG
 from ..reduction import ReducedModel
 from ..sparse.symmetric import beyond, matrix_sum, orthonormalised
 from ..structure.definite import why_indefinite

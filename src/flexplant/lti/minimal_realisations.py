@@ -16,7 +16,7 @@ from .joining import block_matrix, is_block_diagonal, joined_blocks
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
 from .modal_map import DOUBLE, eigenvalues_with_error
-from .responses import responses
+from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
 #: shares and Hankel singular values below this of what they are computed from are rounding

@@ -23,7 +23,7 @@ from .fit import Fit
 from .kind import DEVIATIONS, Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta
 from .neglected import Neglected
-from .neglected_modes import NeglectedModes, with_neglected
+from .neglected_dynamics import NeglectedModes, with_neglected
 from .parameter_amounts import ParameterDelta, require_matrices
 
 #: values of the Deltas at which the channels are compared with a plant assembled anew

@@ -14,13 +14,13 @@ from ...errors import AssumptionError, ModelError
 from ...loop import ClosedLoop, close_loop
 from ...lti.discretisation import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
-from ...lti.responses import Responder, responder
+from ...lti.response_solvers import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...plant import AnyPlant, StandardPlant
 from ...plant.building import at_rate
-from ...plant.uncertainty.neglected_modes import with_neglected
+from ...plant.uncertainty.neglected_dynamics import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
-from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval

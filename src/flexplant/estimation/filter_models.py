@@ -18,7 +18,7 @@ from ..plant import AnyPlant, StandardPlant
 from ..plant.partitioned import require_noise
 from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
-from .left_out import LeftOut
+from .left_out_modes import LeftOut
 
 #: said where a covariance is followed sample by sample and cannot be
 FEW_DIGITS = (

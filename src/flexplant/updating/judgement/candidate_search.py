@@ -13,7 +13,7 @@ from ...checks import whole as counted
 from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
-from ..changed_model import FullBasis
+from ..changed_models import FullBasis
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
 from .goodness import chance, is_bad

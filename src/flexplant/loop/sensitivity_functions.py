@@ -24,7 +24,7 @@ from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
 from ..lti.measured_lines import on_lines
-from ..lti.responses import remembered, responder
+from ..lti.response_solvers import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import AnyPlant, SensorPort
 from ..tolerances import SAME
