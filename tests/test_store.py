@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from flexplant import DofSet, load
-from flexplant.checks import Value
 from flexplant.errors import FlexplantError
 from flexplant.lti import StateSpace
+from flexplant.store import Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)

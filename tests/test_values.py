@@ -9,20 +9,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from flexplant.checks import (
-    Value,
-    check_names,
-    frozen,
-    generator,
-    name_list,
-    positive,
-    real_array,
-    rebuild,
-    seed_sequence,
-    signal_names,
-    whole,
-)
+from flexplant.arrays import positive, real_array, whole
 from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.seeds import generator, seed_sequence
+from flexplant.store import Value, frozen, rebuild
+from flexplant.words import check_names, name_list, signal_names
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .checks import ComplexArray
+from .arrays import ComplexArray
 from .store import Value
 
 

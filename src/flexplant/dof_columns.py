@@ -11,9 +11,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .checks import FloatArray, IntArray, Value, check_names, name_list, real_array, several, short
-from .errors import LabelError, ShapeError, unknown_label
+from .arrays import FloatArray, IntArray, real_array
+from .errors import LabelError, ShapeError, short, unknown_label
+from .store import Value
 from .tolerances import SAME
+from .words import check_names, name_list, several
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 #: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .checks import FloatArray, IntArray, Value, frozen, instance, name_list, real_array
+from .arrays import FloatArray, IntArray, real_array
 from .dof_columns import DIRECTIONS as DIRECTIONS
 from .dof_columns import (
     DofIndex,
@@ -27,7 +27,9 @@ from .dof_columns import (
 from .dof_columns import Interpolation as Interpolation
 from .dof_columns import Place as Place
 from .errors import LabelError, ShapeError, counted, require_known, unknown_label
+from .store import Value, frozen
 from .tolerances import SAME
+from .words import instance, name_list
 
 
 def checked_direction(direction: Any, name: str = "direction") -> str:

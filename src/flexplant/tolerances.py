@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .checks import FloatArray
+from .arrays import FloatArray
 
 #: in the place of zero where something is divided by it, or its logarithm taken; not relative:
 #: no size in SI units is smaller, and 1e8 times its reciprocal is a number still

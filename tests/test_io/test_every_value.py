@@ -19,13 +19,13 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import estimation, load, lti, placement, structure, synthesis
 from flexplant import plant as plants
-from flexplant.checks import Value, rebuild
 from flexplant.errors import FlexplantError
 from flexplant.estimation import LeftOut
 from flexplant.loop import close_loop
 from flexplant.modes import normal_form
 from flexplant.reduction import select_dofs
 from flexplant.simulation import LearnedFeedforward, error_map, exposure_errors
+from flexplant.store import Value, rebuild
 from flexplant.updating import eigenvalue_sensitivities
 from stages import CORNERS, RATE, Z8, full, ports, reduced, some_modes
 from test_layers import LEVEL

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.checks import with_unit
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.plot.html_page import neighbours
+from flexplant.words import with_unit
 from stages import RATE, ports, reduced, some_modes
 
 CHROMIUM = next(

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.checks import in_unit
 from flexplant.errors import ModelError
 from flexplant.lti import inverse_sensitivity, tf
 from flexplant.plot import CYCLE, STYLES
 from flexplant.plot._axes import styles
+from flexplant.words import in_unit
 from stages import reduced, sampled
 
 PLANT = tf([1.0], [1.0, 1.0, 0.0])

@@ -6,10 +6,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, with_unit
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import counted
 from ..plant import AnyPlant
 from ..tolerances import SAME, TINY, divisor
+from ..words import with_unit
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root
 from .innovations import ExcessPeak, InnovationLines, InnovationParts, impulse, steady_gain

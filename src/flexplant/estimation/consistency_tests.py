@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, between, instance, real_array, short
-from ..errors import ModelError, ShapeError, counted
+from ..arrays import ComplexArray, FloatArray, between, real_array
+from ..errors import ModelError, ShapeError, counted, short
 from ..loop import ClosedLoop
 from ..plant import AnyPlant
+from ..store import Value
+from ..words import instance
 from .causes import (
     Cause,
     Examined,

@@ -14,17 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    Value,
-    in_unit,
-    instance,
-    members,
-    short,
-    sizes_of,
-)
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import (
     AssumptionError,
     CertificateError,
@@ -34,6 +24,7 @@ from ..errors import (
     aligned,
     counted,
     require_known,
+    short,
     warn,
 )
 from ..loop import ClosedLoop, close_loop
@@ -45,7 +36,9 @@ from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant
+from ..store import Value
 from ..tolerances import SAME, TINY, divisor
+from ..words import in_unit, instance, members, sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;

@@ -12,21 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Value,
-    instance,
-    known_units,
-    real_array,
-    sizes_of,
-)
+from ..arrays import BoolArray, FloatArray, IntArray, real_array
 from ..errors import SolverError, counted, unknown_label, warn
 from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
+from ..store import Value
+from ..words import instance, known_units, sizes_of
 from .estimator_channels import ChannelError, estimates, recorded
 from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother

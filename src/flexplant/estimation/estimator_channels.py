@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, floats, real_array, short
-from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
+from ..arrays import FloatArray, floats, real_array
+from ..errors import AssumptionError, LabelError, ModelError, ShapeError, short, unknown_label
 from ..lti.statespace import System
 from ..plant import AnyPlant, GeneralizedPlant, plant_of, standard_plant
 

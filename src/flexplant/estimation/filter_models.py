@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import FloatArray, IntArray, real_array
 from ..certificates import Certificate
-from ..checks import FloatArray, IntArray, Value, real_array
 from ..errors import CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import difference_of, solve_stein, square_root
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, StandardPlant
 from ..plant.partitioned import require_noise
+from ..store import Value
 from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out_modes import LeftOut

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant

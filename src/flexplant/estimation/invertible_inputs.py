@@ -9,13 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, check_names, name_list
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, require_known
 from ..lti.equations import state_scale
 from ..lti.statespace import System
 from ..plant import AnyPlant
 from ..plant.partitioned import require_sampled
+from ..store import Value
 from ..tolerances import SPLIT, TINY, divisor
+from ..words import check_names, name_list
 from .estimator_channels import checked_plant
 from .filter_models import FilterModel, filter_model
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import CertificateError, ModelError, SolverError
 from ..lti.lyapunov import dual_variances
 from ..lti.riccati import filter_dare, riccati_root

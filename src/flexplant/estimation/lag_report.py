@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, checked, positive_array, whole
+from ..arrays import FloatArray, positive_array, whole
 from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
@@ -20,6 +20,7 @@ from ..parallel import one_thread
 from ..plant import AnyPlant, standard_plant
 from ..plant.partitioned import require_sampled
 from ..plant.rigid_body import rigid_rows
+from ..store import Value, checked
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .filter_models import Sight, Steady

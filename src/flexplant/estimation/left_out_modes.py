@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..lti.modal_map import ModalMap
@@ -25,6 +25,7 @@ from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
+from ..store import Value
 from ..structure import FEModel
 from ..tolerances import SAME, TINY, divisor
 from .error import error_variances

@@ -9,14 +9,24 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import FloatArray, real_array, whole
 from ..certificates import Certificate
-from ..checks import FloatArray, Value, instance, real_array, short, sizes_of, whole
-from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, require_known
+from ..errors import (
+    CertificateError,
+    LabelError,
+    ModelError,
+    ShapeError,
+    counted,
+    require_known,
+    short,
+)
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
+from ..store import Value
 from ..tolerances import TINY
+from ..words import instance, sizes_of
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
 from .filter_models import (
     AGREEMENT,

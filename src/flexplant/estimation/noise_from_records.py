@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, ModelError, SolverError, counted, warn
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import AnyPlant
+from ..store import Value
 from ..tolerances import SETTLED, TINY
 from .causes import settling
 from .consistency_tests import consistency

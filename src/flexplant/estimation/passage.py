@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csgraph
 
-from ..checks import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray
 from ..lti.discretisation import Recursion
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein

@@ -10,15 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..arrays import FloatArray, positive
 from ..certificates import Certificate
-from ..checks import FloatArray, Value, checked, instance, positive, sizes_of
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
+from ..store import Value, checked
 from ..tolerances import TINY, divisor
+from ..words import instance, sizes_of
 from .estimator_channels import checked_plant, poi_channels, row_of
 from .filter_models import (
     AGREEMENT,

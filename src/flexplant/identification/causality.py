@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import warn
 from ..lti.frequency import Frf
 from .diagram import affordable, line_windows, moments_in

@@ -14,23 +14,21 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import (
+from ..arrays import (
     BoolArray,
     ComplexArray,
     FloatArray,
     IntArray,
-    Value,
     between,
-    checked,
     complex_array,
     real_array,
-    several,
-    short,
     whole,
 )
-from ..errors import ModelError, SolverError, counted
+from ..errors import ModelError, SolverError, counted, short
 from ..modes.matching import assigned, in_span
+from ..store import Value, checked
 from ..tolerances import TINY
+from ..words import several
 from .line_weights import PreparedLines
 
 #: flags of a pole, each including the ones before

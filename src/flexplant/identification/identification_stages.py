@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, IntArray
+from ..arrays import ComplexArray, IntArray
 from ..errors import ModelError, ShapeError, SolverError, attempted, counted, warn
 from ..lti.frequency import Frf
 from ..modes.matching import mac_matrix

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import IntArray, between, instance, positive, real_array, several, short, whole
-from ..errors import LabelError, ModelError, SolverError, require_known
+from ..arrays import IntArray, between, positive, real_array, whole
+from ..errors import LabelError, ModelError, SolverError, require_known, short
 from ..lti.frequency import Frf
 from ..parallel import one_thread
 from ..tolerances import ROUNDING
+from ..words import instance, several
 from .causality import forward_in_time
 from .diagram import (
     PoleSelection,

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive, short
-from ..errors import ModelError, ShapeError, SolverError, counted, require_known
+from ..arrays import ComplexArray, FloatArray, IntArray, between, positive
+from ..errors import ModelError, ShapeError, SolverError, counted, require_known, short
 from ..lti.frequency import Frf
+from ..store import Value
 from ..tolerances import TINY
+from ..words import instance
 from .line_weights import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, error_statistics, records

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import BoolArray, ComplexArray, FloatArray, frequency_band, instance
+from ..arrays import BoolArray, ComplexArray, FloatArray, frequency_band
 from ..errors import ModelError
 from ..lti.frequency import Frf
+from ..words import instance
 
 #: lines over which what a fit leaves is averaged to a variance
 WINDOW = 41

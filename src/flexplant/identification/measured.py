@@ -10,24 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    between,
-    check_names,
-    complex_array,
-    instance,
-    positive,
-    real_array,
-    several,
-    short,
-    whole,
-)
-from ..errors import LabelError, ModelError, ShapeError, counted, some_names
+from ..arrays import ComplexArray, FloatArray, between, complex_array, positive, real_array, whole
+from ..errors import LabelError, ModelError, ShapeError, counted, short, some_names
 from ..modes import Modes
 from ..modes.matching import assigned, in_span
+from ..store import Value
 from ..tolerances import SAME, SPLIT
+from ..words import check_names, instance, several
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..modes.matching import mac_matrix
 from ..tolerances import TINY
 from .refine import PoleFit, scaled_inverse

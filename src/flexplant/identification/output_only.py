@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, below_half_rate, frequency_band, positive, whole
+from ..arrays import ComplexArray, FloatArray, below_half_rate, frequency_band, positive, whole
 from ..errors import ModelError, SolverError
 from ..modes.matching import assigned, mac_matrix
 from ..parallel import Progress, tick

@@ -7,18 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    checked,
-    frequency_band,
-    generator,
-    positive,
-    whole,
-)
+from ..arrays import ComplexArray, FloatArray, frequency_band, positive, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
+from ..seeds import generator
+from ..store import Value, checked
 from ..tolerances import TINY, TYPED
 from .spectra import Records, error_statistics
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from .model_error import coherence, own_cost, twin_poles
 from .refine import Lines, PoleFit, pivoted, refined

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
 from ..tolerances import RANK, TINY
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
 from ..tolerances import TINY

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, checked, positive, real_array, signal_names
+from ..arrays import ComplexArray, FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, require_known, warn
 from ..lti.frequency import ORDERS, Frf
 from ..lti.measured_lines import checked_overlap, checked_window
+from ..store import Value, checked
 from ..tolerances import ROUNDING, TINY
+from ..words import signal_names
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, flag, instance, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, whole
 from ..errors import LabelError, ModelError, counted, warn
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
 from ..tolerances import divisor
+from ..words import flag, instance
 from .result import IdentifiedModes
 
 #: part of the largest eigenvalue of an inertia or a flexibility below which one is noise, and by

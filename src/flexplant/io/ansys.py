@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet, node_dofs

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..tolerances import ROUNDING
 
 CARTESIAN, CYLINDRICAL, SPHERICAL = "cartesian", "cylindrical", "spherical"

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, instance, positive, real_array
+from ..arrays import FloatArray, IntArray, positive, real_array
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.unit_systems import Units
 from ..structure.unit_systems import units as unit_system
+from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
 #: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits

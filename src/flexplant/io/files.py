@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, several, short
-from ..errors import FlexplantError, ModelError
+from ..arrays import FloatArray
+from ..errors import FlexplantError, ModelError, short
 from ..structure import FEMatrices
+from ..words import several
 
 #: characters of a number that a program printed, at least; shorter ones may be typed by hand
 _PRINTED = 12

@@ -16,13 +16,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..checks import one_of
 from ..errors import LabelError, ModelError, warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import written
 from ..synthesis.aftercare.c_code import c_name, c_program
 from ..synthesis.aftercare.c_text import CText
+from ..words import one_of
 from .files import file_path
 
 #: the types are those that the specification names, spelled out where they are pointers or numbers

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, instance, mapping
+from ..arrays import FloatArray
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, require_known
 from ..lti.frequency import Frf
 from ..store import written
+from ..words import instance, mapping
 from .files import decimal, file_path, parsing, refused, text_of
 from .mat_matrices import mat_variables
 

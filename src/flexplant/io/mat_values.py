@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy
 
-from ..checks import short
-from ..errors import LabelError, ModelError, require_known
+from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DofSet
 from ..loop import ClosedLoop
 from ..lti.frequency import Frf

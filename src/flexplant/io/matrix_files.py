@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 
 
 class RecordedChannels(NamedTuple):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import FlexplantError, ModelError
 from .files import damaged, decimal, numbers_of_lines, refused, text_of, unread, wrong_line_of
 from .record_channels import RecordedChannels

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import positive
+from ..arrays import positive
 from ..errors import FlexplantError
 from ..simulation import Response
 from .files import file_path, refused, unread

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..dof_columns import LARGEST_NODE, at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet, node_dofs

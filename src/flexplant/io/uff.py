@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import positive
+from ..arrays import positive
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..identification import MeasuredModes

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, short
-from ..errors import FlexplantError, ModelError
+from ..arrays import ComplexArray, FloatArray
+from ..errors import FlexplantError, ModelError, short
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS
 from ..structure.unit_systems import GRAVITY, POUND

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..labels import DIRECTIONS
 from ..tolerances import SAME
 from .coordinate_systems import BASIC, CARTESIAN, CYLINDRICAL, SPHERICAL, System, axes_along

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, positive
+from ..arrays import FloatArray, positive
 from ..loop import Spectrum
 from .files import file_path, refused, unread
 from .record_channels import RecordedChannels

@@ -11,13 +11,15 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray, Value, instance, real_array
+from ..arrays import FloatArray, IntArray, real_array
 from ..dof_columns import component_columns
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..reduction import ReducedModel
+from ..store import Value
 from ..structure import FEModel
 from ..tolerances import SAME
+from ..words import instance
 
 #: either kind of model that can be joined
 Model = FEModel | ReducedModel

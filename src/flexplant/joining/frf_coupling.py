@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, flag, instance, mapping
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
 from ..tolerances import divisor
+from ..words import flag, instance, mapping
 from .frf_joints import (
     FrfLink,
     channel_rows,

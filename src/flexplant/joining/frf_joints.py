@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, instance
+from ..arrays import ComplexArray, FloatArray
 from ..dof_columns import at_nodes
 from ..errors import LabelError, ModelError, unknown_label, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
+from ..words import instance
 from .joint import Joint, JointEnd, Patch, joint_axes
 
 #: a joint that adds less than this part to the others repeats them

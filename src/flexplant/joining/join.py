@@ -12,13 +12,14 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray, Value, frozen
+from ..arrays import FloatArray, IntArray
 from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.statics import static_response
 from ..reduction import ReducedModel
 from ..sparse.symmetric import dense, orthonormalised
+from ..store import Value, frozen
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, rigid_body_basis
 from ..tolerances import SAME, TINY, divisor

@@ -9,21 +9,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checks import (
-    FloatArray,
-    IntArray,
-    Value,
-    instance,
-    name_list,
-    positive_array,
-    real_array,
-    short,
-)
+from ..arrays import FloatArray, IntArray, positive_array, real_array
 from ..dof_columns import node_numbers
-from ..errors import LabelError, ModelError, require_known
+from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, DofSet
+from ..store import Value
 from ..structure.rigid import rigid_motions
 from ..tolerances import SAME
+from ..words import instance, name_list
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
 End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"

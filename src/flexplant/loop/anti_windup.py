@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import ModelError, counted
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..tolerances import ROUNDING, TINY, divisor

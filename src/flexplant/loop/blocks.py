@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, inner_names
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, LabelError, ModelError, unknown_label
 from ..lti.interconnection import among, connect
 from ..lti.joining import equal_matrices
@@ -16,6 +16,7 @@ from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..tolerances import SAME
+from ..words import inner_names
 from .anti_windup import recovery_gain
 
 

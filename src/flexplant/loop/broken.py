@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, short
-from ..errors import LabelError
+from ..arrays import ComplexArray, FloatArray
+from ..errors import LabelError, short
 from ..lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
 from ..lti.response_solvers import Responder, responder

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, in_unit, instance, real_array, short
+from ..arrays import FloatArray, IntArray, real_array
 from ..errors import (
     AssumptionError,
     CertificateError,
@@ -17,6 +17,7 @@ from ..errors import (
     ModelError,
     aligned,
     require_known,
+    short,
 )
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
@@ -25,7 +26,9 @@ from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
 from ..plant.evaluation_model import NOT_JUDGED
+from ..store import Value
 from ..tolerances import divisor
+from ..words import in_unit, instance
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
 AGREEMENT = 1e-6

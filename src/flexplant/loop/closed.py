@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import ComplexArray, FloatArray, whole
 from ..certificates import one_line
-from ..checks import ComplexArray, FloatArray, Value, name_list, whole
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
@@ -20,6 +20,8 @@ from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
+from ..store import Value
+from ..words import name_list
 from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (

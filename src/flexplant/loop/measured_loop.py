@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, flag, instance, positive
+from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.frequency import Frf
 from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import TINY
+from ..words import flag, instance
 from .broken import BrokenLoop
 
 #: degrees of freedom above which a variance is taken as it is

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import BoolArray, ComplexArray, FloatArray, IntArray
+from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..lti.response_solvers import Responder, points, responder
 from ..lti.sampling import acting

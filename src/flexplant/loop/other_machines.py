@@ -10,18 +10,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..arrays import FloatArray, IntArray, floats, positive, real_array, whole
 from ..certificates import one_line, stability_name
-from ..checks import (
-    FloatArray,
-    IntArray,
-    Value,
-    checked,
-    floats,
-    generator,
-    positive,
-    real_array,
-    whole,
-)
 from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
@@ -29,6 +19,8 @@ from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
+from ..seeds import generator
+from ..store import Value, checked
 from ..tolerances import TINY
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached

@@ -8,11 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, instance, mapping, whole
+from ..arrays import ComplexArray, FloatArray, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import climbed_grid, crossings, highest
 from ..plant.evaluation_model import NOT_JUDGED
+from ..store import Value
 from ..tolerances import SPLIT
+from ..words import instance, mapping
 from .blocks import references
 from .broken import BrokenLoop, inverted
 from .closed import ClosedLoop

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, short
+from ..arrays import ComplexArray, FloatArray
 from ..errors import (
     AssumptionError,
     LabelError,
@@ -17,6 +17,7 @@ from ..errors import (
     ShapeError,
     counted,
     require_known,
+    short,
     unknown_label,
     warn,
 )

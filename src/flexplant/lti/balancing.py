@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import FloatArray, Value, positive
+from ..arrays import FloatArray, positive
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
+from ..store import Value
 from .interconnection import parallel, series
 from .lyapunov import compressed, controllability_factor, observability_factor
 from .modal import StableSplit, split_stable

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, between, positive
+from ..arrays import FloatArray, between, positive
 from ..errors import ModelError
 from ..tolerances import ROUNDING
 from .joining import bilinear_matrices, trapezoidal

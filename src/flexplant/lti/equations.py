@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError
 from ..tolerances import SPLIT, TINY, divisor
 

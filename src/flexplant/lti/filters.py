@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import between, number, positive, whole
+from ..arrays import between, number, positive, whole
 from ..errors import ModelError
 from ..tolerances import SAME
 from .interconnection import series

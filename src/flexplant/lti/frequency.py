@@ -11,23 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    checked,
-    complex_array,
-    known_units,
-    name_list,
-    positive,
-    positive_array,
-    rebuild,
-    short,
-    signal_names,
-)
-from ..errors import LabelError, ModelError, ShapeError, counted, require_known
+from ..arrays import ComplexArray, FloatArray, complex_array, positive, positive_array
+from ..errors import LabelError, ModelError, ShapeError, counted, require_known, short
 from ..parallel import Progress, expect
+from ..store import Value, checked, rebuild
 from ..tolerances import SAME
+from ..words import known_units, name_list, signal_names
 from .frequency_sweep import checked_freq as checked_freq
 from .frequency_sweep import default_freq as default_freq
 from .frequency_sweep import sampled_freq as sampled_freq

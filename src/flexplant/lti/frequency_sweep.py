@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
 from ..tolerances import ROUNDING, SPLIT, TINY
 from .response_solvers import continuous_poles, responder

@@ -8,9 +8,10 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..checks import ComplexArray, FloatArray, inner_names, instance, name_list, short
-from ..errors import LabelError, ModelError, ShapeError, require_known
+from ..arrays import ComplexArray, FloatArray
+from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..tolerances import ROUNDING
+from ..words import inner_names, instance, name_list
 from .equations import balanced_matrix
 from .joining import Matrices, block_matrix, common_dt, common_fields, joined_units, state_names
 from .statespace import StateSpace, System, as_statespace

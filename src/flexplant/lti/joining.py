@@ -13,21 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    complex_array,
-    instance,
-    name_list,
-    positive,
-    real_array,
-    several,
-    short,
-    whole,
-)
-from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array, whole
+from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..tolerances import ROUNDING, SPLIT, divisor
+from ..words import instance, name_list, several
 from .equations import mean_speed, reciprocal, state_scale
 
 #: A, B, C, D

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
 from ..tolerances import divisor

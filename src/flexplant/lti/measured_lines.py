@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, between, complex_array
+from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, between, complex_array
 from ..errors import ModelError, ShapeError
 from ..tolerances import ROUNDING, SAME, TINY
 

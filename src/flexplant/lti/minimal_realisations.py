@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..checks import ComplexArray, FloatArray, between
+from ..arrays import ComplexArray, FloatArray, between
 from ..tolerances import TINY
 from .equations import reciprocal, state_scale
 from .joining import block_matrix, is_block_diagonal, joined_blocks

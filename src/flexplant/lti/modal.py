@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, positive
+from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import SolverError, counted
+from ..store import Value
 from .equations import state_scale
 from .joining import block_eigenvalues, is_block_diagonal
 from .modal_map import eigenvalues_with_error, uncertain_poles

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from .equations import even_scale, state_scale
 from .joining import diagonal_blocks, is_block_diagonal
 from .statespace import StateSpace

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
 from .equations import axis_frequencies, state_scale

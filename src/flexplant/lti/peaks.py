@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..tolerances import divisor
 from .modal_map import block_form, diagonal_form
 from .statespace import StateSpace

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
 from .equations import scaled_schur

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, real_array
+from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
+from ..store import Value
 from ..tolerances import RANK, SPLIT, divisor
 from .equations import (
     OnAxisError,

@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, check_names, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, ModelError, warn
 from ..tolerances import SAME, TINY, divisor
+from ..words import check_names
 from .equations import state_scale
 from .joining import block_eigenvalues, diagonal_blocks, uncoupled_run
 from .lyapunov import compressed

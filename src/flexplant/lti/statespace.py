@@ -11,21 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    Value,
-    complex_array,
-    known_units,
-    mapping,
-    positive,
-    real_array,
-    short,
-    signal_names,
-)
-from ..errors import FlexplantError, ModelError, ShapeError, counted
+from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
+from ..errors import FlexplantError, ModelError, ShapeError, counted, short
+from ..store import Value
 from ..tolerances import divisor
+from ..words import known_units, mapping, signal_names
 from .joining import (
     Channels,
     block_eigenvalues,

@@ -9,9 +9,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, known_units, one_of, positive, real_array, with_unit
+from ..arrays import FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, require_known
+from ..store import Value
 from ..tolerances import SPLIT, TYPED
+from ..words import known_units, one_of, with_unit
 from .discretisation import Recursion
 from .response_solvers import continuous_poles
 from .sampling import held_exactly

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError
 from ..lti.frequency_sweep import FLOOR
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..tolerances import ROUNDING, TINY, divisor
 
 #: shapes below this part of the largest one of their span are none: rounding

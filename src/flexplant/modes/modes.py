@@ -9,13 +9,10 @@ from typing import Any, cast
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import (
+from ..arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
-    Value,
-    checked,
-    instance,
     positions,
     positive,
     real_array,
@@ -23,8 +20,10 @@ from ..checks import (
 )
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..labels import DofSet, Place
+from ..store import Value, checked
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
+from ..words import instance
 from .matching import pair_modes
 from .normal_forms import pole_pairs
 

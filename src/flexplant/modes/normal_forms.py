@@ -10,9 +10,10 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, Matrix, real_array, whole
 from ..errors import ModelError, SolverError, counted
 from ..sparse.symmetric import dense, orthonormalised
+from ..store import Value
 from ..structure.definite import elastic_modes, signed_square
 from ..tolerances import SAME, divisor
 from .matching import runs

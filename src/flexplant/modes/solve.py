@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, instance, positive, short
-from ..errors import ModelError, SolverError, counted, warn
+from ..arrays import ComplexArray, FloatArray, positive
+from ..errors import ModelError, SolverError, counted, short, warn
 from ..labels import Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT
@@ -29,6 +29,7 @@ from ..sparse.symmetric import (
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
 from ..tolerances import ROUNDING, TINY, divisor
+from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
 from .sparse_modes import counted_modes

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, Matrix, Rng
+from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
+from ..seeds import Rng
 from ..sparse.lowest import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.other_factors import Cholmod, Pardiso
 from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of

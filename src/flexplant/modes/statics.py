@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, short
-from ..errors import ModelError, SolverError, attempted, counted
+from ..arrays import FloatArray, Matrix
+from ..errors import ModelError, SolverError, attempted, counted, short
 from ..labels import DofSet, Place
 from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
 from ..sparse.lowest import multifrontal_inertia, signed_factor

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, checked, mapping, positive
+from ..arrays import FloatArray, positive
 from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
 from ..estimation.estimator_channels import sensors
@@ -19,7 +19,9 @@ from ..lti.riccati import control_dare
 from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
+from ..store import checked
 from ..synthesis import design_hinf
+from ..words import mapping
 from .candidates import Port, side_of
 from .convex import Quadratic, chosen_rows, measured, quadratic
 from .criterion import AGREEMENT, Criterion, Scorer

@@ -11,21 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
-from ..checks import (
-    FloatArray,
-    Value,
-    checked,
-    mapping,
-    members,
-    name_list,
-    number,
-    one_of,
-    positive,
-    short,
-    whole,
-)
-from ..errors import LabelError, ModelError, some_names
+from ..arrays import FloatArray, number, positive, whole
+from ..errors import LabelError, ModelError, short, some_names
+from ..store import Value, checked
 from ..tolerances import TINY
+from ..words import mapping, members, name_list, one_of
 from .candidates import Places
 from .convex import Branch, chosen_rows
 from .zones import Disc, Zone

@@ -13,12 +13,13 @@ from typing import TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, Value
+from ..arrays import FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.lyapunov import square_root
 from ..lti.riccati import control_dare, riccati_root
+from ..store import Value
 from ..tolerances import SETTLED, TINY, divisor
 from .criterion import Scorer
 

@@ -10,9 +10,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, checked, function, short, with_unit
-from ..errors import FlexplantError, ModelError
+from ..arrays import FloatArray, IntArray
+from ..errors import FlexplantError, ModelError, short
 from ..plant import StandardPlant
+from ..store import Value, checked
+from ..words import function, with_unit
 from .candidates import Port, Side, sides_of, with_side
 
 #: relative: a fast score and the criterion on the plant itself agree to this, and so do two ways

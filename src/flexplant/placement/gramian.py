@@ -8,11 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, checked, one_of
+from ..arrays import FloatArray, IntArray
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
+from ..store import checked
 from ..tolerances import RANK, TINY, divisor
+from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
 from .criterion import Criterion, Scorer, by_size

@@ -9,13 +9,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, checked, flag, instance, one_of
+from ..arrays import FloatArray, IntArray
 from ..errors import InfeasibleError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import EffectiveIndependence, ReducedModel
 from ..reduction.criteria import SelectionCriterion
+from ..store import checked
 from ..structure import FEModel
 from ..tolerances import divisor
+from ..words import flag, instance, one_of
 from ..work import Work
 from .candidates import Port
 from .criterion import Criterion, Scorer, by_size

@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, checked, flag, instance, one_of, positive, short
-from ..errors import LabelError, ModelError, only_one, require_known
+from ..arrays import FloatArray, positive
+from ..errors import LabelError, ModelError, only_one, require_known, short
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..estimation.estimator_channels import sensors
 from ..lti.sampling import held_exactly, reaches_at_once
@@ -17,6 +17,8 @@ from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant
 from ..plant.building import direct_effect
 from ..plant.partitioned import require_noise
+from ..store import checked
+from ..words import flag, instance, one_of
 from .candidates import Port, with_side
 from .convex import WorstRow, quadratic
 from .criterion import Criterion, OnBoth, OnPlant, Scorer

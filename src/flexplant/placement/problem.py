@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value
+from ..arrays import FloatArray, IntArray
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
 from ..plant.assumptions import ABSENT
+from ..store import Value
 from ..tolerances import SETTLED, divisor
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side

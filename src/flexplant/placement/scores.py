@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, IntArray, Value, instance, positive, real_array, short, whole
-from ..errors import LabelError, ModelError, counted
+from ..arrays import FloatArray, IntArray, positive, real_array, whole
+from ..errors import LabelError, ModelError, counted, short
 from ..plant import Sensor, StandardPlant
 from ..plant.port import Quantity
+from ..store import Value
+from ..words import instance
 from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
 from .constraints import Constraint, all_of, constraint_rows, constraints_of

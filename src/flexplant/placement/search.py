@@ -10,10 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Rng, Value, checked, instance, name_list, positive, short, whole
-from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known, some_names
+from ..arrays import FloatArray, positive, whole
+from ..errors import (
+    InfeasibleError,
+    LabelError,
+    ModelError,
+    counted,
+    require_known,
+    short,
+    some_names,
+)
 from ..fingerprints import fingerprint
 from ..plant import Actuator, StandardPlant
+from ..seeds import Rng
+from ..store import Value, checked
+from ..words import instance, name_list
 from ..work import Work
 from .branch_and_bound import Exchange
 from .candidates import Places, Port, candidate_places, known_candidates, sampled_plant, side_of

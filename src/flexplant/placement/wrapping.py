@@ -12,11 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, checked, function, one_of, positive, short
-from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted
+from ..arrays import FloatArray, positive
+from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted, short
 from ..plant import StandardPlant
 from ..plant.scheduling import values_over
+from ..store import checked
 from ..tolerances import TINY
+from ..words import function, one_of
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .convex import Below, Branch, Convex, Tangent, least_sum
 from .criterion import Criterion, Scorer, Wrapping, as_criterion

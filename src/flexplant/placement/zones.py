@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, checked, floats_of, positive
+from ..arrays import FloatArray, floats_of, positive
 from ..errors import ModelError
+from ..store import Value, checked
 
 _PLACE = checked(floats_of, count=2, unit="m")
 

@@ -77,6 +77,8 @@ from .assumptions import Assumption as Assumption
 from .assumptions import AssumptionReport as AssumptionReport
 from .axes import DrivenAxes as DrivenAxes
 from .axes import driven_axes as driven_axes
+from .axes_at_gravity import GravityAxes as GravityAxes
+from .axes_at_gravity import gravity_axes as gravity_axes
 from .decoupling import Decoupling as Decoupling
 from .decoupling import decouple as decouple
 from .evaluation_model import EvaluationModel as EvaluationModel
@@ -89,8 +91,6 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
-from .gravity_axes import GravityAxes as GravityAxes
-from .gravity_axes import gravity_axes as gravity_axes
 from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled

@@ -10,12 +10,13 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, counted, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.equations import state_scale
 from ..lti.joining import axis_zeros
 from ..lti.statespace import StateSpace
+from ..store import Value
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partitioned import PartitionedSystem
 from .rigid_body import body_of, rigid_modes

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
 from ..lti.statespace import StateSpace
+from ..store import Value
 from ..tolerances import divisor
+from ..words import name_list
 from .partitioned import Partition
 from .ports import Poi
 from .realisation import natural

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..checks import FloatArray, instance, positive
+from ..arrays import FloatArray, positive
 from ..errors import ModelError, counted
 from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
@@ -16,6 +16,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
+from ..words import instance
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
 from .partitioned import Partition

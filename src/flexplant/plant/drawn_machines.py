@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..tolerances import SAME
 from .realisation import ModalRealisation, natural
 from .remade import rebuilt

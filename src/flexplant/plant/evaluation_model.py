@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from ..checks import Value, instance
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel
+from ..store import Value
 from ..structure import FEModel
 from ..structure.rigid import Structure
+from ..words import instance
 from .ports import Ports
 from .realisation import ModalRealisation, plant_modes
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import LabelError, ModelError, some_names, warn
 from ..tolerances import SAME
 from .building import P, continuous_plant, loud_like, sampled_like

@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, Value, between, checked, positive, real_array
+from ..arrays import FloatArray, between, positive, real_array
 from ..errors import require_known
 from ..labels import Place
 from ..lti.statespace import StateSpace
+from ..store import Value, checked
 from ..structure.rigid import turned_about
 from .port import ForcePort, force_unit, motion_unit
 from .realisation import ModalRealisation

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, instance, name_list, short
-from ..errors import ModelError, require_known
+from ..arrays import FloatArray
+from ..errors import ModelError, require_known, short
 from ..labels import Place
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace, single_channel
+from ..words import instance, name_list
 from .assumptions import AssumptionReport
 from .building import at_rate
 from .evaluation_model import EvaluationModel

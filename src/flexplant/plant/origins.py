@@ -7,8 +7,9 @@ from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Value
+from ..arrays import FloatArray
 from ..lti.statespace import StateSpace
+from ..store import Value
 from .ports import Ports
 from .realisation import ModalRealisation
 

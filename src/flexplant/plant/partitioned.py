@@ -9,7 +9,7 @@ from typing import Any, Self, TypeGuard
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, mapping, name_list, positive, real_array, short
+from ..arrays import FloatArray, IntArray, positive, real_array
 from ..errors import (
     AssumptionError,
     FlexplantError,
@@ -17,11 +17,14 @@ from ..errors import (
     ModelError,
     counted,
     require_known,
+    short,
     some_names,
     unknown_label,
 )
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..store import Value
 from ..structure import FEModel
+from ..words import mapping, name_list
 from .evaluation_model import NOT_JUDGED, EvaluationModel
 from .origins import Assembled, Foreign, Origin, PlantChannel
 from .ports import Ports

@@ -8,10 +8,12 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Value, check_names, flag, positive, real_array, short
-from ..errors import LabelError, ModelError, require_known
+from ..arrays import FloatArray, positive, real_array
+from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, single_channel
+from ..store import Value
+from ..words import check_names, flag
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
 

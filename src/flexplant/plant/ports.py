@@ -6,13 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ..checks import FloatArray, Value, check_names, instance, members, name_list, several, short
-from ..errors import LabelError, ModelError, require_known
+from ..arrays import FloatArray
+from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.filters import pade
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
+from ..store import Value
 from ..structure.rigid import place_motion
+from ..words import check_names, instance, members, name_list, several
 from .forces import Actuator
 from .port import ForcePort, MeasuredRow, Quantity, SensorPort, checked_port, motion_unit, observed
 from .realisation import ModalRealisation

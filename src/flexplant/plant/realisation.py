@@ -9,16 +9,18 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, checked, instance, positive
+from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..lti.joining import block_diagonal
 from ..modes import Modes, NormalForm
 from ..modes.normal_forms import PROPORTIONAL, RealForm, modal, pole_pairs, real_form
 from ..reduction import ReducedModel
+from ..store import Value, checked
 from ..structure import FEModel
 from ..structure.rigid import Structure as Structure
 from ..tolerances import SAME, TINY
+from ..words import instance
 
 T = TypeVar("T")
 

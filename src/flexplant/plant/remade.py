@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import Value, name_list
 from ..errors import require_known
 from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
+from ..store import Value
+from ..words import name_list
 from .building import (
     P,
     changed_densities,

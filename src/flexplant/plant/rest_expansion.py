@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace
 from ..tolerances import divisor

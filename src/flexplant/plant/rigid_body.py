@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, Value
+from ..arrays import FloatArray, IntArray
 from ..errors import AssumptionError, ModelError, attempted, require_known
 from ..labels import DIRECTIONS
+from ..store import Value
 from ..structure import FEModel
 from ..structure.definite import signed_root
 from ..structure.rigid import SPANNED, turned_about

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, instance, number, real_array, short, whole
-from ..errors import LabelError, ModelError, require_known
+from ..arrays import FloatArray, number, real_array, whole
+from ..errors import LabelError, ModelError, require_known, short
 from ..labels import Place
+from ..store import Value
 from ..tolerances import SAME, TYPED
+from ..words import instance
 
 #: points of a position that a mapping of them does not name
 _POINTS = 21

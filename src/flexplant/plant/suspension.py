@@ -9,16 +9,18 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, checked, members, number, positive
+from ..arrays import ComplexArray, FloatArray, number, positive
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes import Modes, normal_form
 from ..modes.matching import runs
 from ..reduction import ReducedModel
 from ..sparse.symmetric import orthonormalised
+from ..store import Value, checked
 from ..structure import Damper, FEModel, Spring
 from ..structure.rigid import SPANNED
 from ..tolerances import SAME, divisor
+from ..words import members
 from .port import checked_place, port_direction
 from .realisation import realise
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value
+from ..arrays import ComplexArray, FloatArray
 from ..lti.joining import block_diagonal
 from ..lti.statespace import StateSpace
+from ..store import Value
 from ..tolerances import SAME, TINY
 from .partitioned import PartitionedSystem
 from .realisation import natural

@@ -16,11 +16,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
-from ..checks import ComplexArray, FloatArray, in_unit, short
-from ..errors import FlexplantError, ModelError
+from ..arrays import ComplexArray, FloatArray
+from ..errors import FlexplantError, ModelError, short
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..tolerances import TINY
+from ..words import in_unit
 
 #: points along a line, of which none shall lie under a legend
 _DENSE = 500

@@ -9,13 +9,14 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ..checks import FloatArray, between, instance, mapping, name_list, positive, real_array
+from ..arrays import FloatArray, between, positive, real_array
 from ..errors import ModelError, ShapeError
 from ..estimation import ConsistencyReport, Estimate, LagReport
 from ..estimation.estimator_channels import row_of
 from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
+from ..words import instance, mapping, name_list
 from ._axes import (
     BLACK,
     BLUE,

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..modes import Modes
 from ..tolerances import divisor
 

@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..certificates import Certificate, figure, one_line, stability_name
-from ..checks import Value, short, with_unit
-from ..errors import FlexplantError, ModelError, counted
+from ..errors import FlexplantError, ModelError, counted, short
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
@@ -30,9 +29,10 @@ from ..plant.evaluation_model import NOT_JUDGED
 from ..reduction import ReducedModel
 from ..rooms import versions
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
-from ..store import written
+from ..store import Value, written
 from ..synthesis import Controller
 from ..updating import Localisation, UpdateResult
+from ..words import with_unit
 from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
 from .bode_diagrams import bode, singular_values
 from .errors import budget, error_map

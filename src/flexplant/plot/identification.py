@@ -8,11 +8,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..checks import ComplexArray, FloatArray, instance
+from ..arrays import ComplexArray, FloatArray
 from ..errors import FlexplantError, ModelError
 from ..identification import IdentifiedModes, StabilisationDiagram, identify_modes
 from ..identification.diagram import PoleSelection
 from ..lti.frequency import Frf
+from ..words import instance
 from ._axes import (
     BLUE,
     GREY,

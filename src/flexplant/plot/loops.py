@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from ..checks import ComplexArray, FloatArray, positive, real_array, short
-from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..arrays import ComplexArray, FloatArray, positive, real_array
+from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..loop import ClosedLoop, complementary_sensitivity, control_sensitivity
 from ..loop import sensitivity as sensitivity_of
 from ..loop.blocks import references

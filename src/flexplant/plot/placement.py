@@ -12,13 +12,14 @@ from matplotlib.colors import LogNorm
 from matplotlib.patches import Circle, Patch
 from matplotlib.patches import Rectangle as Box
 
-from ..checks import FloatArray, IntArray, in_unit, instance, whole
+from ..arrays import FloatArray, IntArray, whole
 from ..errors import ModelError
 from ..placement import Disc, ParetoCurve, SensorMap
 from ..placement.candidates import candidate_places
 from ..placement.mode_shapes import shapes_of
 from ..placement.zones import Zone
 from ..plant import Ports, PositionMap, StandardPlant
+from ..words import in_unit, instance
 from ._axes import (
     BLUE,
     CYCLE,

@@ -15,12 +15,13 @@ from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from ..checks import ComplexArray, FloatArray, IntArray, in_unit, instance, positive, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, positive, whole
 from ..errors import ModelError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
 from ..tolerances import TYPED, divisor
+from ..words import in_unit, instance
 from ._axes import (
     BLACK,
     GREY,

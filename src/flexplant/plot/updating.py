@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..checks import ComplexArray, FloatArray, in_unit, instance, with_unit
+from ..arrays import ComplexArray, FloatArray
 from ..errors import ModelError, counted
 from ..labels import DofSet
 from ..lti.frequency import Frf
@@ -18,6 +18,7 @@ from ..tolerances import TINY
 from ..updating import Correlation, FrfResidual, Localisation, Residual, UpdateResult, correlate
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.search import Objective
+from ..words import in_unit, instance, with_unit
 from ._axes import (
     BLUE,
     CYCLE,

@@ -9,13 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, checked, positive, several, whole
+from ..arrays import FloatArray, IntArray, positive, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.symmetric import dense, unit_diagonal
+from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
+from ..words import several
 from .methods import (
     ReductionMethod,
     Solver,

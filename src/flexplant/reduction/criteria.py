@@ -10,10 +10,12 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, instance, name_list, positive, whole
+from ..arrays import ComplexArray, FloatArray, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
+from ..store import Value
 from ..tolerances import TINY, divisor
+from ..words import instance, name_list
 
 #: shapes at DOFs, real or complex
 Rows: TypeAlias = FloatArray | ComplexArray

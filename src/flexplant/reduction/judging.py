@@ -8,19 +8,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checks import (
+from ..arrays import (
     BoolArray,
     ComplexArray,
     FloatArray,
     IntArray,
-    Value,
     frequency_band,
     positive,
     real_array,
-    short,
     whole,
 )
-from ..errors import ModelError, aligned, counted
+from ..errors import ModelError, aligned, counted, short
 from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
 from ..modes.dynamic_basis import (
@@ -34,6 +32,7 @@ from ..modes.matching import pair_modes
 from ..modes.modes import Modes
 from ..modes.solve import modes_reaching
 from ..modes.statics import held_factor, labels_of, places, static_response
+from ..store import Value
 from ..structure import FEModel
 from ..tolerances import SAME, divisor
 from .ranking import ErrorBound

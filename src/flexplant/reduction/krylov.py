@@ -11,13 +11,14 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, checked, real_array, whole
+from ..arrays import FloatArray, real_array, whole
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..modes.modes import Modes
 from ..modes.statics import held_factor, labels_of, places, static_response
 from ..sparse.factor import DENSE_LIMIT, dynamic_lu
 from ..sparse.symmetric import dense
+from ..store import checked
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
 from .methods import ReductionMethod, fe_model, projected_model

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, Value, checked, instance, name_list
+from ..arrays import FloatArray, Matrix
 from ..errors import LabelError, ModelError, ShapeError, SolverError, attempted, counted, some_names
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, require_real
@@ -20,9 +20,11 @@ from ..modes.statics import places
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
 from ..sparse.symmetric import dense, unit_diagonal
+from ..store import Value, checked
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
 from ..tolerances import RANK, TINY
+from ..words import instance, name_list
 from .criteria import PivotedQr
 from .ranking import ErrorBound
 from .reduced import ReducedModel

@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    Value,
-    checked,
-    complex_array,
-    name_list,
-    positive,
-    real_array,
-)
+from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
@@ -28,9 +18,11 @@ from ..modes.normal_forms import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
 from ..sparse.symmetric import orthonormalised
+from ..store import Value, checked
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
 from ..structure.rigid import SPANNED, relative_miss, rigid_motions
+from ..words import name_list
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 

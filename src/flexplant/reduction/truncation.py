@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, checked, whole
+from ..arrays import FloatArray, whole
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.modes import Modes, require_real
 from ..modes.solve import solve_modes
 from ..modes.statics import attachment_vectors, labels_of, places, static_response
+from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
 from .condensation import kept_columns, mode_numbers

@@ -13,19 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    FloatArray,
-    Value,
-    checked,
-    flag,
-    instance,
-    name_list,
-    positive,
-    real_array,
-    sizes_of,
-    whole,
-    with_unit,
-)
+from ..arrays import FloatArray, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, SolverError, counted, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
@@ -34,7 +22,9 @@ from ..lti.riccati import filter_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..plant.partitioned import require_noise
+from ..store import Value, checked
 from ..tolerances import SAME
+from ..words import flag, instance, name_list, sizes_of, with_unit
 from .moving_machine import (
     MovingMachine,
     MovingPlant,

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, instance, name_list, positive, real_array
+from ..arrays import FloatArray, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, aligned, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
+from ..store import Value
+from ..words import instance, name_list
 from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
 from .sampled_runs import Signal, simulate
 

@@ -9,25 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    instance,
-    name_list,
-    positive,
-    real_array,
-    short,
-    whole,
-)
-from ..errors import AssumptionError, LabelError, ModelError, counted, only_one
+from ..arrays import ComplexArray, FloatArray, positive, real_array, whole
+from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
 from ..plant.rest_expansion import OfS, at_rest, solved
+from ..store import Value
 from ..tolerances import divisor
+from ..words import instance, name_list
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, several
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, some_names, warn
 from ..loop import ClosedLoop
 from ..plant import StandardPlant, driven_axes
 from ..plant.axes import complex_gain, opposing_part, resting_frequency
 from ..plant.rest_expansion import at_rest, followed_at_rest, solved
+from ..words import several
 from .motion import SetPointProfile
 from .nonlinear_elements import Saturation
 from .response import Response

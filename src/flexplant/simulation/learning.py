@@ -7,19 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import (
-    MOST_DRAWS,
-    FloatArray,
-    Value,
-    function,
-    instance,
-    positive,
-    short,
-    whole,
-    with_unit,
-)
-from ..errors import ModelError, counted
+from ..arrays import FloatArray, positive, whole
+from ..errors import ModelError, counted, short
 from ..loop import ClosedLoop
+from ..seeds import MOST_DRAWS
+from ..store import Value
+from ..words import function, instance, with_unit
 from .feedforward import Feedforward, gain_effects, run_errors, term_numbers, tracked
 from .motion import SetPointProfile
 from .response import Response

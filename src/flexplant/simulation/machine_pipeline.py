@@ -12,18 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    Value,
-    checked,
-    generator,
-    instance,
-    positive,
-    real_array,
-    several,
-    short,
-    whole,
-)
-from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted
+from ..arrays import positive, real_array, whole
+from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted, short
 from ..estimation import ConsistencyReport, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
@@ -31,10 +21,12 @@ from ..lti.frequency import Frf
 from ..modes import MeshError, Modes, solve_modes
 from ..plant import Ports, StandardPlant, UncertainPlant, assemble_plant
 from ..reduction import ModalTruncation, ReducedModel, reduce
-from ..store import written
+from ..seeds import generator
+from ..store import Value, checked, written
 from ..structure import Damping, FEModel
 from ..synthesis import design_stage
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
+from ..words import instance, several
 from .response import Response
 from .sampled_runs import simulate
 from .specification import Specification, Verdict

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, instance, positive, real_array
+from ..arrays import FloatArray, positive, real_array
 from ..errors import ModelError, counted
+from ..store import Value
 from ..tolerances import RANK
+from ..words import instance
 
 #: [samples] a time this close to the grid is on it
 ON_GRID = 1e-6

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, real_array
+from ..arrays import FloatArray, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.budget import WhiteNoise, continuous_factor, white_noise

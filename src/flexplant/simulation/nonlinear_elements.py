@@ -8,20 +8,12 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from ..checks import (
-    FloatArray,
-    Value,
-    between,
-    checked,
-    instance,
-    positive,
-    real_array,
-    short,
-    why_not_called,
-)
-from ..errors import ModelError, require_known, unknown_label
+from ..arrays import FloatArray, between, positive, real_array
+from ..errors import ModelError, require_known, short, unknown_label
 from ..plant import StandardPlant
+from ..store import Value, checked
 from ..tolerances import divisor
+from ..words import instance, why_not_called
 
 
 def _upper_limit(value: Any, name: str) -> float:

@@ -9,20 +9,13 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import (
-    FloatArray,
-    IntArray,
-    Value,
-    check_names,
-    known_units,
-    name_list,
-    positive,
-    real_array,
-)
+from ..arrays import FloatArray, IntArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, unknown_label
 from ..estimation.estimator_channels import ChannelError
 from ..loop import Spectrum
+from ..store import Value
 from ..tolerances import TYPED
+from ..words import check_names, known_units, name_list
 
 #: one number, or one per run
 Numbers: TypeAlias = "float | FloatArray"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..loop import ClosedLoop
 from ..loop.blocks import applied_law
 from ..loop.budget import WhiteNoise

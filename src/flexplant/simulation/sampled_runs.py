@@ -8,28 +8,17 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import (
-    MOST_DRAWS,
-    FloatArray,
-    flag,
-    generator,
-    instance,
-    positive,
-    real_array,
-    seed_of,
-    seed_sequence,
-    several,
-    short,
-    whole,
-)
-from ..errors import AssumptionError, ModelError, only_one, require_known, warn
+from ..arrays import FloatArray, positive, real_array, whole
+from ..errors import AssumptionError, ModelError, only_one, require_known, short, warn
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import DERIVATIVES, references, with_known
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
 from ..plant.partitioned import require_sampled
+from ..seeds import MOST_DRAWS, generator, seed_of, seed_sequence
 from ..tolerances import SAME, TYPED
+from ..words import flag, instance, several
 from .force_warnings import warn_beyond_ranges, warn_of_opposing_forces
 from .motion import SetPointProfile
 from .moving_machine import MovingMachine, trajectory

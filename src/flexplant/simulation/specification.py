@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, checked, in_unit, instance, positive, short
-from ..errors import AssumptionError, ModelError, aligned, only_one, require_known
+from ..arrays import FloatArray, positive
+from ..errors import AssumptionError, ModelError, aligned, only_one, require_known, short
 from ..loop import ClosedLoop, bandwidth
+from ..store import Value, checked
+from ..words import in_unit, instance
 from .exposure import exposure_errors, settling_time
 from .response import Response
 

@@ -12,13 +12,25 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, instance, mapping, positive, seed_sequence, short
-from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label, warn
+from ..arrays import FloatArray, positive
+from ..errors import (
+    LabelError,
+    ModelError,
+    aligned,
+    counted,
+    require_known,
+    short,
+    unknown_label,
+    warn,
+)
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..fingerprints import fingerprint
 from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
+from ..seeds import seed_sequence
+from ..store import Value
+from ..words import instance, mapping
 from ..work import Checkpoint
 from .response import Response
 

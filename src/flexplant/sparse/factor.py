@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from scipy.linalg import blas, lapack
 
-from ..checks import ComplexArray, FloatArray, IntArray, Matrix
+from ..arrays import ComplexArray, FloatArray, IntArray, Matrix
 from ..errors import SolverError
 from ..parallel import one_thread
 from .ordering import Dissection, Front, dissect

@@ -11,9 +11,10 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from ..checks import FloatArray, IntArray, Matrix, Rng
+from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import SolverError, attempted, counted
 from ..parallel import one_thread, tick
+from ..seeds import Rng
 from ..tolerances import ROUNDING
 from .factor import DENSE_LIMIT, MultifrontalFactor, eliminated, negative_pivots, symmetric_lu
 from .ordering import Dissection, dissect

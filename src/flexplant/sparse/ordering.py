@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray
 
 #: a part of fewer DOFs is eliminated as one dense block: of 40, twice the fronts take 30 % longer,
 #: of 96 a plate's factor has 16 % more entries

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Value, checked, one_of
+from ..arrays import FloatArray
 from ..errors import SolverError
+from ..store import Value, checked
+from ..words import one_of
 from .factor import not_definite
 
 _ORDERS = ("default", "best", "amd", "metis", "nesdis")

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray, Matrix
+from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError
 from ..tolerances import SAME, divisor
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError
 from ..sparse.factor import is_positive_definite
 from ..sparse.lowest import Lowest, lowest_modes

@@ -9,23 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    FloatArray,
-    Matrix,
-    Value,
-    between,
-    checked,
-    complex_array,
-    flag,
-    positive,
-    real_array,
-    several,
-    short,
-    whole,
-)
-from ..errors import ModelError, ShapeError
+from ..arrays import FloatArray, Matrix, between, complex_array, positive, real_array, whole
+from ..errors import ModelError, ShapeError, short
 from ..sparse.symmetric import dense
+from ..store import Value, checked
 from ..tolerances import ROUNDING, divisor
+from ..words import flag, several
 from .definite import elastic_modes
 
 

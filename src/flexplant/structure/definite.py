@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, real_array
+from ..arrays import FloatArray, Matrix, real_array
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, is_positive_definite

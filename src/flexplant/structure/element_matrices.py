@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 
 # the plate's twelve-term polynomial: x^p y^q in coordinates from 0 to 1 over the element
 _P = np.array([0, 1, 0, 2, 1, 0, 3, 2, 1, 0, 3, 1])

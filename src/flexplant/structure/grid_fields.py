@@ -8,9 +8,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, positive, real_array, several, short, whole, why_not_called
-from ..errors import ModelError, ShapeError
+from ..arrays import FloatArray, positive, real_array, whole
+from ..errors import ModelError, ShapeError, short
 from ..labels import DofSet, Interpolation, node_dofs
+from ..words import several, why_not_called
 from .element_matrices import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre

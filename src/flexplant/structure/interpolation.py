@@ -8,11 +8,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, checked, instance, positive, real_array
+from ..arrays import FloatArray, IntArray, positive, real_array
 from ..dof_columns import direction_names
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..store import Value, checked
 from ..tolerances import SAME, TINY
+from ..words import instance
 from .model import FEModel
 
 #: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do

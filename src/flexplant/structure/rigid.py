@@ -11,7 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray, Matrix, real_array
+from ..arrays import FloatArray, IntArray, Matrix, real_array
 from ..errors import SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import DENSE_LIMIT

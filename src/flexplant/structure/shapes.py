@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, real_array
+from ..arrays import FloatArray, real_array
 from ..errors import LabelError, require_known
 from ..labels import Interpolation
 from ..tolerances import SAME

@@ -8,18 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import (
-    FloatArray,
-    frozen,
-    one_of,
-    positive,
-    positive_array,
-    real_array,
-    several,
-    short,
-)
-from ..errors import ModelError, ShapeError
+from ..arrays import FloatArray, positive, positive_array, real_array
+from ..errors import ModelError, ShapeError, short
 from ..labels import DofSet
+from ..store import frozen
+from ..words import one_of, several
 from .element_matrices import (
     Grid,
     beam_mass,

@@ -10,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import is_positive_definite, symmetric_lu
 from ..sparse.symmetric import dense, diagonal, unit_diagonal

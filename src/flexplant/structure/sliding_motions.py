@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, name_list
+from ..arrays import FloatArray
 from ..errors import ModelError, require_known
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.symmetric import dense, unit_diagonal
+from ..words import name_list
 from .model import FEModel
 
 #: relative: eigenvalues of the scaled K up to this are zero

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 
 # The shear of an edge is constant and the slope of the section along it quadratic: between ends
 # that turn by t1, t2 and move by z1, z2 over a length L,

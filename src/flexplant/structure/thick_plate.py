@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, positive
+from ..arrays import FloatArray, positive
 from .element_matrices import Grid
 from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of
 from .model import FEModel

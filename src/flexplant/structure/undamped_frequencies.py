@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
 from ..sparse.lowest import lowest_modes, multifrontal_inertia
 from ..tolerances import TINY

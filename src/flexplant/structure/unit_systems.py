@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, positive, short
-from ..errors import ModelError
+from ..arrays import FloatArray, positive
+from ..errors import ModelError, short
 from ..labels import DofSet
 from ..sparse.symmetric import diagonal
 from ..tolerances import TYPED

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.lowest import Lowest, lowest_modes

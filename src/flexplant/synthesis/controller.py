@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..certificates import one_line, stability, stability_name
-from ..checks import FloatArray, Value
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
@@ -19,6 +19,7 @@ from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
+from ..store import Value
 from .preparation import Prepared
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..certificates import stability_name
-from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Value, inner_names
+from ..arrays import FloatArray
 from ..errors import AssumptionError, ModelError
 from ..lti.discretisation import bilinear, image_freq, tustin
 from ..lti.equations import mean_speed
@@ -25,7 +25,9 @@ from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
+from ..store import Value
 from ..tolerances import ROUNDING, TINY
+from ..words import inner_names
 from .scaling import (
     POINT,
     answers,

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg as la
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..lti.equations import bordered_scale, state_scale
 from ..lti.modal_map import eigenvalues_with_error
 from ..lti.response_solvers import responses

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..lti.filters import high_pass_filter
 from ..modes import solve_modes
 from ..plant import (

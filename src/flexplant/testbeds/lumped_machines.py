@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..labels import DofSet
 from ..structure import FEModel
 from ..tolerances import SAME

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 from numpy.polynomial import legendre
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..dof_columns import Interpolation
 from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, DofSet, node_dofs

@@ -9,17 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    below_half_rate,
-    generator,
-    instance,
-    positive,
-    several,
-    whole,
-)
+from ..arrays import ComplexArray, FloatArray, below_half_rate, positive, whole
 from ..errors import ModelError, require_known
 from ..estimation import design_static
 from ..identification import MeasuredModes
@@ -29,9 +19,12 @@ from ..lti.frequency import Frf
 from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
 from ..plant.realisation import ModalRealisation, realise
 from ..reduction import ReducedModel
+from ..seeds import generator
 from ..simulation import Quantiser, Response, simulate
+from ..store import Value
 from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
 from ..synthesis import design_servo
+from ..words import instance, several
 
 #: the plate of the paper's Table 1, as its drawing says
 DRAWING: Mapping[str, Any] = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, positive, positive_array, whole
+from ..arrays import FloatArray, positive, positive_array, whole
 from ..modes import solve_modes
 from ..plant import (
     Actuator,

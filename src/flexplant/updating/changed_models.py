@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Matrix
+from ..arrays import FloatArray, Matrix
 from ..errors import ModelError, ShapeError, attempted, warn
 from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, instance
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, counted, some_names
 from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
+from ..store import Value
 from ..tolerances import divisor
+from ..words import instance
 from .family import Point
 from .residuals.modal_residuals import USUAL, ZETA, Eigenvalues, growth
 from .residuals.residual import Bound, Kind

@@ -13,7 +13,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.symmetric import dense, orthonormalised

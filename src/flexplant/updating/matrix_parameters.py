@@ -12,18 +12,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import (
-    FloatArray,
-    Matrix,
-    element_mask,
-    function,
-    mapping,
-    positive,
-    real_array,
-    short,
-    whole,
-)
-from ..errors import LabelError, ModelError, ShapeError
+from ..arrays import FloatArray, Matrix, element_mask, positive, real_array, whole
+from ..errors import LabelError, ModelError, ShapeError, short
 from ..modes import solve_modes
 from ..reduction import ReducedModel
 from ..sparse.factor import DENSE_LIMIT
@@ -31,6 +21,7 @@ from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
 from ..tolerances import SAME
+from ..words import function, mapping
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 
 #: the damping matrix of one mode is full; beyond this many DOFs it would not fit the memory

@@ -10,11 +10,13 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, Value, instance, real_array, short, with_deviation
-from ..errors import LabelError, ModelError, ShapeError, require_known
+from ..arrays import FloatArray, Matrix, real_array
+from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..reduction import ReducedModel
+from ..store import Value
 from ..structure import FEModel
+from ..words import instance, with_deviation
 
 #: how the function that builds a model is written
 MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."

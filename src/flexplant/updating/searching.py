@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Rng, generator, real_array, whole
+from ..arrays import FloatArray, real_array, whole
 from ..errors import (
     FlexplantError,
     LabelError,
@@ -18,6 +18,7 @@ from ..errors import (
     attempted,
     counted,
 )
+from ..seeds import Rng, generator
 from ..tolerances import TINY, divisor
 from .changed_models import changed_model
 from .family import Point

@@ -9,9 +9,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, several, short
-from ..errors import LabelError, ModelError, counted
+from ..arrays import ComplexArray, FloatArray
+from ..errors import LabelError, ModelError, counted, short
+from ..store import Value
 from ..tolerances import divisor
+from ..words import several
 from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import BoundEigenvalues

@@ -8,22 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    MOST_DRAWS,
-    ComplexArray,
-    FloatArray,
-    Rng,
-    Value,
-    between,
-    generator,
-    positive,
-    short,
-    whole,
-    with_deviation,
-)
-from ..errors import ModelError, counted, require_known
+from ..arrays import ComplexArray, FloatArray, between, positive, whole
+from ..errors import ModelError, counted, require_known, short
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
+from ..seeds import MOST_DRAWS, Rng, generator
+from ..store import Value
+from ..words import with_deviation
 from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .judgement.goodness import chance, is_bad

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
+from ..arrays import FloatArray, positive, whole
 from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress
+from ..seeds import Rng, generator
 from ..structure.model import FEModel
 from ..tolerances import TINY
+from ..words import flag, instance
 from .changed_models import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst

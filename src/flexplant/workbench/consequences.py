@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
 from ..lti.discretisation import Recursion

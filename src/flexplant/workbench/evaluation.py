@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..loop import LoopMargins
 from ..loop.broken import BrokenLoop

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import in_unit
 from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
+from ..words import in_unit
 from .bench import Bench, DesignHistory, crossing_axis, first_axis
 from .consequences import Consequences, Tuning
 from .controls import ElementCards, Number, new_elements, parsed, with_new

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..checks import Value, checked, positive
+from ..arrays import positive
+from ..store import Value, checked
 from ..tolerances import TINY
 from .evaluation import AxisLoop
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..arrays import FloatArray
 from ..synthesis import Notch, ShapedAxis
 from ..tolerances import TINY
 from .controls import name_of, with_element

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 from ...errors import ModelError
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ...checks import positive
+from ...arrays import positive
 from ...errors import ModelError
 from ..partitioned import Partition
 from .channels import Opened

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...checks import FloatArray, Value
+from ...arrays import FloatArray
 from ...errors import FlexplantWarning
 from ...lti.statespace import as_statespace
+from ...store import Value
 from ..building import P, sampled
 from ..partitioned import Partition
 from ..port import ForcePort

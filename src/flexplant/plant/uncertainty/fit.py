@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, members, positive, several, short
-from ...errors import LabelError, ModelError, require_known
+from ...arrays import ComplexArray, FloatArray, positive
+from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
 from ...tolerances import SAME
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
+from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .kind import DEVIATIONS, Known, Uncertainty

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...checks import positive
+from ...arrays import positive
 from ...errors import ModelError, require_known
 from ...lti.statespace import StateSpace
 from ..partitioned import Partition

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import FloatArray, Value
+from ...arrays import FloatArray
+from ...store import Value
 from ..partitioned import Partition
 from .delta import Delta
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ...checks import FloatArray, real_array
+from ...arrays import FloatArray, real_array
 from ...errors import ModelError, require_known, unknown_label
 from ...tolerances import TINY
 from ...updating.matrix_parameters import MatrixParameter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...checks import whole
+from ...arrays import whole
 from ...errors import ModelError
 from ..partitioned import Partition, is_plant
 from .delta import Delta, MachineParts

@@ -9,14 +9,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Value, name_list, whole
+from ...arrays import ComplexArray, FloatArray, whole
 from ...errors import CertificateError, ModelError, counted
 from ...lti.discretisation import image_freq
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
+from ...store import Value
 from ...tolerances import ROUNDING, TINY
+from ...words import name_list
 from ..building import sampled_like
 from ..evaluation_plants import evaluation_plant
 from ..partitioned import Partition, is_plant

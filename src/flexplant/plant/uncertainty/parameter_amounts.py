@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, instance, positive
+from ...arrays import FloatArray, positive
 from ...errors import ModelError
 from ...labels import Place
 from ...sparse.symmetric import dense, orthonormalised
 from ...tolerances import ROUNDING
 from ...updating.parameters import Parameter
+from ...words import instance
 from ..building import continuous_plant
 from ..partitioned import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort

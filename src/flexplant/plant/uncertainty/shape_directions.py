@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...checks import FloatArray, positive, real_array
+from ...arrays import FloatArray, positive, real_array
 from ...errors import ModelError
 from ...tolerances import TINY
 from ..partitioned import Partition

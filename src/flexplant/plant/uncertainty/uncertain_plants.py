@@ -10,11 +10,14 @@ from typing import Any, Generic, Self
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import MOST_DRAWS, FloatArray, Value, generator, mapping, number, whole
+from ...arrays import FloatArray, number, whole
 from ...errors import ModelError, counted, require_known
 from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
+from ...seeds import MOST_DRAWS, generator
+from ...store import Value
 from ...updating import ModalUncertainty, UpdateResult
+from ...words import mapping
 from ..building import P
 from ..partitioned import Partition
 from .channels import Opened, require_exact

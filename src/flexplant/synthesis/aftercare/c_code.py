@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import FloatArray, flag, number, positive, short
-from ...errors import AssumptionError, LabelError, ModelError, require_known
+from ...arrays import FloatArray, number, positive
+from ...errors import AssumptionError, LabelError, ModelError, require_known, short
 from ...loop import ClosedLoop, ScheduledLoop
 from ...loop.blocks import applied_law
 from ...lti.statespace import StateSpace, as_statespace
 from ...store import written
 from ...tolerances import SAME
+from ...words import flag
 from .c_text import CText
 from .forms import back_gain, scheduled_form, two_state_form
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 from ...errors import counted
 from ...lti.statespace import StateSpace
 from .forms import LANES, TwoStateForm

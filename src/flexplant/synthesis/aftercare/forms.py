@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ...checks import ComplexArray, FloatArray, positive
+from ...arrays import ComplexArray, FloatArray, positive
 from ...errors import AssumptionError, CertificateError, ModelError
 from ...loop.anti_windup import recovery_gain
 from ...lti.equations import state_scale

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import instance, short
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -16,6 +15,7 @@ from ...errors import (
     SolverError,
     attempted,
     counted,
+    short,
 )
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
@@ -24,6 +24,7 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...words import instance
 from ..controller import (
     Controller,
     SolvedController,

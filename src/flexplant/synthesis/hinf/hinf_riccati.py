@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, Value, checked, positive
+from ...arrays import FloatArray, positive
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
@@ -17,6 +17,7 @@ from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
+from ...store import Value, checked
 from ...tolerances import ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding

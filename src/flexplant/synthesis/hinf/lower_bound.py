@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, mapping, number
+from ...arrays import FloatArray, number
 from ...errors import CertificateError, FlexplantError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
@@ -19,6 +19,7 @@ from ...parallel import Progress, tick
 from ...plant import AnyPlant, StandardPlant, plant_of
 from ...plant.uncertainty.channels import with_channels
 from ...tolerances import SAME
+from ...words import mapping
 from ..controller import Controller
 from ..preparation import prepared
 from .lower_bound import pointwise_bound

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
+from ...arrays import FloatArray, below_half_rate, positive
 from ...certificates import stability, stability_name
-from ...checks import FloatArray, below_half_rate, positive
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ...arrays import ComplexArray, FloatArray, below_half_rate, positive
 from ...certificates import stability_name
-from ...checks import ComplexArray, FloatArray, Value, below_half_rate, positive
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
@@ -21,6 +21,7 @@ from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant
+from ...store import Value
 from ..controller import Controller, with_left_out
 from ..laws.loop_design import Axes, axes_of, connected
 from .hinf_design import design_hinf

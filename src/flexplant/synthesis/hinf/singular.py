@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm

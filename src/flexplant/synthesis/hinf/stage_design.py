@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import FloatArray, generator, positive
+from ...arrays import FloatArray, positive
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -27,6 +27,7 @@ from ...plant import AnyPlant, StandardPlant, reference_errors, stage_weights, s
 from ...plant.drawn_machines import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...seeds import generator
 from ..controller import Controller, with_left_out
 from .hinf_design import Evened, evened, solved, tolerant
 from .hinf_riccati import Riccati

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Value
+from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, ModelError
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
@@ -18,6 +18,7 @@ from ...lti.statespace import StateSpace
 from ...plant import AnyPlant, StandardPlant
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...store import Value
 from ...tolerances import RANK, TINY
 from ..robustness.uncertainty_blocks import FullBlock, block_places, evened
 

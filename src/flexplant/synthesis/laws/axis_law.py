@@ -10,7 +10,7 @@ from itertools import product as every
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import ComplexArray, FloatArray, IntArray
+from ...arrays import ComplexArray, FloatArray, IntArray
 from ...errors import SolverError
 from ...loop.measured_loop import nyquist_count
 from ...lti.frequency_sweep import local_maxima

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import Value, checked, number, positive, short, whole
-from ...errors import ModelError, ShapeError, counted
+from ...arrays import number, positive, whole
+from ...errors import ModelError, ShapeError, counted, short
 from ...lti.discretisation import bilinear
 from ...lti.statespace import StateSpace, as_statespace, single_channel
+from ...store import Value, checked
 from ..controller import Controller
 from ..hinf.shaping import ShapedLoop
 from .law import BlockSection, Section, SingleElement

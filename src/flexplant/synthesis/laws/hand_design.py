@@ -9,25 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import (
-    Value,
-    checked,
-    flag,
-    instance,
-    mapping,
-    number,
-    positive,
-    real_array,
-    short,
-    whole,
-)
-from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
+from ...arrays import number, positive, real_array, whole
+from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known, short
 from ...fingerprints import fingerprint
 from ...loop.blocks import DERIVATIVES
 from ...loop.measured_loop import static_map
 from ...lti.frequency import Frf
 from ...lti.interconnection import among
 from ...lti.statespace import StateSpace
+from ...store import Value, checked
+from ...words import flag, instance, mapping
 from .law import Law, LawElement, SingleElement
 from .loop_design import Axes, DesignedLoops, axes_controller, axes_of, connected, made
 

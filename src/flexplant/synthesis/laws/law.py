@@ -11,22 +11,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    below_half_rate,
-    flag,
-    instance,
-    positive,
-    real_array,
-    short,
-)
-from ...errors import ModelError
+from ...arrays import ComplexArray, FloatArray, below_half_rate, positive, real_array
+from ...errors import ModelError, short
 from ...lti.frequency import sampled_freq
 from ...lti.joining import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
+from ...store import Value
+from ...words import flag, instance
 
 
 class Section(NamedTuple):

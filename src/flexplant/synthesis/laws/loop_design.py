@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Value, name_list, short
-from ...errors import LabelError, ModelError, counted, require_known, warn
+from ...arrays import FloatArray
+from ...errors import LabelError, ModelError, counted, require_known, short, warn
 from ...loop import LoopReport, ModeTolerances, SpillOver, in_axes, report_loops
 from ...loop.measured_loop import static_map
 from ...loop.sensitivity_functions import taken_apart
@@ -19,6 +19,8 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant, decouple
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...store import Value
+from ...words import name_list
 from ..controller import checked_loop
 from .law import Law, LawElement
 

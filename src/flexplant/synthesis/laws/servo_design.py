@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, below_half_rate, between, positive, real_array
+from ...arrays import FloatArray, below_half_rate, between, positive, real_array
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks

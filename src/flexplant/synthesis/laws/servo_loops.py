@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray
 from ...errors import LabelError
 from ...loop.blocks import as_block
 from ...loop.broken import inverted, largest_sensitivity

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, IntArray, between, whole
+from ...arrays import ComplexArray, FloatArray, IntArray, between, whole
 from ...errors import SolverError, warn
 from ...loop import in_axes
 from ...loop.broken import inverted

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, Value, checked, positive, whole
+from ...arrays import FloatArray, positive, whole
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError, counted
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
+from ...store import Value, checked
 from ...tolerances import RANK, TINY, divisor
 from ..controller import SolvedController
 from ..hinf.lower_bound import pointwise_bound, raised_bound

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import below_half_rate, positive, short, whole
-from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted
+from ...arrays import below_half_rate, positive, whole
+from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted, short
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain

@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import FloatArray, Value, between, checked, name_list, positive
+from ...arrays import FloatArray, between, positive
 from ...errors import SolverError, require_known
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
+from ...store import Value, checked
 from ...tolerances import TINY
+from ...words import name_list
 from ..preparation import less_feedthrough
 from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
 from .lmi_programs import (

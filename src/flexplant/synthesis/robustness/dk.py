@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...checks import FloatArray, whole
+from ...arrays import FloatArray, whole
 from ...errors import (
     AssumptionError,
     CertificateError,

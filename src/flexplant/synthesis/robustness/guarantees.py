@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ...arrays import ComplexArray, FloatArray, whole
 from ...certificates import stability
-from ...checks import MOST, ComplexArray, FloatArray, Value, generator, whole
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
 from ...lti.frequency import frequency_response
@@ -20,6 +20,8 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...seeds import MOST, generator
+from ...store import Value
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, smallest_with_block
 from .mu_bounds import INTERVALS, Cover, Covered, sought

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...tolerances import SPLIT, TINY
 from .power_starts import power_iterations

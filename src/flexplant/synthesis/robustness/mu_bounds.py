@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Value, generator
+from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
@@ -22,6 +22,8 @@ from ...lti.modal_map import obstacle
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
+from ...seeds import generator
+from ...store import Value
 from ...tolerances import ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
 from .power_starts import power_iterations

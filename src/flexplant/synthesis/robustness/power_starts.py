@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...checks import BoolArray, ComplexArray, FloatArray, IntArray
+from ...arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...tolerances import TINY
 from .uncertainty_blocks import Perturbation, Place, RepeatedScalar
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, name_list, short
-from ...errors import AssumptionError, ModelError
+from ...arrays import FloatArray
+from ...errors import AssumptionError, ModelError, short
 from ...loop import ClosedLoop, close_loop
 from ...lti.discretisation import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
@@ -21,6 +21,7 @@ from ...plant.building import at_rate
 from ...plant.uncertainty.neglected_dynamics import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...words import name_list
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, IntArray, Value, checked, flag, short, whole
-from ...errors import ModelError, ShapeError
+from ...arrays import ComplexArray, FloatArray, IntArray, whole
+from ...errors import ModelError, ShapeError, short
 from ...lti.interconnection import series
 from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace, as_statespace
+from ...store import Value, checked
 from ...tolerances import ROUNDING, TINY
+from ...words import flag
 
 
 @dataclass(frozen=True, eq=False)

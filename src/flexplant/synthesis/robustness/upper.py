@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, IntArray
+from ...arrays import ComplexArray, FloatArray, IntArray
 from ...tolerances import TINY
 from .uncertainty_blocks import Scalings, osborne
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError
 from ...lti.frequency_sweep import climbed_grid, local_maxima, resonance_grid
 from ...lti.lyapunov import solve_lyapunov

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 
 #: value (infinite where not defined) and gradient
 Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]

@@ -8,14 +8,15 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ...arrays import FloatArray, whole
 from ...certificates import stability_name
-from ...checks import MOST, FloatArray, Rng, generator, short, whole
-from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
+from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, short
 from ...lti.interconnection import lft
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
+from ...seeds import MOST, Rng, generator
 from ...tolerances import SAME
 from ..controller import (
     Controller,

@@ -10,18 +10,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import (
-    FloatArray,
-    Value,
-    checked,
-    flag,
-    function,
-    instance,
-    name_list,
-    real_array,
-    rebuild,
-    whole,
-)
+from ...arrays import FloatArray, real_array, whole
 from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
@@ -29,6 +18,8 @@ from ...lti.joining import Matrices as LawMatrices
 from ...lti.riccati import control_care, filter_care
 from ...lti.statespace import StateSpace, System
 from ...plant import AnyPlant
+from ...store import Value, checked, rebuild
+from ...words import flag, function, instance, name_list
 from ..hinf.hinf_design import design_hinf
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws

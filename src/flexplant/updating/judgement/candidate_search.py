@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Value
-from ...checks import whole as counted
+from ...arrays import FloatArray
+from ...arrays import whole as counted
 from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
+from ...store import Value
 from ...structure.model import FEModel
 from ..changed_models import FullBasis
 from ..parameters import Parameter, checked_parameters

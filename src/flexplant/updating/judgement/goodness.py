@@ -11,7 +11,7 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 from ...tolerances import TINY, divisor
 from ..family import Point
 from ..search import Objective

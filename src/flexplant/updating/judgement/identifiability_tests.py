@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Value
+from ...arrays import FloatArray
 from ...errors import counted
+from ...store import Value
 from ...tolerances import TINY
 from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values

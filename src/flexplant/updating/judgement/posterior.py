@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Rng, Value, between, generator
+from ...arrays import FloatArray, between
 from ...errors import ModelError
 from ...parallel import Progress
+from ...seeds import Rng, generator
+from ...store import Value
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
 from ..update_result import UpdateResult

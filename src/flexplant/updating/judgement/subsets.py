@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 from ...errors import ModelError, SolverError
 from ...modes.matching import mac_matrix
 from ...tolerances import TINY, divisor

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from ...checks import FloatArray
+from ...arrays import FloatArray
 from ...errors import ModelError
 from ...tolerances import divisor
 from ..search import Objective

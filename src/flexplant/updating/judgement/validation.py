@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Rng, Value, between, complex_array, generator
+from ...arrays import ComplexArray, FloatArray, between, complex_array
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...modes import matching
+from ...seeds import Rng, generator
 from ...sparse.symmetric import dense
+from ...store import Value
 from ..family import Point
 from ..parameters import Parameter, checked_parameters
 from ..residuals.frf_residual import FrfResidual

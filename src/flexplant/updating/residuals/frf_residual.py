@@ -9,21 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import (
-    ComplexArray,
-    FloatArray,
-    flag,
-    instance,
-    one_of,
-    positive,
-    short,
-    spread_array,
-)
-from ...errors import ModelError, counted, require_known, warn
+from ...arrays import ComplexArray, FloatArray, positive, spread_array
+from ...errors import ModelError, counted, require_known, short, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
 from ...tolerances import divisor
+from ...words import flag, instance, one_of
 from ..family import Family, Point
 from .point_residuals import Held
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts

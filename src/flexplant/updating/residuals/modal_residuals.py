@@ -9,24 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import (
+from ...arrays import (
     ComplexArray,
     FloatArray,
-    flag,
-    instance,
     positive,
     positive_array,
     real_array,
     real_or_complex,
-    short,
     spread_array,
     whole,
 )
-from ...errors import LabelError, ModelError, ShapeError, counted, require_known
+from ...errors import LabelError, ModelError, ShapeError, counted, require_known, short
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import assigned, clusters, mac_matrix
 from ...tolerances import SAME, TYPED
+from ...words import flag, instance
 from ..family import CLUSTER, Family, Point
 from ..parameters import named_place
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts

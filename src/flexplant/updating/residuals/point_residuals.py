@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import (
+from ...arrays import (
     ComplexArray,
     FloatArray,
     below_half_rate,

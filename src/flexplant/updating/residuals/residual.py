@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Matrix, Value, mapping
+from ...arrays import ComplexArray, FloatArray, Matrix
 from ...errors import LabelError
 from ...labels import Place
+from ...store import Value
+from ...words import mapping
 from ..family import Family, Point
 
 

@@ -10,9 +10,11 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, between, checked, one_of, positive, whole
+from ...arrays import FloatArray, between, positive, whole
 from ...errors import ModelError, SolverError, counted
+from ...store import checked
 from ...tolerances import divisor
+from ...words import one_of
 from ..family import Point
 from ..sensitivities import SINGULAR, UNSEEN
 from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes

@@ -9,10 +9,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Value, instance
+from ...arrays import ComplexArray, FloatArray
 from ...errors import ModelError
 from ...parallel import tick
+from ...store import Value
 from ...tolerances import divisor
+from ...words import instance
 from ..family import Family, Point, first_point
 from ..parameters import Parameter
 from ..residuals.modal_residuals import BoundEigenvalues

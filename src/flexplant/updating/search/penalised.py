@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, checked, positive
+from ...arrays import FloatArray, positive
 from ...errors import ModelError, SolverError
+from ...store import checked
 from ...tolerances import ROUNDING, TINY
 from .least_squares import TrustRegion
 from .objective import Objective, PriorRows, SearchEnd, Trail, UpdateMethod, unit_changes

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import FloatArray, Value, name_list
+from ..arrays import FloatArray
 from ..errors import AssumptionError, counted, require_known
 from ..lti.statespace import StateSpace
+from ..store import Value
+from ..words import name_list
 from .partitioned import Partition
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of, rigid_parts
 

@@ -1,61 +1,25 @@
-"""Types of arrays, and the checks of arguments of public functions."""
+"""Types of arrays, and the checks of arguments that are numbers."""
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from .errors import FlexplantError, LabelError, ModelError, ShapeError
-from .errors import short as short
-from .store import Value as Value
-from .store import checked as checked
-from .store import frozen as frozen
-from .store import rebuild as rebuild
+from .errors import ModelError, ShapeError, short
 
-T = TypeVar("T")
 #: from here on the cube of a number is none of float64
 TOO_LARGE = 1e100
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
-#: what seeds chance
-Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: lengths along the axes; None is any
 Shape: TypeAlias = tuple[int | None, ...]
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = FloatArray | sp.csc_array
-#: draws, runs or machines in one call
-MOST_DRAWS = 10**7
-
-_PREFIXES = (
-    (1e-15, "f"),
-    (1e-12, "p"),
-    (1e-9, "n"),
-    (1e-6, "\N{MICRO SIGN}"),
-    (1e-3, "m"),
-    (1.0, ""),
-    (1e3, "k"),
-    (1e6, "M"),
-)
-#: units that take a prefix, alone or before others: m^2, N m, rad/s
-_PREFIXED = re.compile(r"(m|g|s|N|rad|Hz|V|A|W|J|Pa|T)(?:\^(\d))?(?![A-Za-z])")
-
-
-def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
-    """Return the units of some channels; those of other names are left out."""
-    if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
-        raise ModelError(
-            f"units must be a mapping {{channel: unit}}, got {short(units)}: {{'y1': 'm'}}."
-        )
-    return {name: units[name] for name in names if name in units}
 
 
 def real_array(
@@ -189,42 +153,6 @@ def _shape_text(shape: Shape) -> str:
     return f"have shape ({sizes}{',' if len(shape) == 1 else ''})"
 
 
-def in_unit(size: float, unit: str | None) -> tuple[float, str]:
-    """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000."""
-    base, per = (unit[1:], 1e-3) if unit and unit.startswith("kg") else (unit or "", 1.0)
-    head = _PREFIXED.match(base)
-    if head is None or not size or not np.isfinite(size):
-        return 1.0, unit or ""
-    power = int(head[2] or 1)
-    known = ((factor**power, prefix) for factor, prefix in _PREFIXES)
-    most = size / (per * 1e3**power) * (1.0 + 1e-9)  # 1e-6 m is 1 um, whatever rounding says
-    factor, prefix = next((s for s in known if most < s[0]), (1e6**power, "M"))
-    return per * factor, prefix + base
-
-
-def with_unit(value: float, unit: str | None) -> str:
-    """Return a number in words: `0.527 nm`; without a unit as it is."""
-    factor, shown = in_unit(abs(value), unit)
-    return f"{value / factor:.3g} {shown}".rstrip()
-
-
-def with_deviation(value: float, deviation: float | None) -> str:
-    """Return a number in words, without the figures that its standard deviation leaves open."""
-    if deviation is None:
-        return f"{value:.7g}"
-    known = 7
-    if value and deviation > 0 and np.isfinite(deviation):
-        known = min(max(int(np.floor(np.log10(abs(value) / deviation))) + 2, 1), 7)
-    return f"{value:.{known}g} +- {deviation:.2g}"
-
-
-def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4) -> str:
-    """Return sizes of channels in words, `die:z 0.527 nm, die:rx 3.1 nrad`, and how many more."""
-    shown = [f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items()]
-    more = [f"... ({len(shown) - most} more)"] if len(shown) > most else []
-    return ", ".join(shown[:most] + more)
-
-
 def number(value: Any, name: str) -> float:
     """Return `value` as one finite float."""
     return float(real_array(value, name, ()))
@@ -249,10 +177,6 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
     return number
 
 
-#: of machines or starts that are each a search: days on any computer, so that more is a mistake
-MOST = 1_000_000
-
-
 def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None) -> int:
     """Return `value` as an int between bounds; 3.0 is none, nor is True."""
     least = f"at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
@@ -273,139 +197,6 @@ def positions(values: Any, name: str, count: int) -> IntArray:
             "of them."
         )
     return np.asarray(array, dtype=np.int64)
-
-
-def flag(value: Any, name: str) -> bool:
-    """Return `value` as a bool: True or False, nothing that merely counts as one."""
-    if not isinstance(value, bool | np.bool_):
-        raise ModelError(f"{name} must be True or False, got {short(value)}. Pass one of them.")
-    return bool(value)
-
-
-def instance(
-    value: Any, kind: Any, name: str, hint: str, error: type[FlexplantError] = ModelError
-) -> Any:
-    """Return `value`, which must be of a class, or of one of several."""
-    if not isinstance(value, kind) or (kind is Iterable and not several(value)):
-        listed = [one.__name__ for one in getattr(kind, "__args__", (kind,))]
-        kinds = " or ".join(name for name in listed if name != "NoneType")
-        raise error(f"{name} must be of type {kinds}, got {type(value).__name__}. {hint}")
-    return value
-
-
-def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
-    """Return `value`, which must be one of some texts."""
-    listed = list(choices)
-    if not isinstance(value, str) or value not in listed:
-        raise ModelError(f"{name} must be one of {listed}, got {short(value)}. Pass one of them.")
-    return value
-
-
-def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
-    """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for."""
-    # a Generator is drawn from, so that two calls with the same one differ
-    if isinstance(rng, np.random.SeedSequence):
-        return rng
-    if isinstance(rng, np.random.Generator):
-        return np.random.SeedSequence(rng.integers(0, 2**32, size=4).tolist())
-    if rng is None:
-        return np.random.SeedSequence()
-    numbers = [rng] if isinstance(rng, int | np.integer) else rng
-    if isinstance(numbers, list | tuple | np.ndarray) and several(numbers):
-        entropy = [n for n in numbers if isinstance(n, int | np.integer) and n >= 0]
-        if len(entropy) == len(numbers) and not any(isinstance(n, bool) for n in numbers):
-            given = [int(n) for n in entropy]
-            return np.random.SeedSequence(given[0] if numbers is not rng else given)
-    raise ModelError(
-        f"{name} must be a seed (a whole number from 0, or several), a SeedSequence, a Generator "
-        f"or None, got {short(rng)}. Pass an int to have the same draw again."
-    )
-
-
-def seed_of(sequence: np.random.SeedSequence) -> int | tuple[int, ...]:
-    """Return the number, or numbers, that give the same draws as a SeedSequence when passed as rng.
-
-    A spawned one mixes the key of its place in after four words of entropy, so that a list does.
-    """
-    entropy: Any = sequence.entropy
-    given = entropy if isinstance(entropy, Sequence | np.ndarray) else (entropy,)
-    numbers = tuple(int(number) for number in given)
-    if not sequence.spawn_key:
-        return numbers[0] if given is not entropy else numbers
-    words = [n >> k & 0xFFFFFFFF for n in numbers for k in range(0, max(n.bit_length(), 1), 32)]
-    return (*words, *(0,) * (sequence.pool_size - len(words)), *sequence.spawn_key)
-
-
-def generator(rng: Any, name: str = "rng") -> np.random.Generator:
-    """Return the Generator that a seed, SeedSequence, Generator or None stands for."""
-    if isinstance(rng, np.random.Generator):
-        return rng
-    return np.random.default_rng(seed_sequence(rng, name))
-
-
-def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tuple[str, ...]:
-    """Return `count` unique signal names, `prefix1`, `prefix2`, ... when none are given."""
-    listed = name_list(names, side) if names is not None else ()
-    if not listed:
-        return tuple(f"{prefix}{i}" for i in range(1, count + 1))
-    if len(listed) != count:
-        raise ShapeError(
-            f"{count} {side} need {count} names, got {len(listed)}: {short(listed)}. Name each "
-            f"once, or none to have {prefix}1, {prefix}2, ..."
-        )
-    check_names(listed, side)
-    return listed
-
-
-def several(value: Any) -> bool:
-    """Return whether there is something to go through: a list, a generator, an array; no text."""
-    if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and not value.ndim):
-        return False
-    return isinstance(value, Iterable)
-
-
-def name_list(names: Any, name: str) -> tuple[str, ...]:
-    """Return names as a tuple of str; one str is one name."""
-    if type(names) is tuple and all(type(one) is str for one in names):
-        return names
-    if isinstance(names, str):
-        return (names,)
-    if not several(names):
-        raise LabelError(f"{name} are chosen by name, got {short(names)}. Pass a list of names.")
-    listed = tuple(names)
-    wrong = [one for one in listed if not isinstance(one, str)]
-    if wrong:
-        raise LabelError(
-            f"{name} are chosen by name, got {short(wrong[0])} among them. Pass a list of names."
-        )
-    return tuple(str(one) for one in listed)
-
-
-def inner_names(names: Iterable[str], taken: Iterable[str]) -> tuple[str, ...]:
-    """Return names of our own, lengthened by '|' until none equals one that a user has taken."""
-    found, known = tuple(names), set(taken)
-    while not known.isdisjoint(found):
-        found = tuple(f"{name}|" for name in found)
-    return found
-
-
-def check_names(names: Sequence[str], side: str) -> None:
-    """Raise LabelError unless the names are unique and of the allowed form."""
-    text = "\n".join(["", *names, ""])
-    if not ("." in text or "\n-" in text or "\n\n" in text) and len(set(names)) == len(names):
-        return
-    for name in names:
-        if not name or "." in name or name.startswith("-"):
-            raise LabelError(
-                f"{name!r} cannot name one of the {side}: names are not empty, hold no '.' and do "
-                "not begin with '-' (python-control refuses those). Rename it."
-            )
-    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
-    if doubled:
-        raise LabelError(
-            f"the {side} hold {doubled} more than once: names select channels, so each must be "
-            "unique. Rename all but one."
-        )
 
 
 def between(value: Any, name: str, low: float, high: float, hint: str, *, ends: str = "") -> float:
@@ -470,38 +261,6 @@ def spread_array(value: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
         ) from None
 
 
-def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> tuple[Any, ...]:
-    """Return several values as a tuple, all of a class."""
-    listed = tuple(values) if several(values) else ()
-    if (
-        not several(values)
-        or len(listed) < least
-        or not all(isinstance(one, kind) for one in listed)
-    ):
-        kinds = " or ".join(one.__name__ for one in getattr(kind, "__args__", (kind,)))
-        many = "" if not least else "at least one " if least == 1 else f"at least {least} "
-        raise ModelError(f"{name} must be a list of {many}{kinds}, got {short(values)}. {hint}")
-    return listed
-
-
-def mapping(
-    value: Any,
-    name: str,
-    hint: str,
-    *,
-    least: int = 0,
-    kind: Any = object,
-    error: type[FlexplantError] = ModelError,
-) -> dict[Any, Any]:
-    """Return a mapping of so many entries at least, all of a class, as a dict."""
-    if not isinstance(value, Mapping) or len(value) < least:
-        filled = f" with {least} or more entries" if least else ""
-        raise error(f"{name} must be a mapping{filled}, got {short(value)}. {hint}")
-    return {
-        key: instance(one, kind, f"{key!r} of {name}", hint, error) for key, one in value.items()
-    }
-
-
 def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
     """Return which elements of a mesh are chosen, some at least."""
     mask = np.asarray(_array_of(value, name))
@@ -511,21 +270,3 @@ def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
             "Pass a comparison, x < 0.3, say."
         )
     return mask
-
-
-def why_not_called(function: Any, *arguments: Any) -> str:
-    """Return why a function does not take such arguments; empty when it does, or is of C."""
-    try:
-        inspect.signature(function).bind(*arguments)
-    except TypeError as error:
-        return str(error)
-    except ValueError:  # a function of C has no signature
-        pass
-    return ""
-
-
-def function(value: Any, name: str, hint: str) -> Any:
-    """Return what can be called."""
-    if not callable(value):
-        raise ModelError(f"{name} must be a function, got {short(value)}. {hint}")
-    return value
