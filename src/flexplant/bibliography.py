@@ -207,6 +207,8 @@
    systems using Krylov subspace methods, Linear Algebra Appl. 415, 2006.
 .. [Scherer1997] Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI
    optimization, IEEE Trans. Autom. Control 42, 1997.
+.. [Seiler2020] Seiler, Packard, Gahinet, An introduction to disk margins, IEEE Control Syst. Mag.
+   40(5), 2020, 78-95.
 .. [Skogestad2005] Skogestad, Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley, 2005.
 .. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
    generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.

@@ -51,6 +51,12 @@ class LoopMargins(Value):
         Where it is.
     gain_freq, phase_freq : float [Hz]
         Where the nearer of both gain margins and the phase margin are; NaN where there are none.
+    phases : tuple of float [deg]
+        At each crossover, what reaches the critical point: a lag where positive, a lead where
+        negative.
+    gains : tuple of (float [Hz], float)
+        Each frequency at which a factor on the gain alone reaches the critical point, and the
+        factor.
 
     Examples
     --------
@@ -69,6 +75,14 @@ class LoopMargins(Value):
     freq: float
     gain_freq: float = float("nan")
     phase_freq: float = float("nan")
+    phases: tuple[float, ...] = ()
+    gains: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def delay_margin(self) -> float:
+        """The least delay [s] that reaches the critical point; infinite without a crossover."""
+        pairs = zip(self.phases, self.crossovers, strict=True)
+        return min((phase % 360.0 / (360.0 * freq) for phase, freq in pairs), default=float("inf"))
 
     def __repr__(self) -> str:
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
@@ -257,7 +271,32 @@ def loop_margins(
 
     find = between if exact is None else exact
     crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
-    phases = np.abs(np.degrees(np.angle(find(crossovers))))
+    phases = np.degrees(np.angle(find(crossovers)))
+    gains = _gain_crossings(freq, L, find, sampled)
+    above = [factor for _, factor in gains if factor > 1.0]
+    below = [factor for _, factor in gains if factor < 1.0]
+    near = min(((abs(np.log(factor)), place) for place, factor in gains), default=(0.0, np.nan))
+    rounds = 0 if exact is None else _ROUNDS
+    peak, where = highest(lambda f: closeness(find(f)), freq, rounds, closeness(L))
+    return LoopMargins(
+        name,
+        tuple(crossovers.tolist()),
+        min(above, default=float("inf")),
+        max(below, default=0.0),
+        float(np.min(np.abs(phases), initial=180.0)),
+        1.0 / peak,
+        where,
+        float(near[1]),
+        float(crossovers[np.argmin(np.abs(phases))]) if crossovers.size else float("nan"),
+        tuple(phases.tolist()),
+        gains,
+    )
+
+
+def _gain_crossings(
+    freq: FloatArray, L: ComplexArray, find: Callable[[FloatArray], ComplexArray], sampled: bool
+) -> tuple[tuple[float, float], ...]:
+    """Return frequencies [Hz] at which L is real and positive, and the factors that make it 1."""
     # L is real where the imaginary part changes sign; positive: towards the critical point. At an
     # undamped pole or zero it changes sign through infinity or zero, where L turns round
     turns = crossings(lambda f: find(f).imag, freq, L.imag)
@@ -274,25 +313,8 @@ def loop_margins(
     ends = [i for i in ends if abs(L[i].imag) < _REAL * abs(L[i].real)]
     reals += [L[i].real for i in ends]
     places = [*turns.tolist(), *(float(freq[i]) for i in ends)]
-    below = [float(x) for x in reals if 0.0 < x < 1.0]
-    above = [float(x) for x in reals if x > 1.0]
-    near = min(
-        ((abs(np.log(x)), place) for x, place in zip(reals, places, strict=True) if x > 0.0),
-        default=(0.0, float("nan")),
-    )
-    rounds = 0 if exact is None else _ROUNDS
-    peak, where = highest(lambda f: closeness(find(f)), freq, rounds, closeness(L))
-    return LoopMargins(
-        name,
-        tuple(crossovers.tolist()),
-        1.0 / max(below) if below else float("inf"),
-        1.0 / min(above) if above else 0.0,
-        float(phases.min(initial=180.0)),
-        1.0 / peak,
-        where,
-        float(near[1]),
-        float(crossovers[np.argmin(phases)]) if crossovers.size else float("nan"),
-    )
+    found = [(place, 1.0 / float(x)) for place, x in zip(places, reals, strict=True) if x > 0.0]
+    return tuple(sorted(found))
 
 
 #: share of the bandwidth at which low-frequency suppression is compared

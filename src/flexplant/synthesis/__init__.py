@@ -30,6 +30,7 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 | ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
 | ``ncfsyn``, ``loopsyn``, ``ncfmargin`` | `design_ncf`, `shape_loop`, `ncf_margin` |
 | ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
+| ``allmargin``, ``diskmargin`` | `margins` |
 | ``mussv``, ``robstab`` | `mu`, `robust_stability` |
 | ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
 
@@ -72,6 +73,9 @@ from .lmi.objectives import H2 as H2
 from .lmi.objectives import Hinf as Hinf
 from .lmi.objectives import PeakGain as PeakGain
 from .lmi.objectives import PoleRegion as PoleRegion
+from .robustness.disk_margins import DiskMargin as DiskMargin
+from .robustness.disk_margins import MarginTable as MarginTable
+from .robustness.disk_margins import margins as margins
 from .robustness.dk import design_mu as design_mu
 from .robustness.guarantees import RobustStability as RobustStability
 from .robustness.guarantees import WorstCaseGain as WorstCaseGain
