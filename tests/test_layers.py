@@ -19,7 +19,7 @@ ROOT = Path(flexplant.__file__).parent
 ROOMS = (
     (
         *("errors", "rooms", "arrays", "words", "seeds", "store", "certificates", "parallel"),
-        *("tolerances", "fingerprint", "work", "dof_columns", "labels", "bibliography"),
+        *("tolerances", "fingerprints", "work", "dof_columns", "labels", "bibliography"),
         "algorithms",
     ),
     "lti",
