@@ -7,12 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Value
+from ...arrays import ComplexArray, FloatArray
 from ...errors import ModelError, aligned
 from ...loop.broken import BrokenLoop, inverted, scaled_size
 from ...loop.report import LoopMargins, report_loops
 from ...loop.sensitivity import Loop, taken_apart
 from ...lti.frequency_sweep import highest
+from ...store import Value
 from .mu import mu
 from .uncertainty_blocks import FullBlock
 
