@@ -11,10 +11,10 @@ from ...arrays import ComplexArray, FloatArray
 from ...errors import ModelError, aligned
 from ...loop.broken import BrokenLoop, inverted, scaled_size
 from ...loop.report import LoopMargins, report_loops
-from ...loop.sensitivity import Loop, taken_apart
+from ...loop.sensitivity_functions import Loop, taken_apart
 from ...lti.frequency_sweep import highest
 from ...store import Value
-from .mu import mu
+from .mu_bounds import mu
 from .uncertainty_blocks import FullBlock
 
 #: the three disks in use, by their skew sigma [Seiler2020]_: symmetric in gain, S and T
