@@ -45,7 +45,7 @@ def moved(case: dict[str, Any], *blocks: Any, reference: Any = MOVE, **noise: An
 def orders(case: dict[str, Any], design: Any, *known: Any) -> dict[str, fx.Response]:
     """Return the move with more and more feedforward."""
     plant = stage.plant_of(case, "measured")
-    blocks = design(plant, case["full"]["measured"], *known)
+    blocks = design(plant, *known)
     model = fx.close_loop(plant, *blocks)
     own = fx.design_feedforward(model)
     runs = {"none": moved(case, *blocks)}

@@ -324,12 +324,6 @@ def test_the_guarantee_holds_on_machines_drawn_anew(later, tmp_path):
     assert example.picture(found, tmp_path).stat().st_size > 20_000
 
 
-@pytest.mark.xfail(
-    reason="poles of the tolerant controller at 4.2 to 7.6 rad/s are poles of the inverse through "
-    "its loop, as no sensor is at the die: design_feedforward finds no expansion to its precision "
-    "below them, and one that it found there would not be that of the move",
-    raises=AssumptionError,
-)
 def test_each_order_buys_what_the_example_says(later, tmp_path):
     """Feedforward on the virtual machine, in both loops of the stage."""
     example = later("feedforward")

@@ -263,6 +263,54 @@ def test_a_mass_on_a_spring_beside_the_poi_is_left_outside_of_the_circle():
     assert found.gains[0, 0, 0] == 0.0 and "acceleration 15 " in repr(found)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_random_free_chains(seed):
+    """By hand: ``1 / P = m s^2 - m^2 g s^4``, g what the modes bend between force and POI."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 6))
+    m = 10.0 ** rng.uniform(-1, 2, n)
+    k = 10.0 ** rng.uniform(2, 6, n - 1)
+    K = np.diag([*k, 0.0]) + np.diag([0.0, *k]) - np.diag(k, 1) - np.diag(k, -1)
+    pushed, seen = rng.integers(1, n + 1, 2)
+    dofs = fx.DofSet(list(range(1, n + 1)), ["x"] * n, np.zeros((n, 3)))
+    at = fx.Ports(
+        u=[fx.Actuator("u1", at=f"{pushed}:x", asd=1e-3)],
+        z=[fx.Poi("die", at=f"{seen}:x", axes=("x",))],
+        y=[fx.Sensor("y1", at=f"{pushed}:x", asd=1e-9)],
+        references=[fx.Reference("die")],
+    )
+    model = fx.FEModel(np.diag(m), K, dofs=dofs)
+    found = design_feedforward(fx.assemble_plant(solve_modes(model, count=n), at)).gains[0, 0]
+    omega2, phi = la.eigh(K, np.diag(m))
+    soft = np.sum(phi[seen - 1, 1:] * phi[pushed - 1, 1:] / omega2[1:])
+    total = m.sum()
+    np.testing.assert_allclose(found[[0, 1, 3]], 0.0, atol=1e-9 * total)
+    assert found[2] == pytest.approx(total, rel=1e-6)
+    assert found[4] == pytest.approx(-(total**2) * soft, rel=1e-4)
+
+
+def test_slow_poles_of_a_controller(model):
+    """Poles of the inverse at 5 rad/s, far below the move: least squares pass over them."""
+    plant = model.machine
+    static, servo = model.blocks
+    K = getattr(servo, "system", servo)
+    # u = K e + a slow lag of K e, which leaves the loop as it is above a few rad/s
+    slow = np.exp(-5.0 * plant.dt)
+    n, m = K.n_states, len(K.outputs)
+    A = np.block([[K.A, np.zeros((n, m))], [(1 - slow) * K.C, slow * np.eye(m)]])
+    B = np.vstack([K.B, (1 - slow) * K.D])
+    C = np.hstack([K.C, 2.0 * np.eye(m)])
+    lagging = fx.StateSpace(A, B, C, K.D, plant.dt, inputs=K.inputs, outputs=K.outputs)
+    loop = fx.close_loop(plant, static, lagging)
+    assert loop.is_stable
+    peak = {}
+    own = design_feedforward(loop)
+    for name, blocks in {"none": (), "loop": (own,), "plant": (design_feedforward(plant),)}.items():
+        peak[name] = run_of(on(plant, loop, *blocks), MOVE).peak("die:error")
+    assert not np.any(own.gains[:, :, 0]), "a free body takes no force at rest"
+    assert peak["loop"] < 0.01 * peak["none"] and peak["loop"] < 0.3 * peak["plant"]
+
+
 @pytest.mark.parametrize("kind", ["gantry", "dual_stage", "hexapod", "ball_screw"])
 def test_the_inverse_on_driven_machines(kind):
     """|P F - 1| by matrices alone, of every reference."""

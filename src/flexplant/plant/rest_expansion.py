@@ -16,13 +16,16 @@ from .axes import complex_gain
 #: a function of s, real on the real axis, to an array of any shape
 OfS: TypeAlias = Callable[[complex], ComplexArray]
 
-#: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
-_SAMPLES, _LARGEST, _RADII = 16, 6e3, 30
+#: points on a circle of Cauchy's integrals
+_SAMPLES = 16
+#: largest radius [rad/s]: 1 kHz, above the bandwidth of any motion; how often it is halved, to 5e-6
+_LARGEST, _RADII = 6e3, 30
 #: relative: two circles give the same coefficients
 _SAME = 1e-8
-#: where the expansion is compared with the function, as a part of the radius, and relative
-#: difference: with eight terms it lacks 0.1^8 of a function that is regular within the circle
-_INSIDE, _NEAR = 0.1, 1e-6
+#: where the expansion is compared with the function, relative to the radius: in decades, so that
+#: poles far inside of the circle are noticed too; and the relative difference: with eight terms it
+#: lacks 0.1^8 of a function that is regular within the circle
+_INSIDE, _NEAR = (1e-1, 1e-2, 1e-3, 1e-4), 1e-6
 #: terms that are compared
 _TERMS = 8
 #: condition, rows and columns scaled, above which a response counts as singular
@@ -30,10 +33,10 @@ _SINGULAR = 1e9
 
 
 def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatArray:
-    """Return k_0, k_1, ... (..., count) of ``F(s) = k_0 + k_1 s + ...`` around rest.
+    """Return k_0, k_1, ... (..., count) of an inverse ``F(s) = k_0 + k_1 s + ...`` around rest.
 
-    On the largest circle within which F has no pole: two circles agree, which they also do where
-    both enclose the same poles, and the expansion is F inside of them.
+    They are those on the largest circle within which F has no pole: two circles agree, which they
+    also do where both enclose the same poles, and the expansion is F inside of them.
     """
     radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
     powers = np.arange(_TERMS)
@@ -44,9 +47,9 @@ def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatA
         scale = divisor(size.max(axis=tuple(range(1, size.ndim)), keepdims=True))
         low = (0.5 * radius) ** powers
         same = np.abs(outer - inner)[..., :count] * low[:count] <= _SAME * scale
-        if np.all(same) and _is_inside(find, inner, 0.5 * radius):
-            inner[np.abs(inner) * low <= _SAME * scale] = 0.0
-            return np.asarray(inner[..., :count])
+        terms = np.where(np.abs(inner) * low <= _SAME * scale, 0.0, inner)
+        if np.all(same) and _is_inside(find, terms, 0.5 * radius):
+            return np.asarray(terms[..., :count])
         outer, radius = inner, 0.5 * radius
     raise AssumptionError(
         f"the response of {', '.join(axes)} to the actuators has no inverse that is regular at low "
@@ -56,11 +59,14 @@ def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatA
 
 def _is_inside(find: OfS, terms: FloatArray, radius: float) -> bool:
     """Return whether an expansion is the function inside the circle."""
-    s = _INSIDE * radius
-    wanted = find(complex(s)).real
-    found = terms @ s ** np.arange(terms.shape[-1])
-    scale = np.abs(wanted).max(axis=tuple(range(1, wanted.ndim)), keepdims=True)
-    return bool(np.all(np.abs(found - wanted) <= _NEAR * divisor(scale)))
+    for part in _INSIDE:
+        s = part * radius
+        wanted = find(complex(s)).real
+        found = terms @ s ** np.arange(terms.shape[-1])
+        scale = np.abs(wanted).max(axis=tuple(range(1, wanted.ndim)), keepdims=True)
+        if not np.all(np.abs(found - wanted) <= _NEAR * divisor(scale)):
+            return False
+    return True
 
 
 def _on_circle(find: OfS, radius: float) -> FloatArray:

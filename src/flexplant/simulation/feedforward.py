@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, positive, real_array, whole
-from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short
+from ..arrays import ComplexArray, FloatArray, IntArray, real_array, whole
+from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
+from ..loop.report import error_sensitivity
+from ..loop.sensitivity import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
@@ -23,11 +25,16 @@ from ..words import instance, name_list
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements
-from .response import Response
-from .sampled_runs import simulate
 
-#: how long a loop is watched after the beginning of a move, relative to it, for gains of the move
-_AFTER = 1.5
+#: lines of least squares: their number, and the slowest of them relative to the bandwidth of the
+#: loop, or to one over the duration of the move
+_LINES, _SLOWEST = 200, 1e-2
+#: relative to the bandwidth, up to where a set-point without a move is large: a quarter
+_FASTEST = 0.25
+#: samples of a move in continuous time
+_STEPS = 2000
+#: relative: errors that feedforward leaves and that are worth a warning
+_LEFT = 0.2
 #: relative: combinations of gains that change the errors less are left out
 _RESOLVED = 1e-8
 #: what a set-point gives, by the order of the derivative
@@ -130,16 +137,18 @@ def design_feedforward(
     actuators' filters in it), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: of a free machine k_2 is
     the mass, k_3 the mass times the delay, and k_4 holds half the square of the delay and,
     negative, the compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
-    are their stiffness and damping. In a loop ``G_u F + G_r = 1`` is solved for F instead, G_u and
-    G_r the responses of the POI to forces and reference in closed loop: where sensors and POI do
-    not move alike, the feedback would oppose the inverse of P. The coefficients are Cauchy's
-    integrals on a circle around rest, the largest on which two radii agree and within which the
-    expansion is the inverse itself: a zero of P (a mass on a spring beside the POI) is left
-    outside. All axes that the actuators move apart (`flexplant.plant.driven_axes`, next to rest)
-    are taken together: the forces that keep the axes without a reference at rest are in it.
+    are their stiffness and damping. The coefficients are Cauchy's integrals on a circle around
+    rest, the largest on which two radii agree and within which the expansion is the inverse itself:
+    a zero of P (a mass on a spring beside the POI) is left outside. All axes that the actuators
+    move apart (`flexplant.plant.driven_axes`, next to rest) are taken together: the forces that
+    keep the axes without a reference at rest are in it.
 
-    With a move the gains are those of least squares of the errors of a loop in that move instead,
-    which also serves where zeros of P are as slow as the move.
+    Of a loop the gains are those of least squares of its error ``G_u F + G_r - 1``, G_u and G_r the
+    responses of the POI to forces and reference in closed loop: where sensors and POI do not move
+    alike, the feedback would oppose the inverse of P, and its poles and the zeros of P may be as
+    slow as the moves. The errors are weighted with a set-point that follows a snap and moves within
+    about four times the time of the loop's bandwidth, or with the move that is given. A plant that
+    takes no force at rest is given none.
 
     Parameters
     ----------
@@ -151,7 +160,7 @@ def design_feedforward(
     order : int
         Highest derivative, 2 to 4: acceleration, jerk, snap.
     move : SetPointProfile, optional
-        The move in which a loop is to have the least errors.
+        The move in which a loop is to have the least errors; its gains stop at its own order.
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
     elements : mapping {name: element, or a list of some}, optional
@@ -171,7 +180,12 @@ def design_feedforward(
         When the actuators cannot move the POI's axes apart from each other.
     ModelError
         When the plant was not assembled from a structure or is weighted, or the order is not 2 to
-        4; when a move is given without a loop, or with places, or elements without a move.
+        4; when a move is given without a loop, or elements without a move.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the gains leave a fifth of the loop's error or more; when a move exceeds a Saturation.
 
     References
     ----------
@@ -190,32 +204,26 @@ def design_feedforward(
     loop = given if isinstance(given, ClosedLoop) else None
     plant, poi, axis, name = tracked(given if loop is None else loop.machine, reference)
     highest = whole(order, "order", minimum=2, maximum=4)
-    driven, T = force_axes(plant)
-    wanted = np.array([[1.0 if one == poi.channel(axis) else 0.0] for one in driven])
-    if not np.any(wanted):
-        raise AssumptionError(
-            f"the actuators do not move {poi.channel(axis)} apart from other POIs: they move "
-            f"{', '.join(driven)}. Leave other POIs out of the ports, or add actuators."
-        )
-    empty = Feedforward(name, driven, T, tuple(plant.u), np.zeros((1, len(driven), 5)), plant.dt)
-    if elements is not None and move is None:
+    axes = _Tracking.of(plant, poi, poi.channel(axis), name)
+    if move is not None:
+        instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
+        if loop is None:
+            raise ModelError("a move needs a ClosedLoop: pass design_feedforward(loop, move=move).")
+        split_elements(elements, plant, plant.u)  # refuses unknown channels
+        warn_beyond_ranges(plant, {name: move}, elements or {}, _times(move, plant.dt))
+    elif elements is not None:
         raise ModelError("elements are compared with a move: pass design_feedforward(loop, "
                          "move=move, elements=...).")  # fmt: skip
-    if move is not None:
-        if loop is None or along is not None:
-            raise ModelError("a move needs a ClosedLoop, without along=: pass design_feedforward"
-                             "(loop, move=move).")  # fmt: skip
-        split_elements(elements, plant, plant.u)  # refuses unknown channels
-        found = _of_move(empty, loop, move, highest)
-        time = np.arange(np.ceil(move.duration / plant.dt) + 1.0) * plant.dt
-        warn_beyond_ranges(plant, {name: move}, elements or {}, time)
-        return found
-    blocks = () if loop is None else loop.blocks
-    forced = close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
-    find = _inverse_of(forced, poi, T, driven, wanted, name, along)
-    gains = at_rest(find, plant.dt, driven)
+    gains = at_rest(axes.inverse(_forced(plant, ()), along), plant.dt, axes.axes)
+    if loop is not None and (loop.blocks or move is not None):
+        last = highest if move is None else min(highest, move.order)
+        orders = np.arange(0 if np.any(gains[..., 0]) else 1, last + 1)
+        freq, size = _moved_size(loop, name, poi.derived(axis, "error"), move)
+        moved = axes.moved(_forced(plant, loop.blocks), along)
+        gains = np.zeros_like(gains)
+        gains[:, :, orders] = _least(moved, freq, size, axes.wanted, orders)
     gains[:, :, highest + 1 :] = 0.0
-    return empty.replace(gains=gains)
+    return Feedforward(name, axes.axes, axes.T, tuple(plant.u), gains, plant.dt)
 
 
 def known_forces(plant: StandardPlant) -> StateSpace:
@@ -260,101 +268,113 @@ def force_axes(plant: StandardPlant) -> tuple[tuple[str, ...], FloatArray]:
     return driven.channels, driven.T / np.abs(driven.T).sum(axis=0)
 
 
-def _inverse_of(
-    forced: ClosedLoop,
-    poi: Poi,
-    T: FloatArray,
-    axes: tuple[str, ...],
-    wanted: FloatArray,
-    name: str,
-    along: npt.ArrayLike | None,
-) -> OfS:
-    """Return the function of s that gives F (p, r) in a loop with known forces, at p places."""
-    # a place changes what is seen of the states and of u, which the feedback does not read
-    g, plant = forced.monitored, forced.machine
-    acts = np.zeros((len(plant.w), T.shape[1] + 1))
-    acts[g.input_index([force_name(u) for u in plant.u]), :-1] = T
-    acts[g.input_index([name]), -1] = 1.0
-    rows = g.output_index(list(axes))
-    C, D = g.C[rows][None], (g.D[rows] @ acts)[None]
-    if along is not None:
-        places = plant.along(poi.name, real_array(along, "along", (None, 3)))
-        there = {poi.channel(axis): i for i, axis in enumerate(poi.axes)}
-        own = [there[one] for one in axes if one in there]
-        at = [i for i, one in enumerate(axes) if one in there]
-        u = g.output_index(forced.driven)
-        by_u = places.D[:, own][:, :, plant.system.input_index(forced.driven)]
-        C = np.repeat(C, len(places.D), axis=0)
-        D = np.repeat(D, len(places.D), axis=0)
-        C[:, at] = by_u @ g.C[u]
-        C[:, at, : plant.system.n_states] += places.C[:, own]
-        direct = places.D[:, own][:, :, plant.system.input_index(plant.w)]
-        D[:, at] = (direct + by_u @ g.D[u]) @ acts
-
-    def found(s: complex) -> ComplexArray:
-        both = C @ _states(g, g.B @ acts, s) + D
-        return solved(both[:, :, :-1], wanted - both[:, :, -1:], axes)[..., 0]
-
-    return found
+def _forced(plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop:
+    """Return the loop of some blocks with forces that are known."""
+    return close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
 
 
-def _of_move(
-    empty: Feedforward, loop: ClosedLoop, move: SetPointProfile, highest: int
-) -> Feedforward:
-    """Return the gains by least squares of the errors of a loop in a move."""
-    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
-    duration, orders = _AFTER * move.duration, list(range(min(highest, move.order) + 1))
-    plant = loop.machine.replace(evaluation=None)
-    alone = close_loop(plant.replace(evaluation=None), *loop.blocks, idle=loop.idle)
-    _, poi, axis, _ = tracked(plant, empty.reference)
-    others = [one for one in empty.axes if one != poi.channel(axis)]
-    channels = [poi.derived(axis, "error"), *others]
-    given = {empty.reference: move}
-    error = run_errors(simulate(alone, reference=given, duration=duration, noise=False), channels)
-    effects = gain_effects(empty, loop, move, duration, orders, channels)
-    unit = divisor(np.linalg.norm(effects, axis=1))
-    found = np.linalg.lstsq((effects / unit[:, None]).T, -error, rcond=_RESOLVED)[0] / unit
-    gains = empty.gains.copy()
-    gains[0][:, orders] = found.reshape(len(empty.axes), len(orders))
-    return empty.replace(gains=gains)
+class _Tracking(NamedTuple):
+    """The axes that forces move, the reference that one of them follows, and the others at rest."""
+
+    poi: Poi
+    axes: tuple[str, ...]
+    T: FloatArray
+    wanted: FloatArray
+    name: str
+
+    @classmethod
+    def of(cls, plant: StandardPlant, poi: Poi, channel: str, name: str) -> _Tracking:
+        """Return the axes of a plant, of which one follows a reference."""
+        axes, T = force_axes(plant)
+        if channel not in axes:
+            raise AssumptionError(
+                f"the actuators do not move {channel} apart from other POIs: they move "
+                f"{', '.join(axes)}. Leave other POIs out of the ports, or add actuators."
+            )
+        return cls(poi, axes, T, np.array([[float(one == channel)] for one in axes]), name)
+
+    def moved(self, forced: ClosedLoop, along: npt.ArrayLike | None) -> OfS:
+        """Return the function of s that gives [G_u, G_r] (p, r, r + 1) of a loop at p places."""
+        # a place changes what is seen of the states and of u, which the feedback does not read
+        g, plant, poi, axes = forced.monitored, forced.machine, self.poi, self.axes
+        acts = np.zeros((len(plant.w), self.T.shape[1] + 1))
+        acts[g.input_index([force_name(u) for u in plant.u]), :-1] = self.T
+        acts[g.input_index([self.name]), -1] = 1.0
+        rows = g.output_index(list(axes))
+        C, D = g.C[rows][None], (g.D[rows] @ acts)[None]
+        if along is not None:
+            places = plant.along(poi.name, real_array(along, "along", (None, 3)))
+            there = {poi.channel(axis): i for i, axis in enumerate(poi.axes)}
+            own = [there[one] for one in axes if one in there]
+            at = [i for i, one in enumerate(axes) if one in there]
+            u = g.output_index(forced.driven)
+            by_u = places.D[:, own][:, :, plant.system.input_index(forced.driven)]
+            C = np.repeat(C, len(places.D), axis=0)
+            D = np.repeat(D, len(places.D), axis=0)
+            C[:, at] = by_u @ g.C[u]
+            C[:, at, : plant.system.n_states] += places.C[:, own]
+            direct = places.D[:, own][:, :, plant.system.input_index(plant.w)]
+            D[:, at] = (direct + by_u @ g.D[u]) @ acts
+        return lambda s: np.asarray(C @ _states(g, g.B @ acts, s) + D)
+
+    def inverse(self, forced: ClosedLoop, along: npt.ArrayLike | None) -> OfS:
+        """Return the function of s that gives F (p, r) of a loop at p places."""
+        moved = self.moved(forced, along)
+
+        def found(s: complex) -> ComplexArray:
+            both = moved(s)
+            return solved(both[:, :, :-1], self.wanted - both[:, :, -1:], self.axes)[..., 0]
+
+        return found
 
 
-def gain_effects(
-    start: Feedforward,
-    loop: ClosedLoop,
-    move: SetPointProfile,
-    duration: float,
-    orders: list[int],
-    channels: list[str],
+def _times(move: SetPointProfile, dt: float) -> FloatArray:
+    """Return the times [s] of a move, in samples or in as many steps as resolve its snap."""
+    step = dt or move.duration / _STEPS
+    return np.asarray(np.arange(np.ceil(move.duration / step) + 1.0) * step)
+
+
+def _moved_size(
+    loop: ClosedLoop, name: str, error: str, move: SetPointProfile | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies [Hz] and the size of a reference there, of a move or one for the loop."""
+    dt = loop.machine.dt
+    if move is None:
+        grid, sensitivity = error_sensitivity(loop, name, error)
+        top = min(first_crossing(grid, sensitivity, None), float(grid[-1]))
+        freq = np.geomspace(_SLOWEST * top, top, _LINES)
+        return freq, 1.0 / freq / (1.0 + (freq / (_FASTEST * top)) ** 2) ** 2
+    time = _times(move, dt)
+    freq = np.geomspace(_SLOWEST / move.duration, 0.499 / (time[1] - time[0]), _LINES)
+    turns = np.exp(-2j * np.pi * freq[:, None] * time)
+    return freq, np.abs(turns @ move.at(time).acceleration) / freq**2
+
+
+def _least(
+    moved: OfS, freq: FloatArray, size: FloatArray, wanted: FloatArray, orders: IntArray
 ) -> FloatArray:
-    """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
-    plant = loop.machine.replace(evaluation=None)
-    forced = close_loop(
-        plant.replace(evaluation=None), *loop.blocks, known_forces(plant), idle=loop.idle
-    )
-    time = np.arange(round(positive(duration, "duration") / loop.machine.dt)) * loop.machine.dt
-    signals = move.at(time)
-    rows = []
-    for axis in range(len(start.axes)):
-        for order in orders:
-            # of size one: a unit gain may make forces far larger than any that is meant
-            size = float(np.max(np.abs(signals[order]))) or 1.0
-            force = np.outer(start.T[:, axis], signals[order] / size)
-            given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}
-            run = simulate(forced, reference=given, duration=duration, noise=False)
-            rows.append(size * run_errors(run, channels))
-    return np.array(rows)
-
-
-def run_errors(run: object, channels: list[str]) -> FloatArray:
-    """Return the errors one after the other; the mean over runs where there are several."""
-    if not isinstance(run, Response) or any(name not in run for name in channels):
-        raise ModelError(
-            f"a trial must return a Response with {', '.join(channels)}, got {short(run)}. Return "
-            "simulate(loop, reference=move, duration=...)."
-        )
-    signals = [run[name] for name in channels]
-    return np.concatenate([s.mean(axis=0) if s.ndim == 2 else s for s in signals])
+    """Return the gains (p, r, orders) of the least errors of a loop, weighted by frequency."""
+    s = 2j * np.pi * freq
+    weight = size * np.sqrt(freq)  # of equal ratios of frequencies
+    both = np.array([moved(complex(one)) for one in s]) * weight[:, None, None, None]
+    powers = s[:, None] ** orders
+    found = []
+    for p in range(both.shape[1]):
+        effects = np.einsum("fij,fm->fijm", both[:, p, :, :-1], powers)
+        error = both[:, p, :, -1] - weight[:, None] * wanted[:, 0]
+        matrix = effects.reshape(error.size, -1)
+        rows, given = (np.concatenate([x.real, x.imag]) for x in (matrix, error.ravel()))
+        unit = divisor(np.linalg.norm(rows, axis=0))
+        gains = np.linalg.lstsq(rows / unit, -given, rcond=_RESOLVED)[0]
+        left = float(np.linalg.norm(given + rows / unit @ gains) / divisor(np.linalg.norm(given)))
+        if left > _LEFT:
+            warn(
+                f"this feedforward leaves {100 * left:.2g} % of the loop's errors: zeros of the "
+                "plant are about as slow as the move. Make a slower move (move=...), lower the "
+                "bandwidth, or use simulation.inverse_forces."
+            )
+        found.append((gains / unit).reshape(wanted.shape[0], orders.size))
+    return np.array(found)
 
 
 def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:

@@ -9,13 +9,15 @@ import numpy as np
 
 from ..arrays import FloatArray, positive, whole
 from ..errors import ModelError, counted, short
-from ..loop import ClosedLoop
+from ..loop import ClosedLoop, close_loop
+from ..loop.blocks import force_name
 from ..seeds import MOST_DRAWS
 from ..store import Value
 from ..words import function, instance, with_unit
-from .feedforward import Feedforward, gain_effects, run_errors, term_numbers, tracked
+from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPointProfile
 from .response import Response
+from .sampled_runs import simulate
 
 #: condition of the basis (columns scaled to one) beyond which directions are left as they are
 _RESOLVED = 1e-8
@@ -121,14 +123,14 @@ def learn_feedforward(
     _, poi, own, _ = tracked(loop.machine, start.reference)
     others = [one for one in start.axes if one != poi.channel(own)]
     channels = [poi.derived(own, "error"), *others]
-    effects = gain_effects(start, loop, move, duration, orders, channels)
+    effects = _gain_effects(start, loop, move, duration, orders, channels)
     unit = np.linalg.norm(effects, axis=1)
     used = unit > 0
     pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=_RESOLVED)
     function(trial, "trial", "It takes a Feedforward and returns a Response.")
     current, errors, gains = start, [], []
     for _ in range(whole(trials, "trials", maximum=MOST_DRAWS)):
-        error = run_errors(trial(current), channels)
+        error = _run_errors(trial(current), channels)
         if error.size != effects.shape[1]:
             raise ModelError(
                 f"the trial recorded {error.size // len(channels)} samples, the model's run has "
@@ -154,3 +156,41 @@ def _check_trial(start: object, loop: object, move: object) -> None:
         )
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
+
+
+def _gain_effects(
+    start: Feedforward,
+    loop: ClosedLoop,
+    move: SetPointProfile,
+    duration: float,
+    orders: list[int],
+    channels: list[str],
+) -> FloatArray:
+    """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
+    plant = loop.machine.replace(evaluation=None)
+    forced = close_loop(
+        plant.replace(evaluation=None), *loop.blocks, known_forces(plant), idle=loop.idle
+    )
+    time = np.arange(round(positive(duration, "duration") / loop.machine.dt)) * loop.machine.dt
+    signals = move.at(time)
+    rows = []
+    for axis in range(len(start.axes)):
+        for order in orders:
+            # of size one: a unit gain may make forces far larger than any that is meant
+            size = float(np.max(np.abs(signals[order]))) or 1.0
+            force = np.outer(start.T[:, axis], signals[order] / size)
+            given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}
+            run = simulate(forced, reference=given, duration=duration, noise=False)
+            rows.append(size * _run_errors(run, channels))
+    return np.array(rows)
+
+
+def _run_errors(run: object, channels: list[str]) -> FloatArray:
+    """Return the errors one after the other; the mean over runs where there are several."""
+    if not isinstance(run, Response) or any(name not in run for name in channels):
+        raise ModelError(
+            f"a trial must return a Response with {', '.join(channels)}, got {short(run)}. Return "
+            "simulate(loop, reference=move, duration=...)."
+        )
+    signals = [run[name] for name in channels]
+    return np.concatenate([s.mean(axis=0) if s.ndim == 2 else s for s in signals])
