@@ -12,7 +12,6 @@ from matplotlib import image
 from PIL import Image
 
 import flexplant as fx
-from flexplant.errors import AssumptionError
 from oracles_plant import machine
 from oracles_structure import elastic_receptance, plate_matrices, undamped
 from oracles_structure import poles as dense_poles

@@ -63,6 +63,18 @@ def z_scores(found, truth):
     return np.concatenate([error.real / found.std.real, error.imag / found.std.imag])
 
 
+@pytest.mark.parametrize(("low", "high", "count"), [(10.0, 400.0, 400), (3.0, 400.0, 300)])
+def test_logarithmic_lines(low, high, count):
+    """Orders that lines afford where they are widest apart; higher ones say what to do."""
+    poles, phi = pole([30.0, 80.0, 200.0], 2e-2), RNG.normal(size=(3, 3))
+    frf = measured(poles, phi, n_in=1, freq=np.geomspace(low, high, count), rigid=False)
+    found = identify_modes(frf)
+    near = np.array([found.poles[np.argmin(np.abs(found.poles - one))] for one in poles])
+    np.testing.assert_allclose(near, poles, rtol=1e-2)
+    with pytest.raises(ModelError, match="count as"):
+        identify_modes(frf, orders=range(2, 100))
+
+
 @pytest.mark.slow
 def test_close_and_repeated_modes_with_rigid_body_motion():
     freq = np.arange(30.0, 180.0, 0.2)

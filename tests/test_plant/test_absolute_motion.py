@@ -96,6 +96,29 @@ def test_inertial_sensors_and_pois_of_a_suspended_structure():
     np.testing.assert_allclose(pushed, own, rtol=1e-8)
 
 
+@pytest.mark.parametrize("last", ["high-pass", "low-pass"])
+@pytest.mark.parametrize("roll", [1, 2])
+def test_a_floor_of_several_filters(last, roll):
+    """A high-pass in series with low-passes has its zeros at 0 Hz in either order, in any unit."""
+    parts = [high_pass_filter(FLOOR, order=2), low_pass_filter(40.0, order=roll)]
+    shape = fx.lti.series(*(parts if last == "low-pass" else parts[::-1]))
+    units = np.geomspace(1e-3, 1e3, shape.n_states)
+    scaled = fx.StateSpace(units[:, None] * shape.A / units, units[:, None] * shape.B,
+                           shape.C / units, shape.D)  # fmt: skip
+    pois = [Poi("die", at="5:x", axes=("x",), absolute=True)]
+    for one in (shape, scaled):
+        found = plant([Sensor("y", at="1:x")], [floor(shape=one)], pois)
+        shown = fx.frequency_response(found.Gzw, FREQ)["die:x", "floor"]
+        moved = [transmitted(M, D + DAMPER, K + SPRING, np.ones(5), s)[4] for s in S]
+        p = S / (2 * np.pi * 40.0)
+        low = 1.0 / (p + 1) if roll == 1 else 1.0 / (p**2 + np.sqrt(2) * p + 1)
+        np.testing.assert_allclose(shown, moved * corner(FLOOR, S) * low / S**2, rtol=1e-6)
+    # one zero is too few for a displacement
+    few = fx.lti.series(high_pass_filter(FLOOR), low_pass_filter(40.0, order=roll))
+    with pytest.raises(ModelError, match="1 zero at 0 Hz more|has 1"):
+        plant([Sensor("y", at="1:x")], [floor(shape=few)], pois)
+
+
 def test_modes_of_a_suspended_structure_let_a_white_floor_pass():
     """Springs that bend the shapes a little leave nothing of the floor at once."""
     size = {"size": (0.4, 0.3, 0.05), "elements": (4, 3, 1)}

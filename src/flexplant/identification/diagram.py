@@ -385,6 +385,8 @@ HIGHEST, LINES_OF_ORDER = 40, 4
 #: references times parts of the band from which every other order is enough: each is a large
 #: eigenvalue problem
 MANY = 4
+#: quantile of the gaps between lines that counts as their widest: a tenth of them may be wider
+_WIDE = 0.9
 #: the most poles of a diagram's order, conjugates included: an eigenvalue problem of this size
 POLES = 100
 
@@ -392,7 +394,7 @@ POLES = 100
 def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
     """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
     parts = line_windows(ready)
-    fewest = min(seen.stop - seen.start for _, seen in parts)
+    fewest = min(_resolved(ready.freq[seen]) for _, seen in parts)
     if orders is None:
         # four orders at least are compared, which twenty lines afford
         references = ready.data.shape[1]
@@ -400,10 +402,18 @@ def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
         return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
     if 2 * (orders[-1] + 1) > fewest:
         raise ModelError(
-            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
-            "the orders or measure longer."
+            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band, which "
+            f"count as {fewest} where they are widest apart: lower the orders, or measure lines "
+            "that are closer and evenly spaced."
         )
     return orders
+
+
+def _resolved(freq: FloatArray) -> int:
+    """Return the number of evenly spaced lines with the resolution of the widest gaps."""
+    # polynomials are determined only where lines are; single lines that were left out do no harm
+    gap = float(np.quantile(np.diff(freq), _WIDE))
+    return min(freq.size, round((freq[-1] - freq[0]) / gap) + 1)
 
 
 def checked_orders(orders: Iterable[int]) -> list[int]:

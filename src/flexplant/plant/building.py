@@ -182,9 +182,11 @@ def _integrals(part: StateSpace | None, most: int) -> int:
     if part is None or not part.n_states:
         return 0
     B, direct = part.B, float(part.D[0, 0])
+    # what rounding of one solution may reach: a state that is zero may be read
+    spread = np.abs(part.C) @ np.abs(np.linalg.inv(part.A)) @ np.abs(part.A)
     for times in range(most):
         B = np.asarray(np.linalg.solve(part.A, B), dtype=np.float64)
-        size = abs(direct) + float((np.abs(part.C) @ np.abs(B))[0, 0])
+        size = abs(direct) + float((spread @ np.abs(B))[0, 0])
         if abs(direct - float((part.C @ B)[0, 0])) > _ZERO * size:
             return times
         direct = 0.0
@@ -219,8 +221,8 @@ def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str
     return (
         f"{output!r} is an absolute {QUANTITIES[order]}, which grows without bound with the "
         f"acceleration of {name!r}: its integrals need {counted(left, 'zero')} at 0 Hz more "
-        f"than the sensor has, and {has}. Give it one that has, shape=highpass(0.1, "
-        f"order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
+        f"than the sensor has, and {has}. Give it one that has, shape=fx.lti.high_pass_filter("
+        f"0.1, order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
         "ground: absolute=False."
     )
 

@@ -29,8 +29,9 @@ from .nonlinear_elements import Acts, split_elements
 #: lines of least squares: their number, and the slowest of them relative to the bandwidth of the
 #: loop, or to one over the duration of the move
 _LINES, _SLOWEST = 200, 1e-2
-#: relative to the bandwidth, up to where a set-point without a move is large: a quarter
-_FASTEST = 0.25
+#: relative to the bandwidth, above which a set-point counts less when no move is given: as that of
+#: a move that takes about three times one over the bandwidth
+_FASTEST = 0.4
 #: samples of a move in continuous time
 _STEPS = 2000
 #: relative: errors that feedforward leaves and that are worth a warning
@@ -143,12 +144,12 @@ def design_feedforward(
     move apart (`flexplant.plant.driven_axes`, next to rest) are taken together: the forces that
     keep the axes without a reference at rest are in it.
 
-    Of a loop the gains are those of least squares of its error ``G_u F + G_r - 1``, G_u and G_r the
-    responses of the POI to forces and reference in closed loop: where sensors and POI do not move
-    alike, the feedback would oppose the inverse of P, and its poles and the zeros of P may be as
-    slow as the moves. The errors are weighted with a set-point that follows a snap and moves within
-    about four times the time of the loop's bandwidth, or with the move that is given. A plant that
-    takes no force at rest is given none.
+    In a loop the gains are those of least squares of its error ``G_u F + G_r - 1``, with G_u and
+    G_r the responses of the POI to forces and reference in closed loop: where sensors and POI do
+    not move alike, the feedback would oppose the inverse of P. Poles of the controller and zeros of
+    P may be as slow as the moves. The errors are weighted with the spectrum of the move, or of one
+    that takes about three times one over the loop's bandwidth. Without a move, a plant that takes
+    no force at rest is given none. Gains of a lower order are the best of that order.
 
     Parameters
     ----------
@@ -217,7 +218,9 @@ def design_feedforward(
     gains = at_rest(axes.inverse(_forced(plant, ()), along), plant.dt, axes.axes)
     if loop is not None and (loop.blocks or move is not None):
         last = highest if move is None else min(highest, move.order)
-        orders = np.arange(0 if np.any(gains[..., 0]) else 1, last + 1)
+        # a force that grows with the position would stay when a free machine has arrived
+        first = 0 if move is not None or np.any(gains[..., 0]) else 1
+        orders = np.arange(first, last + 1)
         freq, size = _moved_size(loop, name, poi.derived(axis, "error"), move)
         moved = axes.moved(_forced(plant, loop.blocks), along)
         gains = np.zeros_like(gains)
