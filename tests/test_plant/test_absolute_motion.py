@@ -115,7 +115,7 @@ def test_a_floor_of_several_filters(last, roll):
         np.testing.assert_allclose(shown, moved * corner(FLOOR, S) * low / S**2, rtol=1e-6)
     # one zero is too few for a displacement
     few = fx.lti.series(high_pass_filter(FLOOR), low_pass_filter(40.0, order=roll))
-    with pytest.raises(ModelError, match="1 zero at 0 Hz more|has 1"):
+    with pytest.raises(ModelError, match="has 1"):
         plant([Sensor("y", at="1:x")], [floor(shape=few)], pois)
 
 

@@ -413,7 +413,7 @@ def _resolved(freq: FloatArray) -> int:
     """Return the number of evenly spaced lines with the resolution of the widest gaps."""
     # polynomials are determined only where lines are; single lines that were left out do no harm
     gap = float(np.quantile(np.diff(freq), _WIDE))
-    return min(freq.size, round((freq[-1] - freq[0]) / gap) + 1)
+    return min(freq.size, round(float(freq[-1] - freq[0]) / gap) + 1)
 
 
 def checked_orders(orders: Iterable[int]) -> list[int]:

@@ -222,8 +222,8 @@ def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str
         f"{output!r} is an absolute {QUANTITIES[order]}, which grows without bound with the "
         f"acceleration of {name!r}: its integrals need {counted(left, 'zero')} at 0 Hz more "
         f"than the sensor has, and {has}. Give it one that has, shape=fx.lti.high_pass_filter("
-        f"0.1, order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
-        "ground: absolute=False."
+        f"0.1, order={left}) say, or dynamics to the sensor (a geophone's), or measure relative "
+        "to the ground: absolute=False."
     )
 
 
