@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import flexplant as fx
-from flexplant.synthesis import write_c
+from flexplant.export import write_c
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 RATE, BANDWIDTH, DAMPING, L = 10e3, 50.0, 0.01, 0.6  # Hz, Hz, 1, m

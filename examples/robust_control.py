@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 import flexplant as fx
-from flexplant.synthesis import reduce_controller, robust_stability, worst_case_gain, write_c
+from flexplant.export import write_c
+from flexplant.synthesis import reduce_controller, robust_stability, worst_case_gain
 from wafer_stage import RATE, models, ports
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook

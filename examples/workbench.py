@@ -85,7 +85,7 @@ def main(*, browser: bool = False) -> dict[str, Any]:
     closed = fx.close_loop(plant, design.controller())
     OUT.mkdir(exist_ok=True)
     design.save(OUT / "loops.npz")
-    fx.synthesis.write_c(design.controller(), OUT / "loops.c")
+    fx.export.write_c(design.controller(), OUT / "loops.c")
     return {"frf": frf, "bench": bench, "design": design, "loops": design.loops(frf)} | {
         "plant": plant, "closed": closed,
     }  # fmt: skip

@@ -21,10 +21,10 @@ import pytest
 import flexplant as fx
 from flexplant import parallel
 from flexplant.errors import FlexplantError, SolverError
-from flexplant.io import write_fmu, write_frf_csv, write_mat
+from flexplant.export import write_c, write_fmu
+from flexplant.io import write_frf_csv, write_mat
 from flexplant.placement import Exhaustive, place_sensors
 from flexplant.plot import report
-from flexplant.synthesis import write_c
 from placement_plate import machine
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and mounts of Linux")

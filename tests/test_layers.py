@@ -38,6 +38,7 @@ ROOMS = (
     "simulation",
     "testbeds",
     "io",
+    "export",
     "plot",
     "workbench",
     "documentation",

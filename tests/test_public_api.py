@@ -57,7 +57,17 @@ ROOMS = {
         "updating",
         "plant",
     ),
-    *("loop", "estimation", "synthesis", "placement", "simulation", "testbeds", "io", "errors"),
+    *(
+        "loop",
+        "estimation",
+        "synthesis",
+        "placement",
+        "simulation",
+        "testbeds",
+        "io",
+        "export",
+        "errors",
+    ),
     "plot",
     "workbench",
 }

@@ -135,7 +135,7 @@ USES = {
 }
 EXPORTS = {
     "npz": lambda c, p: [v.save(p / "v.npz") for v in (c.plant, c.observer, c.loop, c.h2)],
-    "c": lambda c, p: syn.write_c(c.h2, p / "k.c"),
+    "c": lambda c, p: fx.export.write_c(c.h2, p / "k.c"),
     "html": lambda c, p: fx.plot.report(p / "r.html", c.run, c.plant, c.observer),
 }
 

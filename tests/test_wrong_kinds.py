@@ -112,7 +112,7 @@ CALLS = [
     ("H2 below", lambda x: fx.synthesis.H2(below=x), ("none", "fraction")),
     ("reduce_controller", lambda x: fx.synthesis.reduce_controller(x, servo()), ()),
     ("anti_windup_form", lambda x: fx.synthesis.anti_windup_form(x), NUMBERS),
-    ("write_c", lambda x: fx.synthesis.write_c(servo(), x), ()),
+    ("write_c", lambda x: fx.export.write_c(servo(), x), ()),
     ("design_kalman", lambda x: fx.design_kalman(x), ()),
     ("check_bias", lambda x: fx.estimation.check_bias(x, ["amp1"]), ()),
     ("check_bias inputs", lambda x: fx.estimation.check_bias(plant(), x), ()),

@@ -152,7 +152,7 @@ lower bound too, by a perturbation that reaches it.
 | ``placement.ByRows``, ``Found`` | `placement.RowSelection`, `placement.SearchResult` |
 | ``plant.Along`` | `plant.PortPath` |
 | ``plant.Seen``, ``plant.Moves`` | `plant.MeasuredRow`, `plant.PlaceMotion` |
-| ``synthesis.fixed_point`` | gone: `synthesis.write_c` computes in float or double |
+| ``synthesis.fixed_point`` | gone: `export.write_c` computes in float or double |
 | ``design_hinf_filter``, ``design_minimax_filter`` | `design_kalman`; `plant.uncertain` |
 | ``simulation.certify_speed`` | gone: `simulation.rms_along(..., repeats=True)`, one path |
 | ``kirchhoff_plate(holes=, ribs=)`` | gone: a mesh of scikit-fem, `examples/from_skfem.py` |

@@ -2,6 +2,7 @@
 
 from . import errors as errors
 from . import estimation as estimation
+from . import export as export
 from . import identification as identification
 from . import io as io
 from . import joining as joining

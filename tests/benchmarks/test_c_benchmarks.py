@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.signal import sosfilt
 
+from flexplant.export import write_c
 from flexplant.lti import StateSpace
-from flexplant.synthesis import second_order_sections, write_c
+from flexplant.synthesis import second_order_sections
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 SAMPLES = 200_000

@@ -12,8 +12,8 @@ import pytest
 from test_placement_benchmarks import stage
 
 import flexplant as fx
+from flexplant.export import write_c
 from flexplant.placement import BranchAndBound
-from flexplant.synthesis import write_c
 from oracles_lti import periodic_answer
 from stages import RATE, L, ports, some_modes
 

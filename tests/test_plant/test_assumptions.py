@@ -9,7 +9,7 @@ from flexplant import DofSet
 from flexplant.errors import AssumptionError, LabelError
 from flexplant.estimation import design_kalman
 from flexplant.lti import StateSpace, low_pass_filter
-from flexplant.lti.joining import axis_zeros
+from flexplant.lti.zeros import axis_zeros
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, StandardPlant, assemble_plant
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from flexplant.synthesis import design_hinf

@@ -18,9 +18,10 @@ from flexplant.errors import (
     LabelError,
     ModelError,
 )
+from flexplant.export import write_c
 from flexplant.lti import StateSpace
 from flexplant.simulation import Saturation
-from flexplant.synthesis import anti_windup_form, write_c
+from flexplant.synthesis import anti_windup_form
 from oracles_lti import periodic_answer
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")

@@ -34,7 +34,6 @@ be read are refused with what to write instead.
 | records | `read_records` | .uff, .lvm, .csv of a logger: time records; `read_spectra` |
 | responses | `read_frf_csv`, ... | .csv, .mat, .npz: frequency responses |
 | values for MATLAB | `read_mat`, `write_mat` | .mat: systems, plants, reduced models, responses |
-| functional mock-up | `write_fmu` | .fmu: sampled plants and controllers, FMI 2.0 and 3.0 |
 
 **A model of your own**, in whatever units it was written, is read, checked, solved and reduced:
 
@@ -85,7 +84,6 @@ from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys
 from .exodus import read_exodus_modes as read_exodus_modes
 from .fe_modes import read_modes as read_modes
-from .fmu import write_fmu as write_fmu
 from .frf_files import read_frf_csv as read_frf_csv
 from .frf_files import read_frf_mat as read_frf_mat
 from .frf_files import read_frf_npz as read_frf_npz

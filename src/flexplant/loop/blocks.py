@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, LabelError, ModelError, unknown_label
+from ..lti.blocks_of_states import equal_matrices
 from ..lti.interconnection import among, connect
-from ..lti.joining import equal_matrices
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import FloatArray, between, positive
 from ..errors import ModelError
 from ..tolerances import ROUNDING
-from .joining import bilinear_matrices, trapezoidal
+from .blocks_of_states import bilinear_matrices, trapezoidal
 from .statespace import StateSpace, System, as_statespace
 
 

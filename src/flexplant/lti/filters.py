@@ -8,8 +8,8 @@ import numpy.typing as npt
 from ..arrays import between, number, positive, whole
 from ..errors import ModelError
 from ..tolerances import SAME
+from .foreign_systems import tf_fields, zpk_fields
 from .interconnection import series
-from .joining import tf_fields, zpk_fields
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -17,10 +17,10 @@ from ..parallel import Progress, expect
 from ..store import Value, checked, rebuild
 from ..tolerances import SAME
 from ..words import known_units, name_list, signal_names
+from .blocks_of_states import chosen_pair, rows_of, short_list
 from .frequency_sweep import checked_freq as checked_freq
 from .frequency_sweep import default_freq as default_freq
 from .frequency_sweep import sampled_freq as sampled_freq
-from .joining import chosen_pair, rows_of, short_list
 from .measured_lines import checked_correlation, checked_overlap, checked_window, line_correlation
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace

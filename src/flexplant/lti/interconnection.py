@@ -12,8 +12,15 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..tolerances import ROUNDING
 from ..words import inner_names, instance, name_list
+from .blocks_of_states import (
+    Matrices,
+    block_matrix,
+    common_dt,
+    common_fields,
+    joined_units,
+    state_names,
+)
 from .equations import balanced_matrix
-from .joining import Matrices, block_matrix, common_dt, common_fields, joined_units, state_names
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -11,6 +11,7 @@ from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
 from ..tolerances import divisor
+from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .equations import (
     DOUBLINGS,
     accumulated,
@@ -24,7 +25,6 @@ from .equations import (
     symmetric,
     symmetrised,
 )
-from .joining import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .modal_map import ModalMap
 from .statespace import StateSpace, System, as_statespace
 

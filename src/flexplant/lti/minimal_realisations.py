@@ -11,8 +11,8 @@ from scipy.sparse import csgraph
 
 from ..arrays import ComplexArray, FloatArray, between
 from ..tolerances import TINY
+from .blocks_of_states import block_matrix, is_block_diagonal, joined_blocks
 from .equations import reciprocal, state_scale
-from .joining import block_matrix, is_block_diagonal, joined_blocks
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
 from .modal_map import DOUBLE, eigenvalues_with_error

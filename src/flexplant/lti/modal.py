@@ -10,8 +10,8 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import SolverError, counted
 from ..store import Value
+from .blocks_of_states import block_eigenvalues, is_block_diagonal
 from .equations import state_scale
-from .joining import block_eigenvalues, is_block_diagonal
 from .modal_map import eigenvalues_with_error, uncertain_poles
 from .statespace import StateSpace, System, as_statespace
 

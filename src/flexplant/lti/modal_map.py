@@ -8,8 +8,8 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
+from .blocks_of_states import diagonal_blocks, is_block_diagonal
 from .equations import even_scale, state_scale
-from .joining import diagonal_blocks, is_block_diagonal
 from .statespace import StateSpace
 
 #: largest condition of eigenvectors whose residues are used

@@ -9,9 +9,9 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
+from .blocks_of_states import bilinear_matrices, is_block_diagonal
 from .equations import axis_frequencies, state_scale
 from .frequency_sweep import SOUGHT, highest, largest_gains, resonance_grid
-from .joining import bilinear_matrices, is_block_diagonal
 from .lyapunov import (
     controllability_factor,
     controllability_gramian,

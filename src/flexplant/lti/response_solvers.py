@@ -12,8 +12,8 @@ from scipy.sparse import csgraph
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
+from .blocks_of_states import diagonal_blocks, uncoupled_run
 from .equations import scaled_schur
-from .joining import diagonal_blocks, uncoupled_run
 from .modal_map import diagonal_form
 from .statespace import StateSpace
 

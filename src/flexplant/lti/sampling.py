@@ -14,8 +14,8 @@ from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, ModelError, warn
 from ..tolerances import SAME, TINY, divisor
 from ..words import check_names
+from .blocks_of_states import block_eigenvalues, diagonal_blocks, uncoupled_run
 from .equations import state_scale
-from .joining import block_eigenvalues, diagonal_blocks, uncoupled_run
 from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace
 

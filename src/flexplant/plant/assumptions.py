@@ -14,8 +14,8 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, counted, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.equations import state_scale
-from ..lti.joining import axis_zeros
 from ..lti.statespace import StateSpace
+from ..lti.zeros import axis_zeros
 from ..store import Value
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partitioned import PartitionedSystem

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
-from ..lti.joining import block_diagonal
+from ..lti.blocks_of_states import block_diagonal
 from ..modes import Modes, NormalForm
 from ..modes.normal_forms import PROPORTIONAL, RealForm, modal, pole_pairs, real_form
 from ..reduction import ReducedModel

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray
-from ..lti.joining import block_diagonal
+from ..lti.blocks_of_states import block_diagonal
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import SAME, TINY

@@ -11,7 +11,7 @@ from ..arrays import FloatArray, IntArray, positive, real_array, whole
 from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.balancing import hankel_values
-from ..lti.joining import block_diagonal
+from ..lti.blocks_of_states import block_diagonal
 from ..lti.statespace import StateSpace
 from ..modes.modes import Modes
 from ..modes.statics import labels_of, places

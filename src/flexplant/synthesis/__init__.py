@@ -11,8 +11,7 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
 - `mu`, `robust_stability`, `worst_case_gain`, `design_mu`: guarantees for uncertain plants.
 
 To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
-`second_order_sections`, `write_c` (a whole loop in one C file; 60 states in 0.04 us a sample);
-`fx.io.write_fmu`.
+`second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write what runs elsewhere.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -38,7 +37,6 @@ Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `desi
 """
 
 from ..rooms import public_names as _public_names
-from .aftercare.c_code import write_c as write_c
 from .aftercare.forms import anti_windup_form as anti_windup_form
 from .aftercare.forms import second_order_sections as second_order_sections
 from .aftercare.order import discretise_controller as discretise_controller

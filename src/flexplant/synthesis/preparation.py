@@ -18,9 +18,9 @@ import scipy.linalg as la
 
 from ..arrays import FloatArray
 from ..errors import AssumptionError, ModelError
+from ..lti.blocks_of_states import Matrices
 from ..lti.discretisation import bilinear, image_freq, tustin
 from ..lti.equations import mean_speed
-from ..lti.joining import Matrices
 from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantError, ModelError
+from ..export import write_c
 from ..io import write_mat
 from ..lti.statespace import StateSpace
 from ..store import load
@@ -24,7 +25,6 @@ from ..synthesis import (
     ShapedAxis,
     ShapedLoop,
     second_order_sections,
-    write_c,
 )
 from ..synthesis.laws.hand_design import TERMS
 from ..synthesis.laws.law import LawElement

@@ -12,9 +12,9 @@ from ...arrays import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid
-from ...lti.joining import axis_zeros
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
+from ...lti.zeros import axis_zeros
 from ...tolerances import divisor
 from ..preparation import Prepared
 

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from ...arrays import ComplexArray, FloatArray, below_half_rate, positive, real_array
 from ...errors import ModelError, short
+from ...lti.blocks_of_states import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.frequency import sampled_freq
-from ...lti.joining import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...store import Value

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...arrays import ComplexArray, FloatArray, IntArray, whole
 from ...errors import ModelError, ShapeError, short
+from ...lti.blocks_of_states import block_matrix
 from ...lti.interconnection import series
-from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace, as_statespace
 from ...store import Value, checked
 from ...tolerances import ROUNDING, TINY

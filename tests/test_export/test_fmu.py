@@ -8,6 +8,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
+from flexplant.export import write_fmu
 from flexplant.lti import StateSpace
 
 fmpy = pytest.importorskip("fmpy", reason="extra test")
@@ -65,7 +66,7 @@ def test_plant_and_controller_as_units_give_the_run_of_simulate(version, tmp_pat
     """Both validate; joined sample by sample they are the loop, to 1e-9 of each channel."""
     plant, loop = masses()
     files = [
-        fx.io.write_fmu(one, tmp_path / f"{name}.fmu", version=version)
+        write_fmu(one, tmp_path / f"{name}.fmu", version=version)
         for name, one in (("plant", plant), ("law", loop))
     ]
     for file in files:
@@ -103,7 +104,7 @@ def test_fmpy_runs_a_unit_with_names_of_any_letters(version, tmp_path):
     shown = "y \u03b8"
     g = StateSpace([[0.9, 0.2], [-0.2, 0.9]], np.eye(2), [[1.0, 1.0]], [[0.0, 0.0]], 0.01,
                    inputs=names, outputs=[shown], units={shown: "N m/s^2"})  # fmt: skip
-    file = fx.io.write_fmu(g, tmp_path / "any.fmu", version=version)
+    file = write_fmu(g, tmp_path / "any.fmu", version=version)
     assert validate_fmu(str(file)) == []
     rows = [(0.0, 1.0, 0.0), (0.1, 0.0, 2.0), (0.4, 0.0, 0.0)]
     given = np.array(rows, dtype=[("time", float), (names[0], float), (names[1], float)])
@@ -137,7 +138,7 @@ def test_without_a_compiler_the_sources_are_written_and_it_is_said(monkeypatch, 
     monkeypatch.setattr(shutil, "which", lambda name: None)
     plant, _ = masses()
     with pytest.warns(FlexplantWarning, match="no C compiler"):
-        file = fx.io.write_fmu(plant, tmp_path / "masses.fmu")
+        file = write_fmu(plant, tmp_path / "masses.fmu")
     names = zipfile.ZipFile(file).namelist()
     assert sorted(names) == [
         "modelDescription.xml", "sources/buildDescription.xml", "sources/masses.c",
@@ -148,10 +149,10 @@ def test_without_a_compiler_the_sources_are_written_and_it_is_said(monkeypatch, 
 def test_refusals_of_units(tmp_path):
     plant, _ = masses()
     for error, cause, call in (
-        (ModelError, r"\.fmu", lambda: fx.io.write_fmu(plant, tmp_path / "a.zip")),
-        (ModelError, "version", lambda: fx.io.write_fmu(plant, tmp_path / "a.fmu", version="1")),
-        (LabelError, "C allows", lambda: fx.io.write_fmu(plant, tmp_path / "1a.fmu")),
-        (ModelError, "continuous", lambda: fx.io.write_fmu(plant.continuous, tmp_path / "a.fmu")),
+        (ModelError, r"\.fmu", lambda: write_fmu(plant, tmp_path / "a.zip")),
+        (ModelError, "version", lambda: write_fmu(plant, tmp_path / "a.fmu", version="1")),
+        (LabelError, "C allows", lambda: write_fmu(plant, tmp_path / "1a.fmu")),
+        (ModelError, "continuous", lambda: write_fmu(plant.continuous, tmp_path / "a.fmu")),
     ):
         with pytest.raises(error, match=cause):
             call()
@@ -161,4 +162,4 @@ def test_refusals_of_units(tmp_path):
 def test_names_that_no_variable_may_have(name, tmp_path):
     gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=[name], outputs=["u1"])
     with pytest.raises(LabelError, match="no variable"):
-        fx.io.write_fmu(gain, tmp_path / "unit.fmu")
+        write_fmu(gain, tmp_path / "unit.fmu")

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import FloatArray, number, positive
-from ...errors import AssumptionError, LabelError, ModelError, require_known, short
-from ...loop import ClosedLoop, ScheduledLoop
-from ...loop.blocks import applied_law
-from ...lti.statespace import StateSpace, as_statespace
-from ...store import written
-from ...tolerances import SAME
-from ...words import flag
+from ..arrays import FloatArray, number, positive
+from ..errors import AssumptionError, LabelError, ModelError, require_known, short
+from ..loop import ClosedLoop, ScheduledLoop
+from ..loop.blocks import applied_law
+from ..lti.statespace import StateSpace, as_statespace
+from ..store import written
+from ..synthesis.aftercare.forms import back_gain, scheduled_form, two_state_form
+from ..tolerances import SAME
+from ..words import flag
 from .c_text import CText
-from .forms import back_gain, scheduled_form, two_state_form
 
 #: words of C, and what its library has with the ending _t
 _RESERVED = frozenset(
@@ -96,7 +96,7 @@ def write_c(
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     loop = fx.close_loop(plant, observer, servo)
-    ...     _ = fx.synthesis.write_c(loop, os.path.join(folder, "servo.c"), limits=20.0)
+    ...     _ = fx.export.write_c(loop, os.path.join(folder, "servo.c"), limits=20.0)
     ...     sorted(os.listdir(folder))
     ['servo.c', 'servo.h']
     """

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LabelError, ModelError, warn
+from ..io.files import file_path
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import written
-from ..synthesis.aftercare.c_code import c_name, c_program
-from ..synthesis.aftercare.c_text import CText
 from ..words import one_of
-from .files import file_path
+from .c_code import c_name, c_program
+from .c_text import CText
 
 #: the types are those that the specification names, spelled out where they are pointers or numbers
 _COMMON = """\
@@ -383,7 +383,7 @@ def write_fmu(
     >>> import os, tempfile, zipfile
     >>> plant = fx.testbeds.three_masses()
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     made = fx.io.write_fmu(plant, os.path.join(folder, "masses.fmu"))
+    ...     made = fx.export.write_fmu(plant, os.path.join(folder, "masses.fmu"))
     ...     sorted(name for name in zipfile.ZipFile(made).namelist() if name.endswith(".c"))
     ['sources/masses.c', 'sources/masses_fmi.c']
     """

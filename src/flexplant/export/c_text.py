@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import FloatArray
-from ...errors import counted
-from ...lti.statespace import StateSpace
-from .forms import LANES, TwoStateForm
+from ..arrays import FloatArray
+from ..errors import counted
+from ..lti.statespace import StateSpace
+from ..synthesis.aftercare.forms import LANES, TwoStateForm
 
 _HEADER = """\
 /* {title}
