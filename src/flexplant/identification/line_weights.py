@@ -66,19 +66,22 @@ class PreparedLines:
             return 1.0
         return float(np.median(self.line_correlation.sum(axis=1)))
 
-    def spread(self, a: int, b: int, rows: ComplexArray) -> ComplexArray | None:
-        """Return the correlation of the errors of rows a and b times `rows` (n_in, n_freq, k)."""
-        # None where the two are independent
+    def correlated(self, a: int, b: int) -> Any:
+        """Return the correlation of the errors of rows a and b at each line, None where it is 0."""
+        if self.correlation is None or self.swapped:
+            return 1.0 if a == b else None
+        return self.correlation[a, b][None, :, None]
+
+    def spread(self, rows: ComplexArray) -> ComplexArray:
+        """Return the correlation of the errors within a row times `rows` (n_in, n_freq, k)."""
         C, R = self.correlation, self.line_correlation
-        if a != b and (C is None or self.swapped):
-            return None
         if R is not None:
             flat = np.moveaxis(rows, 1, 0)
             spread: Any = (R @ flat.reshape(flat.shape[0], -1)).reshape(flat.shape)
             rows = np.moveaxis(spread, 0, 1)
         if C is not None and self.swapped:
             return np.asarray(np.einsum("abf,bfq->afq", C, rows))
-        return rows if C is None else np.asarray(C[a, b][None, :, None] * rows)
+        return rows
 
     @property
     def line_weight(self) -> FloatArray:

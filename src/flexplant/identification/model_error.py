@@ -53,9 +53,13 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     free = max(1.0, 2 * lines.data.size - lines.inflation * count)
     if parts == 1 or fit.cost < NOISE * free:
         return False
-    alone = own_cost(fit)
     noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEXT_TO_NONE * (fit.cost - free)
-    return alone < min(least, free + noise) and alone * NOISE < fit.cost
+    limit, alone = min(least, free + noise, fit.cost / NOISE), 0.0
+    for place in range(parts):
+        alone += fit.own_of(place).cost
+        if alone >= limit:
+            return False
+    return True
 
 
 def coherence(fit: PoleFit, pole: complex) -> float:
@@ -145,10 +149,7 @@ def disagreement(fit: PoleFit, least: float, excess: float) -> Disagreement | No
         return None
     places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
     # an output that hardly sees a mode may have its own pole anywhere: known no better than there
-    parted = [
-        PoleFit(fit.lines.of_rows(rows), fit.poles, fit.participation, fit.pivots)
-        for rows in fit.lines.parts
-    ]
+    parted = [fit.at_rows(rows) for rows in fit.lines.parts]
     seen, alone = (np.array([_variance(one) for one in fits]) for fits in (parted, own))
     elsewhere, broad = (np.tile(squares, 2) for squares in _strayed(fit, own))
     variance = np.maximum(seen, alone) + elsewhere

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -24,15 +24,14 @@ def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
     least = gain_due_of_pole(lines)
     fit = pivoted(lines, poles, part)
-    kept = list(range(poles.size))
-    now = fit.cost_of(kept) if kept else 0.0
+    kept, now = list(range(poles.size)), fit.cost
     while len(kept) > 1:
-        allowed = least * max(1.0, now / lines.freedom(len(kept)))
-        costs = [fit.cost_of([k for k in kept if k != out]) for out in kept]
-        if min(costs) - now > allowed:
+        rises = fit.rises(kept)
+        weakest = int(np.argmin(rises))
+        if rises[weakest] > least * max(1.0, now / lines.freedom(len(kept))):
             break
-        kept.pop(int(np.argmin(costs)))
-        now = min(costs)
+        kept.pop(weakest)
+        now += float(rises[weakest])
     kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
     if not kept:
         raise SolverError(
@@ -278,44 +277,46 @@ def split_proposals(fit: PoleFit) -> Proposals:
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
     """
-    pairs = (pair for k in range(fit.m) for pair in _pairs(fit, k))
-    yield sorted((_more_poles(fit, *pair) for pair in pairs), key=lambda trial: -trial.gain)
+    trials = (trial for k in range(fit.m) for trial in _pairs(fit, k))
+    yield sorted(trials, key=lambda trial: -trial.gain)
 
 
-def _more_poles(fit: PoleFit, poles: ComplexArray, part: ComplexArray) -> Trial:
-    """Return the trial of a fit with a pole more."""
+def _more_poles(
+    fit: PoleFit, poles: ComplexArray, part: ComplexArray, instead: int | None = None
+) -> Trial:
+    """Return the trial of a fit with one pole more, or with two instead of one."""
     least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
-    return Trial(fit.lines, poles, part, fit.cost - PoleFit(fit.lines, poles, part).cost, least)
+    gain = fit.cost - fit.cost_with(poles, part, instead)
+    now = (fit.poles, fit.participation) if instead is None else fit.rest(instead)
+    all_poles, all_parts = np.append(now[0], poles), np.hstack([now[1], part])
+    return Trial(fit.lines, all_poles, all_parts, gain, least)
 
 
-def _pairs(fit: PoleFit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
-    """Return poles and participation with pole k twice: other directions, other places."""
-    pole, own = fit.poles[k], fit.participation[:, [k]]
-    delta = 1j * APART * abs(pole.real)
-    moved = fit.poles.copy()
-    moved[k] += delta
-    pairs = [(np.append(moved, pole - delta), np.hstack([fit.participation, own]))]
+def _pairs(fit: PoleFit, k: int) -> Iterator[Trial]:
+    """Yield the trials with pole k twice: at other places, in other directions."""
+    pole, own = fit.poles[[k]], fit.participation[:, [k]]
+    delta = 1j * APART * np.abs(pole.real)
+    yield _more_poles(fit, np.append(pole + delta, pole - delta), np.hstack([own, own]), k)
     others = np.asarray(la.null_space(own.conj().T), dtype=np.complex128)
     for other in others.T:
         # a little of its own, so that the fit is free to turn both
-        mixed = other[:, None] * la.norm(own) + 1e-3 * own
-        pairs.append((np.append(fit.poles, pole), np.hstack([fit.participation, mixed])))
-    return pairs
+        yield _more_poles(fit, pole, other[:, None] * la.norm(own) + 1e-3 * own)
 
 
 def relocated(fit: PoleFit) -> Proposals:
     """Propose other places for weak poles, within seven half-widths."""
     # the likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest
+    rises = fit.rises(list(range(fit.m)))
     for k, pole in enumerate(fit.poles):
-        if fit.m == 1 or -pole.real > 0.05 * abs(pole):
-            continue
-        if PoleFit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * gain_due_of_pole(fit.lines):
+        light = -pole.real <= 0.05 * abs(pole)
+        if fit.m == 1 or not light or rises[k] > WEAK * gain_due_of_pole(fit.lines):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
             poles = fit.poles.copy()
             poles[k] = pole + 1j * shift * abs(pole.real)
-            trials.append((PoleFit(fit.lines, poles, fit.participation).cost, abs(shift), poles))
+            cost = fit.cost_with(poles[[k]], fit.participation[:, [k]], instead=k)
+            trials.append((cost, abs(shift), poles))
         best = sorted(trials, key=lambda trial: trial[0])[:RIVALS]
         # refined, it is to lower the cost: where it begins it does so seldom
         yield [
@@ -328,7 +329,7 @@ def relocated(fit: PoleFit) -> Proposals:
 def missed_poles(fit: PoleFit) -> Proposals:
     """Propose a pole at the highest peaks of what is left, single lines apart."""
     for peak in [peak for peak in unexplained(fit) if not peak.isolated][:TRIED]:
-        yield [_more_poles(fit, *_with_pole(fit, peak))]
+        yield [_more_poles(fit, *_pole_at(fit, peak))]
 
 
 #: lengths [lines] of the stretches that are examined
@@ -444,13 +445,13 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
     return bool(np.median(near / np.convolve(power[1:], window, mode="valid")) > 0.5)
 
 
-def _with_pole(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
-    """Return poles and participation with the one added that explains a peak best."""
+def _pole_at(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
+    """Return the pole and participation that explain a peak best."""
     # of frequencies across the peak and some damping ratios; the participation is the leading right
     # singular vector of what the pole has in common with the residual
     lines = fit.lines
     error = (lines.data - fit.model) * lines.weight**2
-    best, pole, part = -1.0, 0j, fit.participation
+    best, pole, part = -1.0, 0j, fit.participation[:, :1]
     # dampings that a resolved peak can have
     own = np.clip(peak.width / (2 * peak.freq) * np.array([0.3, 1.0]), 1e-5, 0.15)
     for zeta in np.unique([*DAMPING, *own.tolist()]):
@@ -462,8 +463,7 @@ def _with_pole(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
             sizes, right = la.svd(error @ term.conj() / np.sqrt(gain))[1:]
             if sizes[0] > best:
                 best, pole, part = float(sizes[0]), place, right[0][:, None]
-    parts = np.hstack([fit.participation, part.astype(np.complex128)])
-    return np.append(fit.poles, pole), parts
+    return np.array([pole]), part.astype(np.complex128)
 
 
 def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:

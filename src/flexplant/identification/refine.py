@@ -13,6 +13,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
 from ..tolerances import RANK, TINY
+from .terms import axis, pole_terms, residual_terms
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
@@ -242,7 +243,8 @@ class PoleFit:
         #: by place in `lines.parts`, the fits of single outputs that were made so far
         self.alone: dict[int, PoleFit] = {}
         self.cost = 0.0
-        for o, (right, stacked) in enumerate(zip(lines.goals, self._stacked(), strict=True)):
+        columns = self._stacked(self.plus, self.minus, participation)
+        for o, (right, stacked) in enumerate(zip(lines.goals, columns, strict=True)):
             size = np.maximum(np.linalg.norm(stacked, axis=0), TINY)
             Q, R = _orthonormal(stacked / size)
             x = la.lstsq(R, Q.T @ right, cond=RANK)[0] / size
@@ -252,14 +254,16 @@ class PoleFit:
             self.cost += float(error @ error)
             self.bases.append((Q, error))
 
-    def _stacked(self) -> Iterator[FloatArray]:
-        """Yield per output the columns (n_in 2 n_freq, 2 m) of its shapes, free of other terms."""
-        l = self.participation[:, :, None]  # noqa: E741 - the field's letter
-        first, second = l * self.plus, l.conj() * self.minus
+    def _stacked(
+        self, plus: ComplexArray, minus: ComplexArray, participation: ComplexArray
+    ) -> Iterator[FloatArray]:
+        """Yield per output the columns (n_in 2 n_freq, 2 m) of shapes, free of residual terms."""
+        l = participation[:, :, None]  # noqa: E741 - the field's letter
+        first, second = l * plus, l.conj() * minus
         both = np.concatenate([first + second, 1j * (first - second)], axis=1)
         for (Q, _), w in zip(self.lines.smooth_bases, self.lines.weight, strict=True):
             columns = _off(Q, _real_and_imag(both * w[:, None, :]))
-            yield columns.swapaxes(0, 1).reshape(2 * self.m, w.shape[0] * columns.shape[2]).T
+            yield columns.swapaxes(0, 1).reshape(2 * len(plus), w.shape[0] * columns.shape[2]).T
 
     @property
     def misfit(self) -> float:
@@ -270,24 +274,45 @@ class PoleFit:
         """Return poles and participation without those at a place."""
         return np.delete(self.poles, place), np.delete(self.participation, place, axis=1)
 
-    def cost_of(self, kept: list[int]) -> float:
-        """Return the cost with the poles at some places only, from the normal equations."""
-        both, total = np.array([*kept, *(k + self.m for k in kept)]), 0.0
-        for N, g, square in self._normal:
-            x = la.lstsq(N[np.ix_(both, both)], g[both], cond=RANK)[0]
-            total += square - float(g[both] @ x)
+    def rises(self, kept: list[int]) -> FloatArray:
+        """Return by how much the cost of some poles rises when each of them is left out."""
+        # with the least-squares coefficients x and the inverse V of the normal matrix, leaving out
+        # the two of a pole costs `x^T V^-1 x` of its own entries
+        both, total = np.array([*kept, *(k + self.m for k in kept)]), np.zeros(len(kept))
+        for right, (Q, _), (R, _) in zip(self.lines.goals, self.bases, self.triangles, strict=True):
+            half = la.pinv(la.qr(R[:, both], mode="economic")[1], rtol=0.0)
+            x = half @ (half.T @ (R[:, both].T @ (Q.T @ right)))
+            rows = half.reshape(2, len(kept), -1).transpose(1, 0, 2)
+            own = np.linalg.pinv(rows @ rows.transpose(0, 2, 1), rcond=0.0, hermitian=True)
+            pairs = x.reshape(2, -1)
+            total += np.einsum("ik,kij,jk->k", pairs, own, pairs)
         return total
 
-    @cached_property
-    def _normal(self) -> list[tuple[FloatArray, FloatArray, float]]:
-        """Per output the normal equations of its shapes, and the power they are to explain."""
-        found = []
-        for right, (Q, _), (R, size) in zip(
-            self.lines.goals, self.bases, self.triangles, strict=True
+    def cost_with(
+        self, poles: ComplexArray, participation: ComplexArray, instead: int | None = None
+    ) -> float:
+        """Return the cost with further poles, also instead of one of the present poles."""
+        # the bases Q stay: further columns A add `A - Q Q^T A`, and a pole that goes leaves the two
+        # directions Z of `Q^T A` that the others do not span
+        lines, s = self.lines, axis(self.lines.freq)
+        plus, minus = (
+            pole_terms(some, s, lines.hold, lines.segment)[0] for some in (poles, poles.conj())
+        )
+        cost, columns = self.cost, self._stacked(plus, minus, participation)
+        gone = [] if instead is None else [instead, instead + self.m]
+        for right, A, (Q, error), (R, _) in zip(
+            lines.goals, columns, self.bases, self.triangles, strict=True
         ):
-            columns = R * size
-            found.append((columns.T @ columns, columns.T @ (Q.T @ right), float(right @ right)))
-        return found
+            lines.work.add(A.size * 4 * self.m)
+            A = A / np.maximum(np.linalg.norm(A, axis=0), TINY)
+            known, Z = Q.T @ A, np.zeros((2 * self.m, 0))
+            if gone:
+                Z = la.qr(np.delete(R, gone, axis=1))[0][:, 2 * self.m - 2 :]
+            freed = Z.T @ (Q.T @ right)
+            basis = la.orth(np.vstack([A - Q @ known, Z.T @ known]), rcond=RANK)
+            gain = basis.T @ np.concatenate([error, freed])
+            cost += float(freed @ freed - gain @ gain)
+        return cost
 
     @property
     def own(self) -> list[PoleFit]:
@@ -302,13 +327,29 @@ class PoleFit:
 
     def of_rows(self, rows: IntArray, below: float = np.inf) -> PoleFit:
         """Return the fit of some outputs alone: poles of their own, the participation of all."""
+        first = self.at_rows(rows)
         return refined(
-            *(self.lines.of_rows(rows), self.poles, self.participation),
+            *(first.lines, self.poles, self.participation),
             steps=OWN,
             strict=False,
             below=below,
             poles_only=True,
+            first=first,
         )
+
+    def at_rows(self, rows: IntArray) -> PoleFit:
+        """Return what this fit is at some outputs."""
+        part: PoleFit = object.__new__(PoleFit)
+        part.lines, part.alone, part.m = self.lines.of_rows(rows), {}, self.m
+        part.poles, part.participation, part.pivots = self.poles, self.participation, self.pivots
+        part.plus, part.slope = self.plus, self.slope
+        part.minus, part.slope_minus = self.minus, self.slope_minus
+        part.shapes = self.shapes[rows]
+        part.triangles, part.bases = (
+            [each[o] for o in rows] for each in (self.triangles, self.bases)
+        )
+        part.cost = sum(float(error @ error) for _, error in part.bases)
+        return part
 
     @cached_property
     def modal(self) -> ComplexArray:
@@ -489,102 +530,3 @@ def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _off(Q: FloatArray, rows: FloatArray) -> FloatArray:
     """Return rows (n_in, count, N) without what the columns of Q (n_in, N, n_terms) explain."""
     return np.asarray(rows - (rows @ Q) @ np.swapaxes(Q, -1, -2))
-
-
-#: |x| below which the functions are summed as series, and the terms of that
-SERIES, TERMS = 1.0, 20
-
-
-def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, ComplexArray]:
-    r"""Return R and dR/dq: a pole's term ``1/q`` is seen as ``R/q``, q = s - lambda.
-
-    Averages of windowed segments estimate, for an input that is white over a few lines, the
-    response whose impulse response is multiplied by the autocorrelation of the window, a lag
-    window:
-
-    .. math:: R = q \int_0^T \rho(\tau) e^{-q \tau} d\tau, \quad
-        \rho(\tau) = \left(1 - \frac{\tau}{T}\right)
-        \left(\frac{2}{3} + \frac{1}{3} \cos\frac{2 \pi \tau}{T}\right)
-        + \frac{1}{2 \pi} \sin\frac{2 \pi \tau}{T}
-
-    ([BendatPiersol2010]_, sections 11.5 and 11.6, for Hann windows); 1 far from the pole.
-    """
-    T, turn = segment, 2j * np.pi
-    x = gap * T
-    _, middle = _lag_terms(x)
-    low, left = _lag_terms(x - turn)
-    high, right = _lag_terms(x + turn)
-    g, slope = (4.0 * middle + left + right) / 6.0 + (low - high) / (2.0 * turn)
-    return np.asarray(x * g), np.asarray(T * (g + x * slope))
-
-
-def _lag_terms(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``mu = (1 - exp(-x)) / x`` and ``kappa = (1 - mu) / x``, each with its derivative."""
-    near = np.abs(x) < SERIES
-    far: ComplexArray = np.where(near, 1.0 + 0j, x)
-    decay = np.exp(-far)
-    mu = (1.0 - decay) / far
-    kappa = (1.0 - mu) / far
-    found = np.array([[mu, (decay - mu) / far], [kappa, (mu - 2.0 * kappa) / far]])
-    if np.any(near):
-        # kappa = sum (-x)^n / (n + 2)!
-        z, n = x[near], np.arange(TERMS)
-        inverse = 1.0 / np.cumprod(np.arange(1.0, TERMS + 3))[1:]
-        powers = (-z[:, None]) ** n
-        value, slope = powers @ inverse[:-1], -powers @ ((n + 1) * inverse[1:])
-        found[:, :, near] = [[1.0 - z * value, -value - z * slope], [value, slope]]
-    return found[0], found[1]
-
-
-def pole_terms(
-    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None = None
-) -> tuple[ComplexArray, ComplexArray]:
-    r"""Return ``1/(s - lambda)`` (n_poles, n_freq) and its derivative with respect to lambda.
-
-    Behind a zero-order hold of period T, a sampled mode answers
-
-    .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
-
-    which has the same pole on the axis of s and tends to 1/(s - lambda) with T
-    ([PintelonSchoukens2012]_, section 6.2). `segment`: as lines of Hann-windowed segments [s] show
-    them.
-    """
-    gap = s[None, :] - poles[:, None]
-    value, slope = 1.0 / gap, 1.0 / gap**2
-    if hold is not None:
-        T = 1.0 / hold
-        turn = np.exp(poles * T)[:, None]
-        # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
-        distance = turn * np.expm1(gap * T)
-        gain = (np.expm1(poles * T) / poles)[:, None]
-        change = (turn * T - gain) / poles[:, None]
-        value, slope = gain / distance, change / distance + gain * T * turn / distance**2
-    if segment is not None:
-        ratio, change = hann_ratio(gap, segment)
-        value, slope = value * ratio, slope * ratio - value * change
-    return value, slope
-
-
-def residual_terms(
-    s: ComplexArray, *, lower: int, upper: int, hold: float | None, top: float
-) -> ComplexArray:
-    """Return ``1/s, ..., 1/s^lower`` and ``1, s, ..., s^(upper-1)`` (lower + upper, n_freq)."""
-    # 1/s^2 is the motion of a rigid body; with a hold 1/s and 1/s^2 are T/(z-1) and T^2 (z+1)/(2
-    # (z-1)^2). Powers are of s/top, top in rad/s
-    rows = []
-    for power in range(1, lower + 1):
-        term = s ** (-float(power))
-        if hold is not None:
-            T = 1.0 / hold
-            back: Any = np.expm1(s * T)
-            held = back / (np.exp(s * T) * s * T)
-            known = {1: T / back, 2: T**2 * (back + 2.0) / (2.0 * back**2)}
-            term = known.get(power, term * held)
-        rows.append(term * top**power)
-    rows += [(s / top) ** power for power in range(upper)]
-    return np.array(rows, dtype=np.complex128).reshape(lower + upper, s.size)
-
-
-def axis(freq: FloatArray) -> ComplexArray:
-    """Return s = 2 pi i f."""
-    return np.asarray(2j * np.pi * freq)

@@ -16,7 +16,8 @@ from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines, Rejected
 from .measured import MeasuredModes
 from .model_error import Disagreement
-from .refine import PoleFit, axis, free_inputs, pole_terms, residual_terms, scaled_inverse
+from .refine import PoleFit, free_inputs, scaled_inverse
+from .terms import axis, pole_terms, residual_terms
 
 
 def answer(
@@ -93,19 +94,22 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
     direct = [own for _, own in maps]
     common = inverse
     mixed: FloatArray = np.zeros((n_out, len(inverse), 2 * m))
-    held = np.zeros((n_out, n_out, 2 * m, 2 * m))
+    held = np.zeros((n_out, n_out, m, 2, 2))
     if ready.independent:
         for a, own in enumerate(direct):
-            held[a, a] = _inner_product(own, own)
+            held[a, a] = _of_modes(own, own)
     else:
-        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobians()]
-        common = np.zeros_like(inverse)
-        for a in range(n_out):
-            for b in range(n_out):
-                other = ready.spread(a, b, direct[b])
-                common = common + _inner_product(gains[a], ready.spread(a, b, gains[b]))
-                mixed[b] += _inner_product(gains[a], other)
-                held[a, b] = _inner_product(direct[a], other)
+        J, common = list(fit.jacobians()), np.zeros_like(inverse)
+        for b, (own, slope) in enumerate(zip(direct, J, strict=True)):
+            others, total = ready.spread(own), np.zeros_like(slope)
+            for a in range(n_out):
+                C = ready.correlated(a, b)
+                if C is not None:
+                    held[a, b] = _of_modes(direct[a], C * others)
+                    total += C.conj() * J[a]
+            common += _inner_product(total, ready.spread(slope))
+            mixed[b] = inverse @ _inner_product(total, others)
+        common = inverse @ common @ inverse
     # derivatives of Re and Im of the participation, whose free entries are parameters themselves
     entries = np.zeros((n_in, 2, m, 2 * m * n_in))
     place = 2 * m * (1 + np.arange(n_in - 1)[:, None]) + np.arange(m)
@@ -113,7 +117,6 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
     entries[free, 0, np.arange(m), place] = entries[free, 1, np.arange(m), place + m] = 1.0
     slopes = np.concatenate([slopes, entries])
     mixed = mixed.reshape(n_out, -1, 2, m)
-    held = held.reshape(n_out, n_out, 2, m, 2, m)
     found = np.zeros((m, n_out + n_in, n_out + n_in), dtype=np.complex128)
     for k in range(m):
         slope = slopes[:, :, k]
@@ -121,7 +124,7 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
         cross = np.einsum("oap,epb->oaeb", slope, mixed[..., k])
         S[:, :, :n_out] += cross
         S[:n_out] += cross.transpose(2, 3, 0, 1)
-        S[:n_out, :, :n_out] += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
+        S[:n_out, :, :n_out] += held[:, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     chosen = common[: 2 * m, : 2 * m]
     both: ComplexArray = found + found.conj().transpose(0, 2, 1)
@@ -161,11 +164,15 @@ def _scaled_shapes(
     return phi, driving, np.asarray(T)
 
 
-def _inner_product(left: ComplexArray, right: ComplexArray | None) -> Any:
-    """Return Re(left^H right), summed over inputs and lines; zero where right is None."""
-    if right is None:
-        return 0.0
+def _inner_product(left: ComplexArray, right: ComplexArray) -> Any:
+    """Return Re(left^H right), summed over inputs and lines."""
     return (left.reshape(-1, left.shape[2]).conj().T @ right.reshape(-1, right.shape[2])).real
+
+
+def _of_modes(left: ComplexArray, right: ComplexArray) -> Any:
+    """Return the blocks (m, 2, 2) of the inner product that belong to one mode each."""
+    pairs = (side.reshape(-1, 2, side.shape[2] // 2) for side in (left.conj(), right))
+    return np.einsum("fak,fbk->kab", *pairs).real
 
 
 #: width 2 zeta f of a resonance in lines below which leakage may keep poles from being stable

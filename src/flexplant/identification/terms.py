@@ -1,0 +1,103 @@
+"""What a pole and a residual term show at the lines of a measurement, held and windowed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..checks import ComplexArray, FloatArray
+
+#: |(s - lambda) T| below which the integral of a window's pole is a sum over Gauss points, because
+#: the closed form cancels there, and their number, which is exact to rounding
+CLOSE, GAUSS_POINTS = 8.0, 24
+
+
+def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, ComplexArray]:
+    r"""Return R and dR/dq: a pole's term ``1/q`` is seen as ``R/q``, q = s - lambda.
+
+    Averages of windowed segments estimate, for an input that is white over a few lines, the
+    response whose impulse response is multiplied by the autocorrelation of the window, a lag
+    window:
+
+    .. math:: R = q \int_0^T \rho(\tau) e^{-q \tau} d\tau, \quad
+        \rho(\tau) = \left(1 - \frac{\tau}{T}\right)
+        \left(\frac{2}{3} + \frac{1}{3} \cos\frac{2 \pi \tau}{T}\right)
+        + \frac{1}{2 \pi} \sin\frac{2 \pi \tau}{T}
+
+    ([BendatPiersol2010]_, sections 11.5 and 11.6, for Hann windows); 1 far from the pole, where,
+    with x = q T and P = x^2 + 4 pi^2, it is
+
+    .. math:: R = 1 - \frac{4 \pi^2}{3 P} - \frac{32 \pi^4}{3}\,\frac{1 - e^{-x}}{x P^2}
+    """
+    x, near = gap * segment, np.abs(gap) * segment < CLOSE
+    x[near] = CLOSE
+    square, fourth = 4.0 * np.pi**2 / 3.0, 32.0 * np.pi**4 / 3.0
+    a, b, decay = 1.0 / x, 1.0 / (x**2 + 4.0 * np.pi**2), np.exp(-x)
+    bend = fourth * a * b**2
+    lost = bend * (1.0 - decay)
+    ratio = 1.0 - square * b - lost
+    slope = 2.0 * square * x * b**2 + lost * (a + 4.0 * x * b) - bend * decay
+    if np.any(near):
+        x = gap[near] * segment
+        points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+        t, turn = (1.0 + points) / 2.0, np.pi * (1.0 + points)
+        window = (1.0 - t) * (2.0 + np.cos(turn)) / 3.0 + np.sin(turn) / (2.0 * np.pi)
+        seen = np.exp(-x[:, None] * t) * (weights / 2.0 * window)
+        value = np.sum(seen, axis=1)
+        ratio[near], slope[near] = x * value, value - x * (seen @ t)
+    return ratio, segment * slope
+
+
+def pole_terms(
+    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None = None
+) -> tuple[ComplexArray, ComplexArray]:
+    r"""Return ``1/(s - lambda)`` (n_poles, n_freq) and its derivative with respect to lambda.
+
+    Behind a zero-order hold of period T, a sampled mode answers
+
+    .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
+
+    which has the same pole on the axis of s and tends to 1/(s - lambda) with T
+    ([PintelonSchoukens2012]_, section 6.2). `segment`: as lines of Hann-windowed segments [s] show
+    them.
+    """
+    gap = s[None, :] - poles[:, None]
+    value, slope = 1.0 / gap, 1.0 / gap**2
+    if hold is not None:
+        T = 1.0 / hold
+        turn = np.exp(poles * T)[:, None]
+        # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
+        distance = turn * np.expm1(gap * T)
+        gain = (np.expm1(poles * T) / poles)[:, None]
+        change = (turn * T - gain) / poles[:, None]
+        value, slope = gain / distance, change / distance + gain * T * turn / distance**2
+    if segment is not None:
+        ratio, change = hann_ratio(gap, segment)
+        value, slope = value * ratio, slope * ratio - value * change
+    return value, slope
+
+
+def residual_terms(
+    s: ComplexArray, *, lower: int, upper: int, hold: float | None, top: float
+) -> ComplexArray:
+    """Return ``1/s, ..., 1/s^lower`` and ``1, s, ..., s^(upper-1)`` (lower + upper, n_freq)."""
+    # 1/s^2 is the motion of a rigid body; with a hold 1/s and 1/s^2 are T/(z-1) and T^2 (z+1)/(2
+    # (z-1)^2). Powers are of s/top, top in rad/s
+    rows = []
+    for power in range(1, lower + 1):
+        term = s ** (-float(power))
+        if hold is not None:
+            T = 1.0 / hold
+            back: Any = np.expm1(s * T)
+            held = back / (np.exp(s * T) * s * T)
+            known = {1: T / back, 2: T**2 * (back + 2.0) / (2.0 * back**2)}
+            term = known.get(power, term * held)
+        rows.append(term * top**power)
+    rows += [(s / top) ** power for power in range(upper)]
+    return np.array(rows, dtype=np.complex128).reshape(lower + upper, s.size)
+
+
+def axis(freq: FloatArray) -> ComplexArray:
+    """Return s = 2 pi i f."""
+    return np.asarray(2j * np.pi * freq)
