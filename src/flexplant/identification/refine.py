@@ -305,7 +305,8 @@ class PoleFit:
         ):
             lines.work.add(A.size * 4 * self.m)
             A = A / np.maximum(np.linalg.norm(A, axis=0), TINY)
-            known, Z = Q.T @ A, np.zeros((2 * self.m, 0))
+            known = Q.T @ A
+            Z: FloatArray = np.zeros((2 * self.m, 0))
             if gone:
                 Z = la.qr(np.delete(R, gone, axis=1))[0][:, 2 * self.m - 2 :]
             freed = Z.T @ (Q.T @ right)
