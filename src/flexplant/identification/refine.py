@@ -306,9 +306,8 @@ class PoleFit:
             lines.work.add(A.size * 4 * self.m)
             A = A / np.maximum(np.linalg.norm(A, axis=0), TINY)
             known = Q.T @ A
-            Z: FloatArray = np.zeros((2 * self.m, 0))
-            if gone:
-                Z = la.qr(np.delete(R, gone, axis=1))[0][:, 2 * self.m - 2 :]
+            turned = la.qr(np.delete(R, gone, axis=1))[0] if gone else np.eye(2 * self.m)
+            Z = turned[:, 2 * self.m - len(gone) :]
             freed = Z.T @ (Q.T @ right)
             basis = la.orth(np.vstack([A - Q @ known, Z.T @ known]), rcond=RANK)
             gain = basis.T @ np.concatenate([error, freed])
