@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 
 #: |(s - lambda) T| below which the integral of a window's pole is a sum over Gauss points, because
 #: the closed form cancels there, and their number, which is exact to rounding
