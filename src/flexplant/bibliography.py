@@ -134,6 +134,8 @@
    theory and assumed shear strain fields, Int. J. Numer. Methods Eng. 36, 1993, 1885-1908.
 .. [Kaufman1975] Kaufman, A variable projection method for solving separable nonlinear least squares
    problems, BIT 15, 1975.
+.. [Kautsky1985] Kautsky, Nichols, Van Dooren, Robust pole assignment in linear state feedback,
+   Int. J. Control 41, 1985.
 .. [KennedyOHagan2001] Kennedy, O'Hagan, Bayesian calibration of computer models, J. Royal
    Statistical Society B 63, 2001.
 .. [Kitanidis1987] Kitanidis, Unbiased minimum-variance linear state estimation, Automatica 23,

@@ -143,3 +143,23 @@ def test_poles_by_frequency_and_damping(rate):
     assert np.asarray(fx.plot.pole_map(unstable).get_lines()[1].get_ydata()) == pytest.approx(
         [-0.1]
     )
+
+
+def test_a_root_locus_goes_through_the_closed_loops_poles():
+    """Every curve ends at the eigenvalues of A - k B C at the largest gain, lightly damped too."""
+    g = fx.lti.series(
+        fx.lti.tf([1.0, 0.002, 1.1], [1.0, 0.002, 1.0]), fx.lti.tf([1.0, 0.2], [1.0, 3.0, 0.0])
+    )
+    ax = fx.plot.root_locus(g, gains=[0.5, 1.0, 2.0])
+    paths = ax.get_lines()[: g.n_states]
+    for i, k in enumerate((0.5, 1.0, 2.0), 1):
+        drawn = [line.get_xdata()[i] + 1j * line.get_ydata()[i] for line in paths]
+        exact = np.roots(
+            np.polyadd(
+                np.polymul([1.0, 0.002, 1.0], [1.0, 3.0, 0.0]),
+                k * np.polymul([1.0, 0.002, 1.1], [1.0, 0.2]),
+            )
+        )
+        np.testing.assert_allclose(np.sort_complex(drawn), np.sort_complex(exact), atol=1e-9)
+    with pytest.raises(fx.FlexplantError, match="no root locus"):
+        fx.plot.root_locus(fx.StateSpace([], [], [], [[1.0]]))

@@ -41,6 +41,9 @@ goes back. Their names (``fx.c2d``) raise an error that says ours.
 | ``nyquist``, ``pzmap`` | `fx.plot.nyquist`, `fx.plot.pole_map` |
 | ``step``, ``impulse``, ``lsim``, ``stepinfo`` | `fx.lti.step`, `impulse`, `lsim`, `step_info` |
 | ``c2d`` | `fx.lti.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
+| ``d2c``, ``d2d`` | `fx.lti.continuous`, `fx.lti.resampled(sys, rate)` |
+| ``dss``, ``stabsep`` | `fx.lti.descriptor`, `fx.lti.split_stable` |
+| ``gram``, ``hsvd`` | `fx.lti.controllability_gramian`, `fx.lti.hankel_values` |
 | ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm` |
 | ``getPeakGain`` | `fx.peak_gain` |
 | ``minreal``, ``balred``, ``canon(sys, "modal")`` | `fx.minimal`, `fx.balanced`, `fx.modal_form` |
@@ -56,6 +59,9 @@ from .balancing import balanced as balanced
 from .balancing import hankel_norm as hankel_norm
 from .balancing import hankel_values as hankel_values
 from .balancing import norm_report as norm_report
+from .conversions import continuous as continuous
+from .conversions import descriptor as descriptor
+from .conversions import resampled as resampled
 from .discretisation import tustin as tustin
 from .filters import high_pass_filter as high_pass_filter
 from .filters import inverse_sensitivity as inverse_sensitivity

@@ -34,7 +34,7 @@ later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is. Of more th
 would hide each other each has a panel; more than six in one are named at their ends.
 
 Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB: `bode`,
-`singular_values`, `nyquist`, `pole_map`, `step`.
+`singular_values`, `nyquist`, `pole_map`, `root_locus`, `step`.
 """
 
 from ..rooms import public_names as _public_names
@@ -63,6 +63,7 @@ from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import position_map as position_map
 from .placement import sensor_map as sensor_map
+from .root_locus import root_locus as root_locus
 from .run_pictures import response as response
 from .run_pictures import step as step
 from .shapes import animate_mode as animate_mode

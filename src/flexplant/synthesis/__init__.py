@@ -25,7 +25,9 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 
 | MATLAB | here |
 |---|---|
-| ``hinfsyn``, ``h2syn``, ``lqg`` | `design_hinf`, `design_h2` |
+| ``lqr``, ``dlqr``, ``lqi``, ``lqg`` | `lqr`, `lqi`, `lqg` |
+| ``kalman`` of A, B, C; ``place`` | `lqe`; `place` |
+| ``hinfsyn``, ``h2syn`` | `design_hinf`, `design_h2` |
 | ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
 | ``ncfsyn``, ``loopsyn``, ``ncfmargin`` | `design_ncf`, `shape_loop`, `ncf_margin` |
 | ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
@@ -71,6 +73,11 @@ from .lmi.objectives import H2 as H2
 from .lmi.objectives import Hinf as Hinf
 from .lmi.objectives import PeakGain as PeakGain
 from .lmi.objectives import PoleRegion as PoleRegion
+from .regulators import lqe as lqe
+from .regulators import lqg as lqg
+from .regulators import lqi as lqi
+from .regulators import lqr as lqr
+from .regulators import place as place
 from .robustness.disk_margins import DiskMargin as DiskMargin
 from .robustness.disk_margins import MarginTable as MarginTable
 from .robustness.disk_margins import margins as margins

@@ -1,0 +1,194 @@
+"""A sampled system taken back to continuous time or to another rate; a descriptor system."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+
+from ..arrays import FloatArray, positive, real_array
+from ..errors import ModelError
+from ..tolerances import RANK, ROUNDING, SAME
+from ..words import one_of
+from .discretisation import bilinear, tustin
+from .sampling import held_exactly
+from .statespace import StateSpace, System, as_statespace
+
+
+def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> StateSpace:
+    """Return the continuous system whose samples a sampled system gives (``d2c``).
+
+    With a zero-order hold ``[A_d, B_d; 0, 1] = e^([A, B; 0, 0] dt)``, whose logarithm is taken;
+    what it gives is sampled again as a check.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+        Sampled.
+    method : {"hold", "tustin"}
+        What made it, or how a controller is to be read.
+
+    Returns
+    -------
+    StateSpace
+        With dt = 0 and the same names.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is continuous already, or no real continuous system has these samples: a pole at
+        0 (a delay) or a single one on the negative real axis.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([2.0], [1.0, 3.0])
+    >>> fx.lti.continuous(fx.lti.discretized(lag, 10.0)).poles().real.round(9)
+    array([-3.])
+    """
+    g = as_statespace(sys)
+    one_of(method, "method", ("hold", "tustin"))
+    if not g.dt:
+        raise ModelError(f"{g!r} is continuous already.")
+    if method == "tustin":
+        return bilinear(g, 1.0 / g.dt)
+    return _unheld(g)
+
+
+def _unheld(g: StateSpace) -> StateSpace:
+    """Return the continuous system that a zero-order hold samples to this one."""
+    n, m = g.B.shape
+    held = np.block([[g.A, g.B], [np.zeros((m, n)), np.eye(m)]])
+    if np.min(np.abs(g.poles()), initial=1.0) < ROUNDING:
+        raise ModelError(
+            "a pole at 0 is a delay of a sample, which no continuous system with these states has. "
+            "Convert the system without its delay."
+        )
+    log = la.logm(held)
+    if np.max(np.abs(np.imag(log)), initial=0.0) > SAME * np.max(np.abs(log)):
+        raise ModelError(
+            "a single pole on the negative real axis has no real continuous counterpart: it is a "
+            "mode at half the rate. Use method='tustin' for a controller."
+        )
+    flow = np.real(log) / g.dt
+    found = g.replace(A=flow[:n, :n], B=flow[:n, n:], dt=0.0, blocks=None)
+    again = held_exactly(found, 1.0 / g.dt)
+    size = np.linalg.norm(held)
+    worst = max(np.linalg.norm(again.A - g.A), np.linalg.norm(again.B - g.B)) / size
+    if worst > SAME:
+        raise ModelError(
+            f"the logarithm of the samples is not accurate, sampled again it is {worst:.1g} off:"
+            " its poles lie close together. fx.minimal(sys) or fx.balanced(sys) first may help."
+        )
+    return found
+
+
+def resampled(
+    sys: System, rate: float, *, method: Literal["hold", "tustin"] = "hold"
+) -> StateSpace:
+    """Return a sampled system at another rate (``d2d``), by way of its continuous counterpart.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+        Sampled.
+    rate : float [Hz]
+        The new one.
+    method : {"hold", "tustin"}
+        As in `continuous`, for both ways.
+
+    Returns
+    -------
+    StateSpace
+        With dt = 1 / rate.
+
+    Raises
+    ------
+    ModelError
+        As `continuous`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> slow = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 1.0]), 10.0)
+    >>> fx.lti.resampled(slow, 20.0).poles().real.round(6)  # exp(-1 / 20)
+    array([0.951229])
+    """
+    found = continuous(sys, method=method)
+    positive(rate, "rate")
+    return tustin(found, rate) if method == "tustin" else held_exactly(found, rate)
+
+
+def descriptor(
+    E: npt.ArrayLike,
+    A: npt.ArrayLike,
+    B: npt.ArrayLike,
+    C: npt.ArrayLike,
+    D: npt.ArrayLike = 0.0,
+    dt: float = 0.0,
+) -> StateSpace:
+    """Return the state space of a descriptor system; equations without a derivative are solved.
+
+    ``E dx/dt = A x + B u, y = C x + D u`` (or ``E x[k+1]``). With the singular values of E, its
+    zero rows are equations ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, which give x_2.
+
+    Parameters
+    ----------
+    E, A, B, C, D : (n, n), (n, n), (n, m), (p, n), (p, m) arrays
+        E may be singular.
+    dt : float [s]
+
+    Returns
+    -------
+    StateSpace
+        With as many states as E has rank.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes do not match, or the equations do not determine x_2: the system would
+        differentiate its inputs (its index is above 1), or has no unique solution.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.descriptor([[1, 0], [0, 0]], [[-1, 1], [0, -1]], [[0], [1]], [[1, 0]])
+    <StateSpace: 1 state, continuous, u1 -> y1>
+    """
+    a = real_array(A, "A", (None, None))
+    n = len(a)
+    a, e = real_array(A, "A", (n, n)), real_array(E, "E", (n, n))
+    b, c = real_array(B, "B", (n, None)), real_array(C, "C", (None, n))
+    d = np.zeros((len(c), b.shape[1])) + real_array(D, "D")
+    # rows and columns are brought to even sizes first: the rank of E must not hang on units
+    left, right = _even(np.abs(e) + np.abs(a))
+    a, e, b, c = left[:, None] * a * right, left[:, None] * e * right, left[:, None] * b, c * right
+    U, sizes, Vh = np.linalg.svd(e)
+    r = int(np.sum(sizes > RANK * n * sizes.max(initial=0.0)))
+    a, b, c = U.T @ a @ Vh.T, U.T @ b, c @ Vh.T
+    slow, fast = slice(r), slice(r, n)
+    if n > r and np.linalg.cond(a[fast, fast]) > 1.0 / (RANK * n):
+        raise ModelError(
+            f"the {n - r} equations without a derivative do not determine as many unknowns: the "
+            "system differentiates its inputs, or its equations are not independent. Remove the "
+            "constraint that is differentiated from the model."
+        )
+    # what x_2 is of x_1 and of u
+    of_x, of_u = (-np.linalg.solve(a[fast, fast], part[fast]) for part in (a[:, slow], b))
+    a, b = a[slow, slow] + a[slow, fast] @ of_x, b[slow] + a[slow, fast] @ of_u
+    d, c = d + c[:, fast] @ of_u, c[:, slow] + c[:, fast] @ of_x
+    return StateSpace(a / sizes[slow, None], b / sizes[slow, None], c, d, dt)
+
+
+def _even(sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return factors for rows and columns that bring the largest entries near 1."""
+    left, right = np.ones(len(sizes)), np.ones(len(sizes))
+    for _ in range(3):  # two rounds bring alternating maxima within a factor of two
+        scaled = left[:, None] * sizes * right
+        rows = scaled.max(axis=1, initial=0.0)
+        left /= np.sqrt(np.where(rows > 0, rows, 1.0))
+        columns = (left[:, None] * sizes * right).max(axis=0, initial=0.0)
+        right /= np.sqrt(np.where(columns > 0, columns, 1.0))
+    return left, right

@@ -1,0 +1,280 @@
+"""Gains by the names that textbooks give them: LQR, LQI, LQG, Kalman gain, pole placement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import FloatArray, complex_array
+from ..errors import ModelError, counted
+from ..lti.riccati import RiccatiSolution, control_care, control_dare, filter_care, filter_dare
+from ..lti.statespace import StateSpace, System, as_statespace
+
+#: poles that were asked for and those that came may differ by this part of the largest: those of
+#: a multiplicity m are found to the root m of the rounding
+_PLACED = 1e-3
+
+
+def lqr(
+    sys: System, *, Q: FloatArray, R: FloatArray, N: FloatArray | None = None
+) -> RiccatiSolution:
+    """Return the state feedback of least quadratic cost, continuous or sampled.
+
+    ``u = -F x`` with F the `gain` of the answer minimises ``int x' Q x + 2 x' N u + u' R u dt``, or
+    the sum over samples where the system is sampled (``dlqr``).
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+    Q, R, N : (n, n), (m, m), (n, m) arrays
+        Weights on states, inputs and both; R is positive definite.
+
+    Returns
+    -------
+    RiccatiSolution
+        `gain` is F (m, n), `poles` those of A - B F, `P` the cost x' P x from a state x.
+
+    Raises
+    ------
+    ShapeError, ModelError, SolverError
+        As `flexplant.lti.control_care`: when weights do not fit, R is singular, or a mode cannot
+        be stabilised.
+
+    References
+    ----------
+    [AndersonMoore1979]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> mass = fx.StateSpace([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+    >>> fx.synthesis.lqr(mass, Q=[[1, 0], [0, 0]], R=[[1]]).gain.round(4)
+    array([[1.    , 1.4142]])
+    """
+    g = as_statespace(sys)
+    solve = control_dare if g.dt else control_care
+    return solve(g.A, g.B, Q=Q, R=R, S=N)
+
+
+def lqi(
+    sys: System, *, Q: FloatArray, R: FloatArray, outputs: Iterable[str] | None = None
+) -> RiccatiSolution:
+    """Return the state feedback of least quadratic cost with integrators of outputs.
+
+    ``u = -F [x; q]`` with ``dq/dt = r - y`` (``q[k+1] = q[k] + dt (r - y)`` where the system is
+    sampled): outputs follow constant references r without an error.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+    Q : (n + p, n + p) array
+        Weight on the states and then the integrals.
+    R : (m, m) array
+    outputs : iterable of str, optional
+        The p outputs that are integrated; all when not given.
+
+    Returns
+    -------
+    RiccatiSolution
+        `gain` is F (m, n + p).
+
+    Raises
+    ------
+    ShapeError, ModelError, SolverError
+        As `lqr`. A zero at rest between u and y makes an integral that cannot be stabilised.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([1.0], [1.0, 1.0])
+    >>> fx.synthesis.lqi(lag, Q=np.diag([0.0, 1.0]), R=[[1.0]]).gain.round(3)
+    array([[ 0.732, -1.   ]])
+    """
+    return lqr(_with_integrals(as_statespace(sys), outputs), Q=Q, R=R)
+
+
+def _with_integrals(g: StateSpace, outputs: Iterable[str] | None) -> StateSpace:
+    """Return a system whose last states are the integrals of -y."""
+    seen = g if outputs is None else g.select(outputs)
+    n, p = g.n_states, len(seen.outputs)
+    step = g.dt or 1.0
+    A = np.block(
+        [[g.A, np.zeros((n, p))], [-step * seen.C, np.eye(p) if g.dt else np.zeros((p, p))]]
+    )
+    B = np.vstack([g.B, -step * seen.D])
+    return StateSpace(A, B, np.eye(n + p), np.zeros((n + p, g.B.shape[1])), g.dt, inputs=g.inputs)
+
+
+def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = None) -> StateSpace:
+    """Return the Kalman filter of a system as a system from (u, y) to its states.
+
+    ``dx/dt = A x + B u + w, y = C x + D u + v``. The estimate follows ``dx^/dt = A x^ + B u + K (y
+    - C x^ - D u)``; of a sampled system it is the state predicted for the next sample.
+    `flexplant.design_kalman` does the same for a plant with its ports and judges the error.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+    W, V, N : (n, n), (p, p), (n, p) arrays
+        Densities (covariances, where sampled) of w and v, and between them.
+
+    Returns
+    -------
+    StateSpace
+        Its outputs have the names of the states of `sys`.
+
+    Raises
+    ------
+    ShapeError, ModelError, SolverError
+        As `flexplant.lti.filter_care`.
+
+    References
+    ----------
+    [AndersonMoore1979]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> walk = fx.StateSpace([[0.0]], [[1.0]], [[1.0]], 0, states=["position"])
+    >>> fx.synthesis.lqe(walk, W=[[4.0]], V=[[1.0]])
+    <StateSpace: 1 state, continuous, u1, y1 -> position>
+    """
+    g = as_statespace(sys)
+    K = _observer_gain(g, W, V, N)
+    B = np.hstack([g.B - K @ g.D, K])
+    n = g.n_states
+    return StateSpace(
+        g.A - K @ g.C, B, np.eye(n), np.zeros((n, B.shape[1])), g.dt,
+        inputs=[*g.inputs, *g.outputs], outputs=g.states, units=g.units,
+    )  # fmt: skip
+
+
+def _observer_gain(
+    g: StateSpace, W: FloatArray, V: FloatArray, N: FloatArray | None = None
+) -> FloatArray:
+    solve = filter_dare if g.dt else filter_care
+    return solve(g.A, g.C, Q=W, R=V, S=N).gain
+
+
+def lqg(
+    sys: System,
+    *,
+    Q: FloatArray,
+    R: FloatArray,
+    W: FloatArray,
+    V: FloatArray,
+    integrate: Iterable[str] | None = None,
+) -> StateSpace:
+    """Return the controller of least quadratic cost from measurements y to inputs u.
+
+    State feedback of `lqr` (`lqi` where outputs are integrated) on the estimate of `lqe`. The sign
+    of the feedback is in the controller, as everywhere here: ``fx.lti.feedback(sys, K, sign=1)``,
+    or ``fx.loop.report_loops((sys, K))``.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+    Q, R : (n, n), (m, m) arrays
+        As in `lqr`; (n + p, n + p) as in `lqi` where outputs are integrated.
+    W, V : (n, n), (p, p) arrays
+        As in `lqe`.
+    integrate : iterable of str, optional
+        Outputs that follow a reference without an error; the controller then has inputs
+        `y1:ref`, ... after the measurements.
+
+    Returns
+    -------
+    StateSpace
+
+    Raises
+    ------
+    ShapeError, ModelError, SolverError
+        As `lqr` and `lqe`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import flexplant as fx
+    >>> mass = fx.StateSpace([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+    >>> K = fx.synthesis.lqg(mass, Q=np.eye(2), R=[[1]], W=np.diag([0, 1]), V=[[1]])
+    >>> fx.loop.report_loops((mass, K)).is_stable
+    True
+    """
+    g = as_statespace(sys)
+    names = [] if integrate is None else list(integrate)
+    seen = g.select(names) if names else None
+    F = (lqi(g, Q=Q, R=R, outputs=names) if names else lqr(g, Q=Q, R=R)).gain
+    L = _observer_gain(g, W, V)
+    n, p, m = g.n_states, len(names), len(g.inputs)
+    Fx, Fq = F[:, :n], F[:, n:]
+    # u = -Fx x^ - Fq q; the estimate sees u, and the integrals see r - y
+    step = g.dt or 1.0
+    estimate = np.hstack([g.A - L @ g.C - (g.B - L @ g.D) @ Fx, -(g.B - L @ g.D) @ Fq])
+    integral = np.hstack([np.zeros((p, n)), np.eye(p) if g.dt else np.zeros((p, p))])
+    picked = np.zeros((p, len(g.outputs)))
+    if seen is not None:
+        picked[range(p), g.output_index(names)] = 1.0
+    B = np.block([[L, np.zeros((n, p))], [-step * picked, step * np.eye(p)]])
+    return StateSpace(
+        np.vstack([estimate, integral]), B, -F, np.zeros((m, B.shape[1])), g.dt,
+        inputs=[*g.outputs, *(f"{name}:ref" for name in names)], outputs=g.inputs,
+        units={k: u for k, u in g.units.items() if k in (*g.inputs, *g.outputs)},
+    )  # fmt: skip
+
+
+def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
+    """Return the state feedback F (m, n) that puts the poles of A - B F where they are asked for.
+
+    Several inputs are used to make the eigenvectors as independent as they can be.
+
+    Parameters
+    ----------
+    sys : StateSpace, or a system of python-control or SciPy
+    poles : (n,) array [rad/s, or 1 where sampled]
+        In conjugate pairs; none more often than there are inputs.
+
+    Returns
+    -------
+    (m, n) array
+
+    Raises
+    ------
+    ShapeError
+        When the number of poles is not that of the states.
+    ModelError
+        When poles cannot be placed there: a mode that no input reaches, or a pole that is asked for
+        more often than there are inputs.
+
+    References
+    ----------
+    [Kautsky1985]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> mass = fx.StateSpace([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+    >>> fx.synthesis.place(mass, [-1.0, -2.0]).round(6)
+    array([[2., 3.]])
+    """
+    from scipy.signal import place_poles  # heavy
+
+    g = as_statespace(sys)
+    asked = complex_array(poles, "poles", (g.n_states,))
+    try:
+        gain = np.asarray(place_poles(g.A, g.B, asked).gain_matrix, dtype=np.float64)
+    except ValueError as error:
+        raise ModelError(
+            f"{counted(g.n_states, 'pole')} cannot be placed: {error} Ask for conjugate pairs, "
+            "none more often than there are inputs, and of modes that an input reaches."
+        ) from error
+    found = np.linalg.eigvals(g.A - g.B @ gain)
+    away = max((float(np.min(np.abs(found - pole))) for pole in asked), default=0.0)
+    if away > _PLACED * float(np.max(np.abs(asked), initial=0.0)):
+        raise ModelError(
+            f"a pole came {away:.2g} from its place: no input, or hardly one, reaches its mode. "
+            "fx.minimal(sys) shows which states are reached."
+        )
+    return gain
