@@ -63,7 +63,7 @@ from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import position_map as position_map
 from .placement import sensor_map as sensor_map
-from .root_locus import root_locus as root_locus
+from .root_loci import root_locus as root_locus
 from .run_pictures import response as response
 from .run_pictures import step as step
 from .shapes import animate_mode as animate_mode
