@@ -70,7 +70,7 @@ def test_a_descriptor_system_has_the_same_response(seed):
         rng.normal(size=(3, n)) * right,
         rng.normal(size=(3, 2)),
     )
-    found = descriptor(E, A, B, C, D)
+    found = descriptor(A, B, C, D, E=E)
     assert found.n_states == r
     for s in (0.5j, 3.0j, 1.0 + 1j):
         pencil = (s * E - A) / left[:, None] / right
@@ -80,4 +80,4 @@ def test_a_descriptor_system_has_the_same_response(seed):
 
 def test_a_differentiator_is_refused():
     with pytest.raises(fx.FlexplantError, match="differentiates"):
-        descriptor([[0, 1], [0, 0]], np.eye(2), [[0], [1]], [[1, 0]])
+        descriptor(np.eye(2), [[0], [1]], [[1, 0]], 0, E=[[0, 1], [0, 0]])

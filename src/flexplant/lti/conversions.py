@@ -122,11 +122,12 @@ def resampled(
 
 
 def descriptor(
-    E: npt.ArrayLike,
     A: npt.ArrayLike,
     B: npt.ArrayLike,
     C: npt.ArrayLike,
-    D: npt.ArrayLike = 0.0,
+    D: npt.ArrayLike,
+    *,
+    E: npt.ArrayLike,
     dt: float = 0.0,
 ) -> StateSpace:
     """Return the state space of a descriptor system; equations without a derivative are solved.
@@ -136,8 +137,8 @@ def descriptor(
 
     Parameters
     ----------
-    E, A, B, C, D : (n, n), (n, n), (n, m), (p, n), (p, m) arrays
-        E may be singular.
+    A, B, C, D, E : (n, n), (n, m), (p, n), (p, m), (n, n) arrays
+        E may be singular; D may be the number 0.
     dt : float [s]
 
     Returns
@@ -154,7 +155,7 @@ def descriptor(
     Examples
     --------
     >>> import flexplant as fx
-    >>> fx.lti.descriptor([[1, 0], [0, 0]], [[-1, 1], [0, -1]], [[0], [1]], [[1, 0]])
+    >>> fx.lti.descriptor([[-1, 1], [0, -1]], [[0], [1]], [[1, 0]], 0, E=[[1, 0], [0, 0]])
     <StateSpace: 1 state, continuous, u1 -> y1>
     """
     a = real_array(A, "A", (None, None))
