@@ -86,7 +86,25 @@ def test_ranges_that_suffice_are_not_mentioned():
         warnings.filterwarnings("error", message=".*needs")
         run(machine(), a_move(), wide)
         run(machine(), 1e-3, {"drive": Saturation(1e-6)})  # no SetPoint: nothing is known of it
-        run(machine(), a_move(), {"drive": Saturation(rate=1.0)})
+        # the force changes by mass times jerk, the encoder by the velocity
+        run(machine(), a_move(), {"drive": Saturation(rate=1.03 * 5.0 * 500.0)})
+        run(machine(), a_move(), {"encoder": Saturation(rate=0.201)})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rates_are_compared_too(seed):
+    """A force changes by mass times jerk, a reading by its scale times the velocity."""
+    rng = np.random.default_rng(seed)
+    mass, scale = rng.uniform(1.0, 30.0), rng.uniform(0.5, 3.0)
+    plant, at = machine(mass, scale=scale), a_move().at(np.arange(round(0.6 * RATE)) / RATE)
+    rates = {"drive": mass * np.abs(at.jerk).max(), "encoder": scale * np.abs(at.velocity).max(),
+             "tool:ref": np.abs(at.velocity).max()}  # fmt: skip
+    for name, rate in rates.items():
+        with pytest.warns(FlexplantWarning, match="to change by") as caught:
+            run(plant, a_move(), {name: Saturation(rate=0.9 * rate)})
+        (text,) = (str(one.message) for one in caught if "to change by" in str(one.message))
+        found = float(re.search(r"change by (\S+) ", text).group(1))
+        assert name in text and found == pytest.approx(rate, rel=0.03)
 
 
 def test_a_feedforward_of_a_move_is_compared_too():

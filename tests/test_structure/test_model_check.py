@@ -230,7 +230,7 @@ def test_it_prints_a_table():
     text = repr(fx.check(truss(bars=[(1, 0), (2, 0), (2, 1), (3, 0), (3, 1)])))
     assert text.splitlines()[0] == "<ModelCheck 'truss': 1 FAILED, 0 warnings>"
     assert "  FAIL mechanisms" in text
-    assert "-> join or hold these" in text
+    assert "-> fx.joined, or hold them" in text
     assert max(map(len, text.splitlines())) < 160
 
 

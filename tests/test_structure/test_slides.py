@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
@@ -33,6 +34,8 @@ def test_a_slide_is_offered_by_name_and_taken(seed):
     model, free = machine(seed)
     with pytest.raises(ModelError, match=r"they are slides: pass structure\.sliding\(model\)"):
         fx.solve_modes(model, count=3)
+    (advice,) = (row[3] for row in fx.check(model).lines if row[1] == "mechanisms")
+    assert "joint_motions" in advice and "fx.joined" in advice
     found = slides(model)
     assert len(found) == 1
     ((name, motion),) = found.items()
@@ -64,3 +67,50 @@ def test_a_spring_that_holds_a_slide_is_not_rounding():
     held = fx.FEModel(model.M, soft, dofs=model.dofs, joint_motions=free)
     assert held.rigid_body.shape[1] == 0
     assert 0.0 < fx.solve_modes(held, count=2).freq[0] < 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wrong_motion_is_refused(seed):
+    """A vector that stretches the machine is named where the slide is missed."""
+    rng = np.random.default_rng(seed)
+    model, _ = machine(seed, lambda free: free + 0.1 * rng.standard_normal(free.shape))
+    with pytest.raises(ModelError, match="1 of the motions of the geometry and of joint_motions"):
+        fx.solve_modes(model, count=3)
+
+
+def large(spring, n=800):
+    """Two lines of nodes in the plane: one on springs, the other guided by it along x."""
+    line = sp.diags_array(
+        [np.r_[1.0, np.full(n - 2, 2.0), 1.0], -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]
+    )
+    eye = sp.eye_array(n)
+    at_end = sp.csc_array(([spring], ([0], [0])), shape=(n, n))
+    K = sp.block_array(
+        [
+            [1e8 * line + 1e5 * eye, None, None, None],
+            [None, 5e7 * line + 1.1e6 * eye, None, -1e6 * eye],
+            [None, None, 1e8 * line + at_end, None],
+            [None, -1e6 * eye, None, 5e7 * line + 1e6 * eye],
+        ]
+    ).tocsc()
+    ids = np.arange(1, n + 1)
+    xyz = np.zeros((4 * n, 3))
+    xyz[:, 0] = np.tile(np.linspace(0.0, 1.0, n), 4)
+    nodes = np.concatenate([ids, ids, ids + n, ids + n])
+    dofs = fx.DofSet(nodes, ["x"] * n + ["y"] * n + ["x"] * n + ["y"] * n, xyz)
+    slide = np.zeros((4 * n, 1))
+    slide[2 * n : 3 * n] = 1.0
+    return K, dofs, slide
+
+
+@pytest.mark.parametrize("digits", [7, 10, 12])
+def test_a_slide_of_few_digits_in_a_large_model(digits):
+    """By inverse iteration, where K is too large for its null vectors."""
+    rng = np.random.default_rng(digits)
+    for spring, free in ((0.0, 1), (1e3, 0)):
+        K, dofs, slide = large(spring)
+        given = slide * (1.0 + 10.0**-digits * rng.standard_normal(slide.shape))
+        M = 0.1 * sp.eye_array(K.shape[0], format="csc")
+        model = fx.FEModel(M, K, dofs=dofs, joint_motions=given)
+        modes = fx.solve_modes(model, count=2)
+        assert (modes.n_rigid, bool(modes.freq[0] == 0.0)) == (free, bool(free))

@@ -99,7 +99,8 @@ def counted_modes(
         # a motion of the geometry that is not free has springs, which rounding does not hide
         suspended = are_rigid(model.M, model.body_motions, phi)
         least = np.where(suspended, 0.0, rounding)
-        check_stiffness(squares, phi, least, model.rigid_body, model.dofs, suspended)
+        expected = model.body_motions.shape[1]
+        check_stiffness(squares, phi, least, model.rigid_body, model.dofs, suspended, expected)
         # the count needs the memory
         factor = None
         if below == count and _is_gap(squares, count, top, rounding):

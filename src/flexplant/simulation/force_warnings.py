@@ -29,31 +29,42 @@ def warn_beyond_ranges(
 ) -> None:
     """Warn of the `Saturation` that moves of references exceed, with what they need.
 
-    Forces and readings are those of the plant near rest that follows the moves exactly, without
-    the forces that answer disturbances. References without a
-    SetPoint count as at rest.
+    Values and rates of forces and readings are those of the plant near rest that follows the moves
+    exactly, without the forces that answer disturbances. References without a set-point profile
+    count as at rest.
     """
     limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
     moves = {name: move for name, move in signals.items() if isinstance(move, SetPointProfile)}
     if not limits or not moves or not plant.ports.followed:
         return
     for name, needed in _needed(plant, moves, list(limits), time).items():
-        limit = limits[name]
+        limit, unit, driven = limits[name], plant.units.get(name, ""), name in plant.u
         least = -limit.limit if limit.least is None else limit.least
         low, high = float(needed.min(initial=0.0)), float(needed.max(initial=0.0))
-        if low >= least * (1.0 + _MET) and high <= limit.limit * (1.0 + _MET):
-            continue
-        unit = plant.units.get(name, "")
-        advice = (
-            "Lower the acceleration of the move (its stroke, where springs are pushed), or choose "
-            "a stronger actuator"
-            if name in plant.u
-            else "Shorten the move, or choose a longer range"
-        )
-        warn(
-            f"the move of {', '.join(moves)} needs {low:.4g} to {high:.4g} {unit} of {name!r}, "
-            f"whose range is {least:.4g} to {limit.limit:.4g} {unit}. {advice}."
-        )
+        who = f"the move of {', '.join(moves)} needs"
+        if low < least * (1.0 + _MET) or high > limit.limit * (1.0 + _MET):
+            advice = (
+                "Lower the acceleration of the move (its stroke, where springs are pushed), or "
+                "choose a stronger actuator"
+                if driven
+                else "Shorten the move, or choose a longer range"
+            )
+            warn(
+                f"{who} {low:.4g} to {high:.4g} {unit} of {name!r}, whose range is {least:.4g} to "
+                f"{limit.limit:.4g} {unit}. {advice}."
+            )
+        fastest = float(np.max(np.abs(np.diff(needed) / np.diff(time)), initial=0.0))
+        if limit.rate is not None and fastest > limit.rate * (1.0 + _MET):
+            advice = (
+                "Lower the jerk of the move (its velocity, where springs are pushed), or choose a "
+                "faster amplifier"
+                if driven
+                else "Lower the velocity of the move"
+            )
+            warn(
+                f"{who} {name!r} to change by {fastest:.4g} {unit}/s, and its rate is "
+                f"{limit.rate:.4g} {unit}/s. {advice}."
+            )
 
 
 def _limit(given: Any) -> Saturation | None:

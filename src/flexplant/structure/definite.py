@@ -312,7 +312,8 @@ def elastic_modes(
         unstable[unstable] = are_rigid(M, motions(), phi[:, unstable])
     else:
         unstable[:] = False
-    check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs, unstable)
+    expected = 0 if motions is None else motions().shape[1]
+    check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs, unstable, expected)
     return signed_root(squares), signed(phi)
 
 
@@ -368,8 +369,10 @@ def check_stiffness(
     rigid: FloatArray,
     dofs: DofSet | None = None,
     unstable: np.ndarray | None = None,
+    expected: int = 0,
 ) -> None:
     """Raise ModelError when an elastic omega^2 (k,) is not above its rounding (k,)."""
+    # `expected` is the number of motions of the geometry and of `joint_motions`, held or not
     # `unstable` (k,) says which are rigid-body motions on springs of negative stiffness: those may
     # be negative, by more than their rounding. The DOFs that the first such motion moves most are
     # named as `check` names those of a mechanism
@@ -391,13 +394,20 @@ def check_stiffness(
         basis = np.asarray(la.qr(rigid, mode="economic")[0] if r else rigid, dtype=np.float64)
         motion = nonrigid(np.hstack([basis, phi[:, lost]]), basis)[:, 0]
         moved = f" The first moves {', '.join(dofs.labels[i] for i in most_moved(motion)[:4])}."
+    costly = (
+        f" {expected - r} of the motions of the geometry and of joint_motions stretch the "
+        "structure: if a column of joint_motions is meant to be this slide, mend its entries."
+        if expected > r
+        else ""
+    )
     several = "an elastic mode has" if lost.size == 1 else f"{lost.size} elastic modes have"
     raise ModelError(
         f"{several} no stiffness ({found}): a mechanism, a zero-energy motion beyond the {r} "
         f"rigid-body motions of the geometry, or springs too soft for the digits of K.{moved} If "
-        "drives move them, they are slides: pass structure.sliding(model), which names them. Join "
-        "or hold others, look for wrong coordinates (see check(model)), or suspend the modes "
-        "rather than the model on soft springs."
+        "drives move them, they are slides: pass structure.sliding(model), which names them and "
+        f"gives them as joint_motions.{costly} Join others (fx.joined) or hold them, look for "
+        "wrong coordinates (see check(model)), or suspend the modes rather than the model on soft "
+        "springs."
     )
 
 

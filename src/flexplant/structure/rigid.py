@@ -252,12 +252,25 @@ _NULL = 1e-11
 
 def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
     """Return motions (n, r) without the little by which they stretch a structure: few digits."""
-    # ``m - K^+ K m`` is the null vector of K next to m
-    if K.shape[0] > DENSE_LIMIT or not motions.size:
+    # ``m - K^+ K m`` is the null vector of K next to m; of a large K inverse iteration finds it
+    if not motions.size:
         return motions
     scaled, scale = unit_diagonal(K)
-    force = scale[:, None] * np.asarray(K @ motions)
-    change = scale[:, None] * (la.pinvh(dense(scaled), rtol=_NULL) @ force)
+    if K.shape[0] <= DENSE_LIMIT:
+        force = scale[:, None] * np.asarray(K @ motions)
+        change = scale[:, None] * (la.pinvh(dense(scaled), rtol=_NULL) @ force)
+    else:
+        try:
+            solve = definite_solver(scaled, sp.eye_array(K.shape[0], format="csc"), _NULL)
+        except SolverError:  # magnets make a motion unstable
+            return motions
+        given = motions / scale[:, None]
+        found = given
+        for _ in range(_STEPS):
+            found = solve(_NULL * found)
+        # what is held has shrunk; rounding moves null vectors within their space alone
+        kept = found[:, np.linalg.norm(found, axis=0) > 0.5 * np.linalg.norm(given, axis=0)]
+        change = scale[:, None] * (given - kept @ np.linalg.lstsq(kept, given)[0])
     size = divisor(np.linalg.norm(motions, axis=0))
     small = np.linalg.norm(change, axis=0) <= _FEW_DIGITS * size
     return np.asarray(motions - np.where(small, change, 0.0))
