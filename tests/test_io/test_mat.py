@@ -57,6 +57,16 @@ def test_a_plant_comes_back(tmp_path):
     assert not found.system.A.flags.writeable
 
 
+def test_a_weighted_plant_is_written_with_its_weights(tmp_path):
+    plant = fx.testbeds.three_masses()
+    heavy = plant.weighted(fx.stage_weights(plant, 20.0))
+    write_mat(tmp_path / "plant.mat", heavy)
+    found = read_mat(tmp_path / "plant.mat")
+    assert isinstance(found, StandardPlant)
+    assert [found.w, found.u, found.z, found.y] == [heavy.w, heavy.u, heavy.z, heavy.y]
+    np.testing.assert_array_equal(found.system.A, heavy.system.A)
+
+
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_systems_of_any_order_come_back(tmp_path, n):
     rng = np.random.default_rng(n)

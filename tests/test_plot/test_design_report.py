@@ -304,3 +304,11 @@ def test_the_page_lives_in_a_browser(text, tmp_path, width):
     assert logarithmic and "[Hz]" in label
     read = re.match(rf"{re.escape(label)}: ([\d.e+-]+)", found["read"])
     assert float(read[1]) == pytest.approx(np.sqrt(low * high), rel=0.03)
+
+
+def test_a_weighted_plant_shows_its_machine(tmp_path):
+    """Ports, places and standard assumptions, as of a plant without weights."""
+    plant = fx.testbeds.three_masses()
+    heavy = plant.weighted(fx.stage_weights(plant, 20.0))
+    page = fx.plot.report(tmp_path / "heavy.html", {"heavy": heavy}).read_text(encoding="utf-8")
+    assert "Standard assumptions" in page and "u actuator" in page

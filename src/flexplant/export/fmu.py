@@ -19,7 +19,7 @@ from typing import Any
 from ..errors import LabelError, ModelError, warn
 from ..io.files import file_path
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..store import written
 from ..words import one_of
 from .c_code import c_name, c_program
@@ -343,7 +343,7 @@ def write_fmu(
 
     Parameters
     ----------
-    system : StandardPlant, StateSpace, Controller or ClosedLoop
+    system : StandardPlant, GeneralizedPlant, StateSpace, Controller or ClosedLoop
         Sampled. Of a plant all of w, u, z and y; of a ClosedLoop its controller, as for `write_c`.
     path : str or Path
         Such as "stage.fmu", written atomically; its name is that of the model.
@@ -391,7 +391,7 @@ def write_fmu(
     if target.suffix != ".fmu":
         raise ModelError(f"path must end in .fmu, got {str(target)!r}. Such as 'stage.fmu'.")
     one_of(version, "version", ("2.0", "3.0"))
-    name, is_plant = target.stem, isinstance(system, StandardPlant)
+    name, is_plant = target.stem, isinstance(system, AnyPlant)
     if is_plant and not system.dt:
         raise ModelError(
             "a unit for co-simulation goes on in samples, and the plant is continuous: pass "

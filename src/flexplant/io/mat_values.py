@@ -14,7 +14,7 @@ from ..labels import DofSet
 from ..loop import ClosedLoop
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from ..reduction import ReducedModel
 from ..store import written
 from .files import parsing
@@ -26,7 +26,7 @@ _LONGEST = 63  # characters of a name in MATLAB
 
 
 def write_mat(
-    path: str | Path, value: System | StandardPlant | ReducedModel | Frf | Mapping[str, Any]
+    path: str | Path, value: System | AnyPlant | ReducedModel | Frf | Mapping[str, Any]
 ) -> None:
     """Write a system, a plant, a reduced model or frequency responses, or several, for MATLAB.
 
@@ -45,8 +45,9 @@ def write_mat(
     ----------
     path : str or Path
         The file, written atomically; no ending is added.
-    value : StateSpace, control.StateSpace, StandardPlant, ReducedModel, Frf, or mapping of them
-        What to write; several as {"plant": plant, "K": controller, "frf": frf}. What has a
+    value : StateSpace, control.StateSpace, plant, ReducedModel, Frf, or mapping of them
+        What to write; several as {"plant": plant, "K": controller, "frf": frf}. A weighted plant is
+        written with its weights, and read as a StandardPlant. What has a
         `.system`, a controller or an observer, is written as that. Ports and certificates, and of
         a reduced model its bound and truncated modes, stay behind: `.save` keeps them.
 
@@ -183,7 +184,7 @@ def _struct_fields(value: Any) -> dict[str, Any]:
     if isinstance(value, Frf):
         return frf_fields(value)
     within = getattr(value, "system", value)
-    plain = isinstance(value, StandardPlant | ClosedLoop) or not isinstance(within, StateSpace)
+    plain = isinstance(value, AnyPlant | ClosedLoop) or not isinstance(within, StateSpace)
     return system_fields(value if plain else within)
 
 
@@ -208,9 +209,9 @@ def _mat_value(content: Mapping[str, Any], where: str) -> MatValue:
 
 
 def system_fields(system: Any) -> dict[str, Any]:
-    """Return the fields of a system or a standard plant."""
-    plant = system if isinstance(system, StandardPlant) else None
-    g = as_statespace(system.system if isinstance(system, StandardPlant) else system)
+    """Return the fields of a system or a plant."""
+    plant = system if isinstance(system, AnyPlant) else None
+    g = as_statespace(system if plant is None else plant.system)
     content: dict[str, Any] = {"A": g.A, "B": g.B, "C": g.C, "D": g.D, "dt": g.dt}
     content |= {side: cells(getattr(g, side)) for side in ("inputs", "outputs", "states")}
     content["name"] = g.name or ""

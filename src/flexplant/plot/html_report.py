@@ -81,7 +81,7 @@ def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
         if not isinstance(value, ClosedLoop | Verdict | ExposureErrors)
     }
     plant = design.plant
-    if plant is not None and not any(isinstance(one, StandardPlant) for one in shown.values()):
+    if plant is not None and not any(isinstance(one, AnyPlant) for one in shown.values()):
         shown["Plant of the loop"] = plant
     headed = {room: heading for heading, rooms in _HEADINGS.items() for room in rooms}
     for heading in (*_HEADINGS, "Other values"):
@@ -110,10 +110,10 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
         html_or_why(partial(gallery.picture, draw, said))
         for said, draw in _pictures(name, value, design)
     ]
-    if isinstance(value, StandardPlant):
+    if isinstance(value, AnyPlant):
         shown = html_or_why(lambda: value.check()._repr_html_())
         shown = f"<details><summary>Standard assumptions</summary>{shown}</details>"
-        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value))}{shown}</div>")
+        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value.machine))}{shown}</div>")
     if drawn:
         parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
     tick("report")
@@ -128,11 +128,12 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         if forces and any(n.endswith(":error") for n in value):
             over.append((f"{name}: forces over time", partial(response, value, forces)))
         return over
-    if isinstance(value, StandardPlant) and value.model is not None:
+    if isinstance(value, AnyPlant) and value.machine.model is not None:
         said = "Sensors, actuators and POIs; arrows: along what they act and measure"
+        own = value.machine
         return [
-            (said, partial(placed, value)),
-            ("The plant, from forces along each axis to the POI", partial(_axis_responses, value)),
+            (said, partial(placed, own)),
+            ("The plant, from forces along each axis to the POI", partial(_axis_responses, own)),
         ]
     plant = design.plant
     if isinstance(value, Placement) and plant is not None and plant.model is not None:

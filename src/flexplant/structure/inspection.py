@@ -435,7 +435,7 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
             "fail",
             "mechanisms",
             (f"{counted(extra, 'zero-energy motion')} beyond rigid body; the first moves {moved}"),
-            "fx.joined, or hold them; joint_motions of drives: structure.sliding; look at coordinates",
+            "fx.joined, or hold them; joint_motions of drives: structure.sliding; or a coordinate",
         )
 
 

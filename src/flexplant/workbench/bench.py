@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import ModelError, counted
 from ..lti.frequency import Frf
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..simulation.motion import SetPointProfile
 from ..synthesis import LoopDesign, LowPass, Pid, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
@@ -158,8 +158,9 @@ def _of_model(model: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 def _references(plant: Any, design: LoopDesign) -> dict[str, str]:
     """Return the reference of a plant that each axis follows."""
     plant = getattr(plant, "nominal", plant)
-    if not isinstance(plant, StandardPlant):
+    if not isinstance(plant, AnyPlant):
         return {}
+    plant = plant.machine
     found = {poi.channel(axis): poi.derived(axis, "ref") for poi, axis in plant.ports.followed}
     return {n: ref for n, ref in found.items() if n in design.axes and ref in plant.y}
 

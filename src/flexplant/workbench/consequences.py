@@ -21,7 +21,7 @@ from ..lti.discretisation import Recursion
 from ..lti.interconnection import feedback, series
 from ..lti.sampling import discretized
 from ..parallel import bars_of_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from ..simulation import simulate
 from ..simulation.motion import SetPointProfile
 from ..store import load
@@ -64,10 +64,10 @@ class Question:
 
     @property
     def plant(self) -> StandardPlant | None:
-        """The standard plant, if there is one."""
+        """The machine of the model, if there is one, without weights."""
         given = None if self.model is None else self.model.given
         given = getattr(given, "nominal", given)
-        return given if isinstance(given, StandardPlant) else None
+        return given.machine if isinstance(given, AnyPlant) else None
 
     def answer(self, design: LoopDesign, loop: AxisLoop) -> Consequences:
         """Return everything that takes longer than a slider may wait."""
