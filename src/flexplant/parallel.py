@@ -34,6 +34,8 @@ from .errors import ModelError, SolverError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+#: samples, lines or columns that are computed at once: they stay in the cache
+PIECE = 2048
 #: work of one chunk [s]: long beside the cost of sending it, short beside the whole
 CHUNK = 0.5
 #: items computed here before the rest is sent take this long [s]: they show how long one takes

@@ -8,25 +8,30 @@ import numpy as np
 
 from .arrays import FloatArray
 
-#: in the place of zero where something is divided by it, or its logarithm taken; not relative:
-#: no size in SI units is smaller, and 1e8 times its reciprocal is a number still
+#: replaces zero in a divisor or a logarithm; it is not relative: no size in SI units is smaller,
+#: and 1e8 times its reciprocal does not overflow
 TINY = 1e-300
-#: singular values below this part of the largest are rounding of a few hundred rows: no rank
+#: singular values below this, relative to the largest, are the rounding of some hundred rows and
+#: count as zero in ranks
 RANK = 1e-13
-#: a number below this part of the terms it is a sum of is their rounding
+#: a number below this, relative to the terms of its sum, is the rounding of these terms
 ROUNDING = 1e-12
-#: two numbers given as the same one, through a unit or a binary file, have nine digits alike, and
-#: so have the coordinates of nodes: a motion that they show no more is none
+#: eigenvalues of a scaled matrix up to this are zero: the rounding of some ten thousand rows
+NULL = 1e-11
+#: relative difference up to which two numbers are the same one: nine digits survive a change of
+#: units and binary files. A motion, gain or direction below it is absent
 SAME = 1e-9
-#: numbers that were typed, or printed into a file by another program, have at least six digits
+#: numbers that were typed, or printed into a file by another program, have at least six digits; no
+#: model of a machine is better known, so that two ways to one figure agree to this
 TYPED = 1e-6
-#: a search whose value moves by less has ended: nothing in a machine is known to nine digits
+#: a search ends when its value moves by less, relative to the value: nothing in a machine is known
+#: to nine digits
 SETTLED = 1e-9
-#: eigenvalue solvers split a double pole, as of a rigid-body mode, by the root of their rounding
-#: (1.5e-8) times its condition: nearer ones are one, and those nearer to zero are zero
+#: poles closer than this, relative to their size, are one pole: eigenvalue solvers split a double
+#: pole, as of a rigid-body mode, by the root of their rounding (1.5e-8) times its condition
 SPLIT = 1e-6
 
 
 def divisor(size: Any) -> FloatArray:
-    """Return what to divide by: sizes, and 1 where there is none."""
+    """Return sizes to divide by, and 1 in the place of zero."""
     return np.asarray(np.where(size > 0, size, 1.0))

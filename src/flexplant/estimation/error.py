@@ -37,7 +37,7 @@ from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant
 from ..store import Value
-from ..tolerances import SAME, TINY, divisor
+from ..tolerances import ROUNDING, SAME, TINY, TYPED, divisor
 from ..words import in_unit, instance, members, sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
@@ -48,10 +48,8 @@ _AGREEMENT = 1e-2
 _SEEN = 1e-7
 #: a mode is taken apart where the estimate misses less of its motion: else it keeps 12 of 16 digits
 _FOLLOWED = 1e-2
-#: condition of a sampled mode's eigenvectors above which its block is not diagonalised
-_DEFECTIVE = 1e6
 #: modulus of a sampled pole from which a mode counts as undamped
-ON_CIRCLE = 1.0 - 1e-12
+ON_CIRCLE = 1.0 - ROUNDING
 #: ``1 - |lambda|^2`` up to which it counts as hardly damped: it rings for 1e8 samples
 _HARDLY = 2e-8
 #: share of a variance from which such modes are named
@@ -159,7 +157,7 @@ class _Joint(NamedTuple):
         found: Any = la.eig(self.A[: self.n_elastic, : self.n_elastic], left=True)
         values, left, right = found
         overlap = np.sum(left.conj() * right, axis=0)
-        good = np.abs(overlap) * _DEFECTIVE > 1.0
+        good = np.abs(overlap) * (1.0 / TYPED) > 1.0
         inverse = (left[:, good] / overlap[good].conj()).conj().T
         return ModalMap(values[good], right[:, good], inverse)
 
@@ -287,7 +285,7 @@ def _plant_modes(block: FloatArray, above: FloatArray) -> ModalMap | None:
         return None
     # states of one size: those of a mode are its omega q and dq/dt
     found = ModalMap.of_pairs(pairs)
-    if len(pairs) and np.max(np.linalg.cond(found.T)) > _DEFECTIVE:
+    if len(pairs) and np.max(np.linalg.cond(found.T)) > (1.0 / TYPED):
         return None
     return found
 

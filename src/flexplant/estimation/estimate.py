@@ -17,13 +17,14 @@ from ..errors import SolverError, counted, unknown_label, warn
 from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
-from ..parallel import one_thread
+from ..parallel import PIECE, one_thread
 from ..store import Value
+from ..tolerances import TYPED
 from ..words import instance, known_units, sizes_of
 from .estimator_channels import ChannelError, estimates, recorded
 from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
-from .passage import SETTLED, Moment, Start, Walk, stationary_start
+from .passage import Moment, Start, Walk, stationary_start
 
 #: part of a sensor's samples above which those beyond a gate are no outliers
 _MOST = 0.1
@@ -166,11 +167,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
         raise ChannelError(str(unknown_label("channel", channel, list(self))))
 
 
-#: difference of a gain from the one of P, times a deviation of the innovations, in deviations of
-#: the states: its square is what a sample adds to a variance, and slow states keep 1e6 samples
-_OTHER = 1e-6
-
-
 @one_thread()
 def estimated(
     model: FilterModel,
@@ -246,13 +242,9 @@ def in_unit_states(
     )
     steady = Steady(unit, P / d / d[:, None])
     other = (steady.gains.K - K * s / d[:, None]) @ innovation_root(unit.innovation(steady.P))
-    if not np.max(np.abs(other), initial=0.0) <= _OTHER:
+    if not np.max(np.abs(other), initial=0.0) <= TYPED:
         raise SolverError(FEW_DIGITS)
     return steady, sight, d, s
-
-
-#: samples whose later measurements are followed side by side
-_TOGETHER = 2048
 
 
 def smoothed(passage: Walk, sight: Sight) -> tuple[FloatArray, FloatArray]:
@@ -318,7 +310,7 @@ def _backward(
     some = (here.c @ onward / size[:, :, None]).reshape(-1, F.shape[0])
     weight = solve_stein(F, some.T @ some / here.c.shape[0])
     k = span[1]
-    while k > span[0] and abs(np.sum(weight * (settled - M))) > SETTLED:
+    while k > span[0] and abs(np.sum(weight * (settled - M))) > TYPED:
         k -= 1
         T = here.part(slice(k - span[0], k - span[0] + 1)).c[0] @ onward
         variance[k] -= np.einsum("zi,ij,zj->z", T, M, T)
@@ -378,8 +370,8 @@ def lagged(passage: Walk, sight: Sight, lag: int) -> tuple[FloatArray, FloatArra
         T = sight.part(at).c @ onward
         variance[at] -= np.einsum("kzi,ij,kzj->kz", T, known, T)
     listed = np.flatnonzero(slow)
-    for start in range(0, listed.size, _TOGETHER):
-        _smooth_transient(passage, sight, listed[start : start + _TOGETHER], lag, hat, variance)
+    for start in range(0, listed.size, PIECE):
+        _smooth_transient(passage, sight, listed[start : start + PIECE], lag, hat, variance)
     hat[np.isinf(variance)] = np.nan
     return hat, variance
 

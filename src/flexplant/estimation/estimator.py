@@ -15,16 +15,13 @@ from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..plant.evaluation_model import NOT_JUDGED
+from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
 from .filter_models import FilterModel, KalmanCertificate, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
 from .left_out_modes import NODES, NOTED, LeftOut, left_out
-
-#: relative difference between two ways to a variance from which it is stated beside the rms: six
-#: digits are more than any model holds
-_STATED = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,7 +88,7 @@ class KalmanEstimator(PoiFilter):
                 f";\n  up to {share:.0%} of a variance is from modes with fewer than {NODES:g} "
                 "nodes of the mesh a wavelength:\n  a finer evaluation model would change it"
             )
-        if self.certificate.difference > _STATED:
+        if self.certificate.difference > TYPED:
             beyond += f";\n  variances hold to {self.certificate.difference:.0e}"
         return (
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "

@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import FloatArray, floats, real_array
 from ..errors import AssumptionError, LabelError, ModelError, ShapeError, short, unknown_label
 from ..lti.statespace import System
+from ..parallel import PIECE
 from ..plant import AnyPlant, GeneralizedPlant, plant_of, standard_plant
 
 #: z channels that are not motions of a POI
@@ -120,10 +121,6 @@ class Recorded(NamedTuple):
         return self.both[:, self.ny :]
 
 
-#: samples that are copied together
-_PIECE = 2048
-
-
 def recorded(records: Any, model: Any) -> Recorded:
     """Return the sensors and commands of a filter's model from what was recorded."""
     if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
@@ -153,8 +150,8 @@ def recorded(records: Any, model: Any) -> Recorded:
     if not count:
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
     both = np.empty((count, len(parts)))
-    for first in range(0, count, _PIECE):  # a piece of all columns stays in the cache
-        piece = slice(first, first + _PIECE)
+    for first in range(0, count, PIECE):  # a piece of all columns stays in the cache
+        piece = slice(first, first + PIECE)
         for i, part in enumerate(parts):
             both[piece, i] = part[piece]
     return Recorded(_time(records, known, count, model.dt), both, ny)

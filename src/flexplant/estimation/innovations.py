@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
+from ..parallel import PIECE
 from ..plant import AnyPlant
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root
@@ -125,10 +126,6 @@ def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
     return sorted(listed, key=lambda one: (one.p_value, -one.height))
 
 
-#: lines of a spectrum that are computed at once
-_PIECE = 4000
-
-
 class InnovationLines(NamedTuple):
     """Fourier transform X (m, p) of whitened innovations at lines [cycles per sample]."""
 
@@ -227,8 +224,8 @@ def density_of(
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
-    for start in range(0, freq.size, _PIECE):
-        at = slice(start, start + _PIECE)
+    for start in range(0, freq.size, PIECE):
+        at = slice(start, start + PIECE)
         V = whitening(observer, freq[at]) if white is None else white[at]
         if plant is None:
             sensors[at] = squared(V @ np.linalg.cholesky(observer.model.R))

@@ -16,17 +16,10 @@ from ..lti.statespace import System
 from ..plant import AnyPlant
 from ..plant.partitioned import require_sampled
 from ..store import Value
-from ..tolerances import SPLIT, TINY, divisor
+from ..tolerances import SAME, SPLIT, TINY, TYPED, divisor
 from ..words import check_names, name_list
 from .estimator_channels import checked_plant
 from .filter_models import FilterModel, filter_model
-
-#: singular values below this part of the largest one, inputs and sensors of unit size, are rounding
-_RANK = 1e-9
-#: a zero closer to the unit circle than this is one on it
-_LIMIT = 1e-7
-#: smallest singular value of the scaled test matrix at which a mode is not seen
-_UNSEEN = 1e-9
 
 
 class InputEntry(NamedTuple):
@@ -100,7 +93,7 @@ class InvertibilityReport(Value):
 
     def _described(self, zero: complex) -> str:
         size = abs(zero)
-        grows = f" that grows by {size:.6g} per sample" if size > 1 + _LIMIT else ""
+        grows = f" that grows by {size:.6g} per sample" if size > 1 + SPLIT else ""
         # a double zero at 1 comes out at the root of rounding times its condition
         if abs(zero - 1) < 1e-5:
             return "a constant force (zero at 1: no sensor sees a displacement that it makes)"
@@ -193,7 +186,7 @@ def ranks_and_zeros(
 
 def _rank(matrix: FloatArray) -> int:
     """Return the rank, columns and rows of unit size."""
-    return int(np.linalg.matrix_rank(_unit_sized(matrix)[0], tol=_RANK))
+    return int(np.linalg.matrix_rank(_unit_sized(matrix)[0], tol=SAME))
 
 
 def _unit_sized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -221,19 +214,13 @@ def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: in
         if size_of < 1 - 1e-5 or value.imag < -1e-9:  # well inside, or a conjugate
             continue
         near = 1.0 if abs(value - 1) < 1e-4 else value  # Jordan blocks come out at the root
-        if abs(near) < 1 - _LIMIT or any(abs(near - other) < SPLIT for other in found):
+        if abs(near) < 1 - SPLIT or any(abs(near - other) < SPLIT for other in found):
             continue
         test = np.vstack([near * np.eye(len(inner)) - inner, seen])
         columns = np.linalg.norm(test, axis=0)
-        if la.svdvals(test / divisor(columns))[-1] < _UNSEEN:
+        if la.svdvals(test / divisor(columns))[-1] < SAME:
             found.append(complex(near))
     return np.array(found, dtype=np.complex128)
-
-
-#: singular values below this part of a column of unit size are rounding
-_UNDETERMINED = 1e-9
-#: part of the force in a motion of unit size that leaves the sensors at zero, above which it counts
-_PART = 1e-6
 
 
 def check_bias(plant: AnyPlant | System, inputs: Sequence[str]) -> None:
@@ -295,10 +282,10 @@ def _unseen_forces(plant: AnyPlant, names: Sequence[str]) -> FloatArray:
     whole = np.block([[m.A - np.eye(n), d.G], [noise * m.C2, noise * d.H]])
     scaled, columns = _unit_sized(whole)
     _, sizes, right = np.linalg.svd(scaled)
-    null = right[sizes.size - np.count_nonzero(sizes < _UNDETERMINED) :, n:]
+    null = right[sizes.size - np.count_nonzero(sizes < SAME) :, n:]
     # what is left at rest without a force is no bias
     _, parts, combinations = np.linalg.svd(null)
-    forces = combinations[: np.count_nonzero(parts > _PART)]
+    forces = combinations[: np.count_nonzero(parts > TYPED)]
     forces = forces / columns[n:]
     # one axis for each combination, taken out of the others
     for row in range(len(forces)):

@@ -21,6 +21,7 @@ from ..plant import AnyPlant, standard_plant
 from ..plant.partitioned import require_sampled
 from ..plant.rigid_body import rigid_rows
 from ..store import Value, checked
+from ..tolerances import SAME
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .filter_models import Sight, Steady
@@ -227,10 +228,6 @@ class Smoother(Value):
 Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 
-#: a POI motion that the sensors miss by this relative part is not determined by them
-_MISSED = 1e-8
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class StaticEstimator(Value):
     """The rigid-body least-squares estimate of the motions at the POIs, a matrix of gains.
@@ -316,7 +313,7 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)
     R_y, R_z = rigid_rows(plant, motions, used), rigid_rows(plant, motions, channels)
-    gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)
+    gain = R_z @ np.linalg.pinv(R_y, rcond=SAME)
     missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
     # displacements of a static solution have nine digits
     bad = missed > 1e-6 * np.linalg.norm(R_z, axis=1)

@@ -14,7 +14,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..store import Value
-from ..tolerances import SETTLED, TINY
+from ..tolerances import SETTLED, SPLIT, TINY
 from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
@@ -32,8 +32,6 @@ _LEVEL = 0.999
 _EVALUATION = " Give the plant an evaluation model, if modes left out are what it lacks."
 #: lags of the autocovariances of the start
 _LAGS = 40
-#: smallest eigenvalue of the information of unit size, below which levels cannot be separated
-_SEPARATE = 1e-7
 #: fewest samples, and lines of the spectrum computed at once
 _FEWEST, _LINES = 1000, 4000
 #: a variance is kept above this part of the given one, and below this multiple in one pass
@@ -343,7 +341,7 @@ def _level_covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
             "found. Give it no density, or add a sensor."
         )
     values, vectors = np.linalg.eigh(scaled / np.outer(size, size))
-    if values[0] < _SEPARATE:
+    if values[0] < SPLIT:
         involved = np.flatnonzero(np.abs(vectors[:, 0]) > 0.3)
         raise AssumptionError(
             f"the sensors cannot separate the levels of {', '.join(channels[i] for i in involved)}"

@@ -13,13 +13,11 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..lti.discretisation import Recursion
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
+from ..tolerances import ROUNDING, TYPED
 from .error import ON_CIRCLE
 from .estimator_channels import Recorded
 from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
-#: the gain counts as stationary when all that its last changes would still do to the estimates and
-#: innovations, summed over time, is this part of their variances
-SETTLED = 1e-6
 #: samples between two looks whether it is
 _LOOK = 16
 
@@ -228,13 +226,13 @@ class Walk:
             assert self.found is not None  # noqa: S101
             X = Z @ self.found.X
             # a pass back changes delta itself by the root of what is left of it here
-            left = SETTLED * (1e-8 if self.keep else 1.0)
+            left = TYPED * (1e-8 if self.keep else 1.0)
             if self.found.open.size or np.sum((weight @ X) * X) > left:
                 return False, x, Z
             x, Z = x + Z @ self.found.value, Z[:, :0]
         excess = float(np.sum(weight * (P - self.steady.P)))
         # beside the rounding of both covariances
-        return abs(excess) < SETTLED + 1e-13 * size, x, Z
+        return abs(excess) < TYPED + 1e-13 * size, x, Z
 
     @cached_property
     def _weight(self) -> tuple[FloatArray, float]:
@@ -317,9 +315,6 @@ class Walk:
         return x
 
 
-#: what is left out of a start changes all later estimates, summed over time, by the root of this
-#: part of their deviations
-FADED = 1e-12
 #: largest part of the stationary variance of a state that may still be unknown of it
 _LARGEST = 1e4
 #: samples of the first stretch, and of the longest: twice as many each time
@@ -352,7 +347,7 @@ def excess(
     sizes, vectors = np.linalg.eigh(0.5 * (more + more.T))
     below = vectors[:, sizes < 0] * np.sqrt(-sizes[sizes < 0])
     # beside the rounding of the terms
-    if np.sum((weight @ below) * below) > FADED + 1e-13 * np.sum(np.abs(weight * steady.P)):
+    if np.sum((weight @ below) * below) > ROUNDING + 1e-13 * np.sum(np.abs(weight * steady.P)):
         return None
     return lasting_part(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
 
@@ -360,7 +355,7 @@ def excess(
 def lasting_part(weight: FloatArray, Y: FloatArray) -> FloatArray:
     """Return the combinations of columns of Y that still matter to later estimates."""
     sizes, mix = np.linalg.eigh(Y.T @ weight @ Y)
-    gone = np.cumsum(np.maximum(sizes, 0.0)) < FADED
+    gone = np.cumsum(np.maximum(sizes, 0.0)) < ROUNDING
     return np.asarray(Y @ mix[:, ~gone])
 
 

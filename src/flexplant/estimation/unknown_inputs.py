@@ -19,7 +19,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..store import Value, checked
-from ..tolerances import TINY, divisor
+from ..tolerances import TINY, TYPED, divisor
 from ..words import instance, sizes_of
 from .estimator_channels import checked_plant, poi_channels, row_of
 from .filter_models import (
@@ -41,8 +41,6 @@ from .invertible_inputs import (
 from .kalman import filter_design
 from .noise_from_records import with_densities
 
-#: variance of white inputs at the start of the search, beside what the sensors resolve
-_LARGE = 1e6
 #: Newton steps, and the relative change of a variance at which they end
 _STEPS, _SETTLED = 30, 1e-12
 
@@ -221,7 +219,7 @@ def _initial_covariance(m: FilterModel, d: InputEntry, late: bool) -> FloatArray
     """Return a covariance to start at: that with white inputs of a large variance."""
     F, spread = (m.C2 @ d.G, m.C2 @ m.Q @ m.C2.T + m.R) if late else (d.H, m.R)
     left = _weighted_inverse(F, spread)
-    size = _LARGE * np.sum((left @ spread) * left, axis=1)
+    size = (1.0 / TYPED) * np.sum((left @ spread) * left, axis=1)
     G, H = d.G * size, d.H * size
     return filter_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
 

@@ -15,9 +15,8 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
-from ..plant.assumptions import ABSENT
 from ..store import Value
-from ..tolerances import SETTLED, divisor
+from ..tolerances import SAME, SETTLED, divisor
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2, PoiLqr
@@ -158,7 +157,7 @@ class RigidPart:
 
         def missed(chosen: IntArray) -> IntArray:
             values = np.linalg.svd(self.rows[chosen], compute_uv=False)
-            strong = (values > ABSENT * values[:, :1]) & (values > 0)
+            strong = (values > SAME * values[:, :1]) & (values > 0)
             return np.asarray(wanted - np.count_nonzero(strong, axis=1))
 
         return by_size(sets, missed).astype(np.int64)
@@ -405,7 +404,7 @@ class Problem:
             sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
             sizes[chosen] = sizes[shut] = 0.0
             pick = int(np.argmax(sizes))
-            if np.linalg.norm(left[pick]) < ABSENT:
+            if np.linalg.norm(left[pick]) < SAME:
                 break
             chosen.append(pick)
             left = _rows_without(left, left[pick])
@@ -461,7 +460,7 @@ class Search(Value):
 
 def _rows_without(rows: FloatArray, row: FloatArray) -> FloatArray:
     size = float(np.linalg.norm(row))
-    if size < ABSENT:
+    if size < SAME:
         return rows
     unit = row / size
     return rows - np.outer(rows @ unit, unit)

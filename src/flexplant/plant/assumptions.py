@@ -20,16 +20,7 @@ from ..store import Value
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partitioned import PartitionedSystem
 from .rigid_body import body_of, rigid_modes
-from .visibility import WEAK, ModeVisibility, aliased_modes, mode_visibility, response_at
-
-#: a motion weaker than this beside the strongest one counts as absent
-ABSENT = 1e-8
-#: a pole closer to the stability limit than this, relative to its size, counts as on it
-_AXIS = 1e-9
-#: findings of one kind that are written out
-_SHOWN = 3
-#: poles whose samples are closer than this look alike
-_ALIKE = 1e-7
+from .visibility import SHOWN, WEAK, ModeVisibility, aliased_modes, mode_visibility, response_at
 
 
 class _Case(NamedTuple):
@@ -68,8 +59,8 @@ def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
         texts = list(dict.fromkeys([*texts, *_weights_without(plant, case.key)]))
         listed = f"(channels: {', '.join(case.names) or 'none'})"
         if texts:
-            more = len(texts) - _SHOWN
-            text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+            more = len(texts) - SHOWN
+            text = "; ".join(texts[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
             continue
         text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
@@ -89,7 +80,7 @@ def _undamped_kinds(plant: PartitionedSystem, poles: list[_Pole]) -> list[str]:
     kinds: dict[str, list[float]] = {"undamped suspension mode": [], "undamped mode": []}
     for pole in poles:
         size = abs(pole.value) / (2 * np.pi)
-        if own.n_modes and pole.value.imag and abs(pole.value.real) <= _AXIS * size:
+        if own.n_modes and pole.value.imag and abs(pole.value.real) <= SAME * size:
             weak = np.any(np.abs(known - size) <= TYPED * size)
             kind = "undamped suspension mode" if weak else "undamped mode"
             kinds[kind] += [size] * pole.left.shape[1]
@@ -134,12 +125,12 @@ def _persistent(g: StateSpace) -> list[_Pole]:
     # a double pole at the edge comes out at the root of rounding
     near = 1e-7 * float(np.max(np.abs(poles), initial=TINY))
     found: list[_Pole] = []
-    for pole in poles[(margin > -_AXIS) & (poles.imag >= 0)]:
+    for pole in poles[(margin > -SAME) & (poles.imag >= 0)]:
         if any(abs(pole - other.value) < near for other in found):
             continue
         shifted = g.A - (pole if pole.imag else pole.real) * np.eye(g.n_states)
         left, sizes, right = la.svd(shifted)
-        count = max(int(np.count_nonzero(sizes <= ABSENT * size)), 1)
+        count = max(int(np.count_nonzero(sizes <= SAME * size)), 1)
         count = min(count, _most(g, complex(pole), near))
         found.append(_Pole(complex(pole), left[:, -count:], right[-count:].conj().T))
     return found
@@ -167,11 +158,11 @@ def _alias_groups(poles: list[_Pole], rate: float) -> list[list[_Pole]]:
         mirrored = _Pole(pole.value.conjugate(), pole.left.conj(), pole.right.conj())
         z = _sample(pole.value, rate)
         own = [pole]
-        if rate and pole.value.imag and abs(z.imag) < _ALIKE:
+        if rate and pole.value.imag and abs(z.imag) < SPLIT:
             own = [pole, mirrored]
         elif rate and z.imag < 0:
             z, own = z.conjugate(), [mirrored]
-        same = [members for at, members in groups if rate and abs(at - z) < _ALIKE]
+        same = [members for at, members in groups if rate and abs(at - z) < SPLIT]
         if same:
             same[0].extend(own)
         else:
@@ -203,7 +194,7 @@ def _lacks(plant: PartitionedSystem, group: list[_Pole], case: _Case, rate: floa
             a = pole.value / rate if rate and case.held else 0.0
             size = abs(np.expm1(a) / a) if a else 1.0
             part = _modal_rows(g.B[:, g.input_index(case.names)].T, basis)
-            parts.append(part * (size if size > _ALIKE else 0.0))
+            parts.append(part * (size if size > SPLIT else 0.0))
         else:
             parts.append(_modal_rows(g.C[g.output_index(case.names)], basis))
     missing = _null_combinations(np.hstack(parts).T)  # one column for each channel
@@ -252,7 +243,7 @@ def _weights_without(plant: PartitionedSystem, key: str) -> list[str]:
     for name in getattr(plant, side):
         own = [i for i, state in enumerate(g.states) if f"{name}|" in state]
         poles = np.linalg.eigvals(g.A[np.ix_(own, own)]) if own else np.zeros(0)
-        if np.any(np.abs(poles) >= 1 - _AXIS if g.dt else poles.real >= -_AXIS * np.abs(poles)):
+        if np.any(np.abs(poles) >= 1 - SAME if g.dt else poles.real >= -SAME * np.abs(poles)):
             what = "u does not reach" if side == "w" else "y does not see"
             texts.append(f"{what} the weight of {name}, which does not decay (move its pole left)")
     return texts
@@ -265,7 +256,7 @@ def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     if not scaled.size:
         return np.eye(matrix.shape[0], dtype=np.complex128)
     U, s, _ = la.svd(scaled, full_matrices=True)
-    return np.asarray(U[:, np.count_nonzero(s > ABSENT * s[0]) :])
+    return np.asarray(U[:, np.count_nonzero(s > SAME * s[0]) :])
 
 
 def _axes_in_words(plant: PartitionedSystem, combinations: FloatArray) -> list[str]:

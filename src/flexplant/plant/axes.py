@@ -12,7 +12,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import TYPED, divisor
 from ..words import name_list
 from .partitioned import Partition
 from .ports import Poi
@@ -21,8 +21,6 @@ from .realisation import natural
 #: smallest over largest singular value of the gain, rows and columns scaled, from which on axes
 #: count as moved apart: below it a machine would have to bend or to push a hundred times as hard
 _APART = 1e-2
-#: a gain this small relative to its terms is rounding: the actuator does not move the axis
-_ROUNDING = 1e-6
 #: sweeps that scale rows and columns of a gain to one length
 _SWEEPS = 20
 #: a usual bandwidth as a part of the rate, and of the slowest oscillation of a continuous plant
@@ -204,7 +202,7 @@ def _felt(
     states = _states(g, complex(sigma), columns).real
     G = g.C[rows] @ states + g.D[np.ix_(rows, columns)]
     most = np.abs(g.C[rows]) @ np.abs(states)
-    return np.asarray(np.where(np.abs(G) > _ROUNDING * most, G, 0.0))
+    return np.asarray(np.where(np.abs(G) > TYPED * most, G, 0.0))
 
 
 def apart(G: FloatArray) -> bool:

@@ -11,13 +11,10 @@ from ..arrays import FloatArray
 from ..errors import AssumptionError, counted, require_known
 from ..lti.statespace import StateSpace
 from ..store import Value
+from ..tolerances import TYPED
 from ..words import name_list
 from .partitioned import Partition
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of, rigid_parts
-
-#: relative: what the sensors show or the actuators push of other axes
-_CLEAN = 1e-6
-
 
 #: units of displacements and rotations at the centre of gravity, by what a channel carries
 _UNITS = (
@@ -147,7 +144,7 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
 
 def _left_inverse(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:
     """Return the rows `pick` of the least-squares left inverse, its columns in these units."""
-    return np.asarray(pick @ (unit[:, None] * np.linalg.pinv(matrix * unit, rcond=_CLEAN)))
+    return np.asarray(pick @ (unit[:, None] * np.linalg.pinv(matrix * unit, rcond=TYPED)))
 
 
 def _check_identity(
@@ -161,7 +158,7 @@ def _check_identity(
 ) -> None:
     """Raise AssumptionError unless T (a row per axis) times the geometry is the identity."""
     own = pick @ unit
-    wrong = np.abs((product - pick) * unit / own[:, None]) > _CLEAN
+    wrong = np.abs((product - pick) * unit / own[:, None]) > TYPED
     if np.any(wrong):
         i, j = (int(k) for k in np.argwhere(wrong)[0])
         what = (

@@ -109,10 +109,6 @@ def _filters_of_channels(filters: Mapping[str, StateSpace], names: Iterable[str]
     return append(*(filters.get(n) or one.replace(inputs=[n], outputs=[n]) for n in names))
 
 
-#: relative: a gain at 0 Hz smaller than this is a zero there
-_ZERO = 1e-9
-
-
 def direct_effect(
     model: Structure, one: MeasuredRow, order: int, push: FloatArray, ground: FloatArray
 ) -> FloatArray:
@@ -187,7 +183,7 @@ def _integrals(part: StateSpace | None, most: int) -> int:
     for times in range(most):
         B = np.asarray(np.linalg.solve(part.A, B), dtype=np.float64)
         size = abs(direct) + float((spread @ np.abs(B))[0, 0])
-        if abs(direct - float((part.C @ B)[0, 0])) > _ZERO * size:
+        if abs(direct - float((part.C @ B)[0, 0])) > SAME * size:
             return times
         direct = 0.0
     return most

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from .axes import complex_gain
 
 #: a function of s, real on the real axis, to an array of any shape
@@ -28,8 +28,6 @@ _SAME = 1e-8
 _INSIDE, _NEAR = (1e-1, 1e-2, 1e-3, 1e-4), 1e-6
 #: terms that are compared
 _TERMS = 8
-#: condition, rows and columns scaled, above which a response counts as singular
-_SINGULAR = 1e9
 
 
 def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatArray:
@@ -83,7 +81,7 @@ def solved(G: ComplexArray, wanted: ComplexArray, axes: Sequence[str]) -> Comple
     rows = np.max(np.abs(G), axis=-1, keepdims=True)
     columns = np.max(np.abs(G), axis=-2, keepdims=True)
     flat = rows.min(initial=1.0) <= 0 or columns.min(initial=1.0) <= 0
-    if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > _SINGULAR:
+    if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > 1.0 / SAME:
         raise AssumptionError(
             f"the actuators do not move {', '.join(axes)} apart from each other, so that there is "
             "no inverse. Choose other axes."

@@ -20,9 +20,6 @@ from ..structure.rigid import SPANNED, turned_about
 from ..tolerances import SAME
 from .realisation import ModalRealisation, Structure
 
-#: part of a channel's largest motion that counts as seen
-_SEEN = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class RigidBody(Value):
@@ -112,7 +109,7 @@ def refuse_lost(
     motions = motions[:, [DIRECTIONS.index(axis) for axis in lost]]
     stacked = np.array(list(rows)).reshape(-1, motions.shape[0])
     most = np.abs(stacked) @ np.abs(motions)
-    seen = np.any(np.abs(stacked @ motions) > _SEEN * most.max(axis=0, initial=0.0), axis=0)
+    seen = np.any(np.abs(stacked @ motions) > SAME * most.max(axis=0, initial=0.0), axis=0)
     if np.any(seen):
         named = {axis: part for (axis, part), one in zip(lost.items(), seen, strict=True) if one}
         others = f"the other axes ({', '.join(body.axes)}) would be mixed with these"

@@ -19,7 +19,7 @@ from ..sparse.symmetric import orthonormalised
 from ..store import Value, checked
 from ..structure import Damper, FEModel, Spring
 from ..structure.rigid import SPANNED
-from ..tolerances import SAME, divisor
+from ..tolerances import SAME, SPLIT, TYPED, divisor
 from ..words import members
 from .port import checked_place, port_direction
 from .realisation import realise
@@ -230,14 +230,6 @@ def _suspend_modes(modes: Modes, springs: _Springs) -> Modes:
     )
 
 
-#: relative: poles closer than this have eigenvectors in common
-_CLUSTER = 1e-7
-#: relative: a pole with less imaginary part does not oscillate
-_REAL = 1e-9
-#: relative: what a residue may lack of being symmetric
-_SYMMETRIC = 1e-6
-
-
 def _suspend_complex(modes: Modes, springs: _Springs) -> Modes:
     """Return complex modes on springs."""
     # in first-order form, as no mass is known for truncated complex modes: `x' = A x + N' f`,
@@ -259,7 +251,7 @@ def _suspend_complex(modes: Modes, springs: _Springs) -> Modes:
     pull = stiffness[:, None] * (rows @ S) + damping[:, None] * (rows @ (S @ A))
     at_once = np.eye(len(rows)) + damping[:, None] * (rows @ S @ N.T @ rows.T)
     values, right = la.eig(A - (rows @ N).T @ np.linalg.solve(at_once, pull))
-    upper = np.flatnonzero(values.imag > _REAL * np.abs(values))
+    upper = np.flatnonzero(values.imag > SAME * np.abs(values))
     if 2 * upper.size != values.size:
         raise ModelError(
             "on these springs a mode would not oscillate: it is overdamped, or a negative "
@@ -284,10 +276,10 @@ def _suspend_complex(modes: Modes, springs: _Springs) -> Modes:
 def _residue_shapes(poles: ComplexArray, see: ComplexArray, push: ComplexArray) -> ComplexArray:
     """Return phi (n, k) with ``phi phi' = 2i Im(lambda) see push'`` for each pole."""
     phi = np.zeros_like(see)
-    for own in runs(poles, _CLUSTER):
+    for own in runs(poles, SPLIT):
         ratio = np.linalg.lstsq(see[:, own], push[:, own], rcond=None)[0]
         off = np.linalg.norm(see[:, own] @ ratio - push[:, own]) / np.linalg.norm(push[:, own])
-        if off > _SYMMETRIC:
+        if off > TYPED:
             raise ModelError(
                 f"the shapes at the pole {poles[own[0]]:.6g} rad/s are not reciprocal (by "
                 f"{off:.1e}): these complex modes are not those of symmetric matrices, or two "

@@ -16,11 +16,8 @@ from ..tolerances import SAME, TINY
 from .partitioned import PartitionedSystem
 from .realisation import natural
 
-#: modes that are named
-
-
-#: modes that are named
-_SHOWN = 3
+#: modes, or findings of one kind, that are named
+SHOWN = 3
 
 
 def aliased_modes(plant: PartitionedSystem) -> str:
@@ -35,7 +32,7 @@ def aliased_modes(plant: PartitionedSystem) -> str:
     if not above.size:
         return ""
     seen = np.round(np.abs(freq - rate * np.round(freq / rate)) / rate, 9) * rate
-    named = [f"mode {i + 1} ({freq[i]:.4g} Hz) looks like {seen[i]:.4g} Hz" for i in above[:_SHOWN]]
+    named = [f"mode {i + 1} ({freq[i]:.4g} Hz) looks like {seen[i]:.4g} Hz" for i in above[:SHOWN]]
     more = above.size - len(named)
     return (
         f"not below half the sampling rate of {rate:g} Hz: {', '.join(named)}"

@@ -15,7 +15,7 @@ from ..lti.filters import inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
 from .rest_expansion import followed_at_rest
@@ -27,8 +27,6 @@ _HEADROOM = 1.6
 #: disturbance and effort: the middle of that table; and where frequencies are
 #: uncertain, with which tolerant designs of eleven machines had margins of 0.40 to 0.43
 _SURE, _UNSURE = (3.0, 3.0), (20.0, 10.0)
-#: an axis that the sensors show less than this, relative to the first, has no arm
-_UNSEEN = 1e-9
 #: size of a disturbance elsewhere than at the actuators, relative to one of the same effect there
 _ELSEWHERE = 0.01
 #: least size of a channel, relative to the largest of its kind: one that takes hardly any part
@@ -257,7 +255,7 @@ class _Sizes:
         Y = real_gain(plant.system, sigma, sensors, plant.u) @ T
         shown = np.linalg.norm(Y, axis=0)
         first, r, m = float(shown[0]), len(driven.channels), len(plant.u)
-        d = shown / first if first and np.all(shown > _UNSEEN * first) else np.ones(r)
+        d = shown / first if first and np.all(shown > SAME * first) else np.ones(r)
         forces = np.sqrt(m / r) * np.linalg.norm(T / d, axis=1)
         # an actuator that the decoupling leaves at rest has a size nevertheless
         forces = np.maximum(forces, _IDLE * forces.max())

@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
 from ..store import Value
-from ..tolerances import TINY, divisor
+from ..tolerances import ROUNDING, TINY, divisor
 from ..words import instance, name_list
 
 #: shapes at DOFs, real or complex
@@ -22,8 +22,6 @@ Rows: TypeAlias = FloatArray | ComplexArray
 
 #: downdates after which the information matrix is made anew, and dropped rows leave the arrays
 _REFRESH = 64
-#: part of the largest information below which a combination of modes is not seen at all
-_UNSEEN = 1e-12
 
 
 class SelectionCriterion(Value):
@@ -109,7 +107,7 @@ class EffectiveIndependence(SelectionCriterion):
         length = np.linalg.norm(both, axis=0)
         both = both / divisor(length)
         vectors, size, _ = la.svd(both, full_matrices=False)
-        rows = np.array(vectors[:, size > _UNSEEN * size[0]])
+        rows = np.array(vectors[:, size > ROUNDING * size[0]])
         wanted = max(count, min(rows.shape[1] - fixed, p))
         remaining = np.arange(fixed + p)
         while remaining.size > fixed + wanted:
@@ -123,7 +121,7 @@ class EffectiveIndependence(SelectionCriterion):
     def values(self, rows: Rows) -> FloatArray:
         """Return the share E_i of each row in the information of all."""
         vectors, size, _ = la.svd(rows, full_matrices=False)
-        return np.asarray(np.sum(np.abs(vectors[:, size > _UNSEEN * size[0]]) ** 2, axis=1))
+        return np.asarray(np.sum(np.abs(vectors[:, size > ROUNDING * size[0]]) ** 2, axis=1))
 
 
 def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
@@ -136,7 +134,7 @@ def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
         worst = int(np.argmin(share))
         dropped.append(worst)
         image = inverse @ rows[worst].conj()
-        left = max(1.0 - float(np.real(rows[worst] @ image)), _UNSEEN)
+        left = max(1.0 - float(np.real(rows[worst] @ image)), ROUNDING)
         inverse += np.outer(image, image.conj() / left)
         share += np.abs(rows @ (image / np.sqrt(left))) ** 2
         share[worst] = np.inf

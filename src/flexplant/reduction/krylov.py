@@ -20,14 +20,9 @@ from ..sparse.factor import DENSE_LIMIT, dynamic_lu
 from ..sparse.symmetric import dense
 from ..store import checked
 from ..structure import FEModel
-from ..tolerances import RANK, TINY
+from ..tolerances import RANK, SAME, TINY, TYPED
 from .methods import ReductionMethod, fe_model, projected_model
 from .reduced import ReducedModel
-
-#: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
-_DEPENDENT = 1e-9
-#: residual, relative to the loads, that one refinement leaves unless K + s^2 M is singular
-_UNSOLVED = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -173,7 +168,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
         # pivots kept on the diagonal: one refinement brings the digits back
         found = found + lu.solve(loads - matrix @ found)
         left = np.linalg.norm(loads - matrix @ found, axis=0)
-        if not np.all(left <= _UNSOLVED * np.linalg.norm(loads, axis=0).clip(TINY)):
+        if not np.all(left <= TYPED * np.linalg.norm(loads, axis=0).clip(TINY)):
             raise SolverError(
                 f"the response at {at} leaves a residual of {left.max():.2g}: a resonance is too "
                 "near. Move the expansion frequency."
@@ -195,7 +190,7 @@ def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArr
     for _ in range(2):
         vectors = vectors - basis @ (basis.T @ np.asarray(model.M @ vectors))
     values, mix = la.eigh(vectors.T @ np.asarray(model.M @ vectors))
-    kept = values > _DEPENDENT**2 * max(float(values[-1]) if values.size else 0.0, 1.0)
+    kept = values > SAME**2 * max(float(values[-1]) if values.size else 0.0, 1.0)
     fresh = vectors @ (mix[:, kept] / np.sqrt(values[kept]))[:, ::-1]
     for _ in range(2):
         fresh = fresh - basis @ (basis.T @ np.asarray(model.M @ fresh))

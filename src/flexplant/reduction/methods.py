@@ -23,15 +23,13 @@ from ..sparse.symmetric import dense, unit_diagonal
 from ..store import Value, checked
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import RANK, TINY
+from ..tolerances import RANK, TINY, TYPED
 from ..words import instance, name_list
 from .criteria import PivotedQr
 from .ranking import ErrorBound
 from .reduced import ReducedModel
 
-#: part of a rigid-body motion that a basis may miss
-_RIGID_TOLERANCE = 1e-7
-#: part of the loads that a solution may leave
+#: part of a rigid-body motion that a basis may miss, and of the loads that a solution may leave
 _LEFT = 1e-7
 
 
@@ -133,7 +131,7 @@ def projected_model(
     load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
     rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
     missed = float(np.abs(T @ rigid - full).max(initial=0.0))
-    if not missed <= _RIGID_TOLERANCE * np.abs(full).max(initial=0.0):
+    if not missed <= _LEFT * np.abs(full).max(initial=0.0):
         raise ModelError(
             f"{method} does not hold the rigid-body motions of the structure (misses "
             f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "
@@ -163,8 +161,6 @@ def projected_model(
     )
 
 
-#: beyond this, rounding in K* (eps cond^2) spoils the low modes
-_CONDITION_LIMIT = 1e6
 #: part of the largest pivot above which a row of phi determines a mode of its own
 _TELLS = 1e-3
 _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
@@ -287,10 +283,10 @@ def refused_partition(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], 
     """Return the condition of phi_kk."""
     singular = la.svdvals(basis[dofs.indices(labels)])
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
-    if condition < _CONDITION_LIMIT:
+    if condition < 1.0 / TYPED:
         return condition
     raise ModelError(
-        f"phi_kk is near singular: condition {condition:.3g} (limit {_CONDITION_LIMIT:.0e}). The "
+        f"phi_kk is near singular: condition {condition:.3g} (limit {1.0 / TYPED:.0e}). The "
         f"DOFs do not distinguish the {what}, and M*, K* would be rounding. "
         + _proposal(dofs, basis, labels)
     )
@@ -313,7 +309,7 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
             continue
         fresh = [candidates[i] for i in taken]
         values = la.svdvals(basis[dofs.indices([*kept, *fresh])])
-        if values[-1] > values[0] / _CONDITION_LIMIT:
+        if values[-1] > TYPED * values[0]:
             left = [label for label in labels if label not in set(kept)]
             return (
                 f"Take {', '.join(fresh)} in place of {', '.join(left)}: condition "

@@ -20,6 +20,8 @@ from .symmetric import by_rows, dense, diagonal, unit_diagonal
 
 #: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
 DENSE_LIMIT = 1500
+#: a full matrix with more rows does not fit the memory comfortably
+LARGEST_FULL = 6000
 #: from here on a bound by Lanczos is cheaper than a factorisation
 _BOUND_LIMIT = 10_000
 #: steps of that bound, and the chance that it is wrong

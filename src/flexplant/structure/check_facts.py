@@ -17,7 +17,7 @@ from ..tolerances import SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel
-from .rigid import RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
+from .rigid import FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
@@ -25,8 +25,6 @@ from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_
 _MODES, _FEW = 10, 4
 #: DOFs without stiffness that are counted as motions without energy, at most
 _LOOSE = 64
-#: a rigid-body motion whose relative force is below this is free; its residual measures rounding
-_FREE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     force = np.asarray(K @ motions)
     scale = np.linalg.norm(sizes, axis=0)
     relative = np.linalg.norm(force, axis=0) / divisor(scale)
-    motions = motions[:, (scale > 0) & (relative < _FREE)]
+    motions = motions[:, (scale > 0) & (relative < FREE)]
     motions = motions @ unheld(
         by_rows(K), motions, max(PRECISION, written), farness(given.dofs.xyz)
     )

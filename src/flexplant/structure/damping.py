@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import FloatArray, Matrix, between, complex_array, positive, real_array, whole
 from ..errors import ModelError, ShapeError, short
+from ..sparse.factor import LARGEST_FULL
 from ..sparse.symmetric import dense
 from ..store import Value, checked
 from ..tolerances import ROUNDING, divisor
@@ -264,10 +265,6 @@ def _ratios(value: Any, name: str) -> FloatArray:
     return ratio
 
 
-#: modal damping over all modes fills D; beyond this it would not fit the memory comfortably
-_LIMIT = 5000
-
-
 def damping_matrix(
     stiffness: Matrix,
     mass: Matrix,
@@ -277,10 +274,10 @@ def damping_matrix(
 ) -> FloatArray:
     """Return the full D of a damping law, ``M Phi 2 Z Omega Phi^T M`` over all modes."""
     n = rigid.shape[0]
-    if n > _LIMIT:
+    if n > LARGEST_FULL:
         raise ModelError(
             f"this damping gives a full D, too large for {n} DOFs (limit "
-            f"{_LIMIT}). Pass it to solve_modes(model, damping=...) instead."
+            f"{LARGEST_FULL}). Pass it to solve_modes(model, damping=...) instead."
         )
     M, K = dense(mass), dense(stiffness)
     loaded = M @ rigid

@@ -28,8 +28,6 @@ from .zero_energy_motions import most_moved, nonrigid
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
-#: relative to the diagonal: K and D may have eigenvalues this far below zero
-SEMIDEFINITE = 1e-9
 #: part of its largest possible energy that a rigid translation has at most in K, least in M
 _NONE, _SOME = 1e-6, 0.1
 #: a structure whose every DOF is slower than this [rad/s] is no machine
@@ -118,7 +116,7 @@ def _is_semidefinite(matrix: Matrix) -> bool:
     if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
         # the factorisation in solve_modes finds the rest; here it would double the cost
         return not np.any(diagonal(matrix) < 0)
-    return is_positive_definite(matrix, SEMIDEFINITE)
+    return is_positive_definite(matrix, SAME)
 
 
 def without_inertia(M: Matrix, K: Matrix) -> str:
@@ -185,7 +183,7 @@ def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:
     for axis in "xyz":
         along = np.array([one == axis for one in directions])
         force, size = matrix @ along.astype(float), abs(matrix) @ along.astype(float)
-        count += int(np.sum((np.abs(force) <= SEMIDEFINITE * size) & along))
+        count += int(np.sum((np.abs(force) <= SAME * size) & along))
     return count
 
 

@@ -16,9 +16,9 @@ from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..store import Value, checked
-from ..tolerances import TYPED
+from ..tolerances import SAME, TYPED
 from ..words import flag, instance, name_list, one_of
-from .definite import SEMIDEFINITE, are_swapped, digits_of, square, symmetric_matrix
+from .definite import are_swapped, digits_of, square, symmetric_matrix
 from .model import FEModel
 from .singular_mass import empty_rows, held_rows, inertial
 from .undamped_frequencies import MOST, natural_frequencies
@@ -394,7 +394,7 @@ class FEMatrices(Value):
             warn(f"{self.source or 'K'}: {_modal_damping_note(self.loss_factor)}")
         if self.digits is not None:
             held = None if free else ready._held_by_rounding(model)
-            if held and model.n_unstable and not is_positive_definite(model.K, SEMIDEFINITE):
+            if held and model.n_unstable and not is_positive_definite(model.K, SAME):
                 raise ModelError(f"K is not positive semi-definite. {held[0].upper()}{held[1:]}")
             for said in (endangered(ready.K, ready.M, self.digits), held):
                 if said:

@@ -26,7 +26,7 @@ from ..sparse.symmetric import (
     orthonormalised,
     unit_diagonal,
 )
-from ..tolerances import divisor
+from ..tolerances import NULL, ROUNDING, TYPED, divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
 _OUTLIER = 30.0
@@ -164,13 +164,11 @@ def _join_parts(label: IntArray, one: Any, other: Any) -> IntArray:
 
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
-_ENERGY_TOLERANCE = 1e-10
+FREE = 1e-10
 #: the same for motions that coordinates of few digits keep from being free: worth a closer look
 _NEARLY = 1e-2
 #: largest force of such a motion at any DOF, of the largest that its parts make anywhere
 _EVERYWHERE = 3e-4
-#: force of a motion at 0, of the largest eigenvalue of the model, that its modes are checked for
-_RESIDUAL = 1e-12
 #: steps of inverse iteration from the geometry's motions to the null vectors of K
 _STEPS = 4
 #: part of a motion that may be lost on this way
@@ -243,13 +241,6 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     return np.hstack(found)
 
 
-#: relative: by how much motions are mended that were given with few digits; springs that hold one
-#: change it wholly
-_FEW_DIGITS = 1e-6
-#: eigenvalues of K, scaled, up to this relative size are zero
-_NULL = 1e-11
-
-
 def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
     """Return motions (n, r) without the little by which they stretch a structure: few digits."""
     # ``m - K^+ K m`` is the null vector of K next to m; of a large K inverse iteration finds it
@@ -258,21 +249,21 @@ def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
     scaled, scale = unit_diagonal(K)
     if K.shape[0] <= DENSE_LIMIT:
         force = scale[:, None] * np.asarray(K @ motions)
-        change = scale[:, None] * (la.pinvh(dense(scaled), rtol=_NULL) @ force)
+        change = scale[:, None] * (la.pinvh(dense(scaled), rtol=NULL) @ force)
     else:
         try:
-            solve = definite_solver(scaled, sp.eye_array(K.shape[0], format="csc"), _NULL)
+            solve = definite_solver(scaled, sp.eye_array(K.shape[0], format="csc"), NULL)
         except SolverError:  # magnets make a motion unstable
             return motions
         given = motions / scale[:, None]
         found = given
         for _ in range(_STEPS):
-            found = solve(_NULL * found)
+            found = solve(NULL * found)
         # what is held has shrunk; rounding moves null vectors within their space alone
         kept = found[:, np.linalg.norm(found, axis=0) > 0.5 * np.linalg.norm(given, axis=0)]
         change = scale[:, None] * (given - kept @ np.linalg.lstsq(kept, given)[0])
     size = divisor(np.linalg.norm(motions, axis=0))
-    small = np.linalg.norm(change, axis=0) <= _FEW_DIGITS * size
+    small = np.linalg.norm(change, axis=0) <= TYPED * size
     return np.asarray(motions - np.where(small, change, 0.0))
 
 
@@ -314,7 +305,7 @@ def free_motions(
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     scale = divisor(scale)
     force = np.asarray(K @ motions) / scale
-    tolerance = max(_ENERGY_TOLERANCE, ENERGY * rounding)
+    tolerance = max(FREE, ENERGY * rounding)
     free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
         return _not_held(M, K, motions, far, rounding)
@@ -352,7 +343,7 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
     """Return whether M-orthonormal motions pass for modes at 0 of (K, M), to rounding."""
     root = np.sqrt(M.diagonal())[:, None]
     force = np.linalg.norm(np.asarray(K @ motions) / root, axis=0)
-    return bool(np.all(force <= _RESIDUAL * float(np.max(K.diagonal() / M.diagonal()))))
+    return bool(np.all(force <= ROUNDING * float(np.max(K.diagonal() / M.diagonal()))))
 
 
 def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:

@@ -12,18 +12,9 @@ import scipy.sparse.csgraph as csgraph
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
-from ..sparse.factor import is_positive_definite, symmetric_lu
+from ..sparse.factor import LARGEST_FULL, is_positive_definite, symmetric_lu
 from ..sparse.symmetric import dense, diagonal, unit_diagonal
-from ..tolerances import ROUNDING
-
-#: relative to a unit diagonal: an eigenvalue of M below this is none
-_SINGULAR = 1e-11
-#: blocks of M larger than this are not searched for a null space
-_LARGEST_BLOCK = 3000
-#: the result is a full matrix; beyond, it would not fit the memory comfortably
-_LARGEST = 6000
-#: the DOFs to leave out must follow from the others: no worse conditioned than this
-_CONDITION = 1e12
+from ..tolerances import NULL, ROUNDING
 
 
 def null_motions(M: Any, digits: int | None) -> FloatArray:
@@ -31,7 +22,7 @@ def null_motions(M: Any, digits: int | None) -> FloatArray:
     # M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
     # text leave, are none
     n = M.shape[0]
-    tolerance = _SINGULAR if digits is None else max(_SINGULAR, 10.0 ** (1 - digits))
+    tolerance = NULL if digits is None else max(NULL, 10.0 ** (1 - digits))
     if is_positive_definite(M, -tolerance):
         return np.zeros((n, 0))
     scaled: Any
@@ -41,10 +32,10 @@ def null_motions(M: Any, digits: int | None) -> FloatArray:
     order = np.argsort(label, kind="stable")
     columns: list[FloatArray] = []
     for block in np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1]):
-        if block.size > _LARGEST_BLOCK:
+        if block.size > LARGEST_FULL:
             raise ModelError(
                 f"M is singular or indefinite, and {block.size} of its DOFs are coupled: too "
-                f"many to search (limit {_LARGEST_BLOCK}). Export a lumped M, or one with rotary "
+                f"many to search (limit {LARGEST_FULL}). Export a lumped M, or one with rotary "
                 "inertia."
             )
         values, vectors = la.eigh(dense(scaled[block][:, block]))
@@ -75,10 +66,10 @@ def condense_massless(
     # others, `q_s = -(N^T K)_s^-1 (N^T K)_m q_m`: exact, all finite eigenvalues stay, and the DOFs
     # that are kept keep their meaning
     n, q = motions.shape
-    if n > _LARGEST:
+    if n > LARGEST_FULL:
         raise ModelError(
             f"condensing {q} motions without inertia gives full matrices of {n - q} DOFs (limit "
-            f"{_LARGEST}). Give the offset masses a rotary inertia."
+            f"{LARGEST_FULL}). Give the offset masses a rotary inertia."
         )
     if D is not None and np.abs(D @ motions).max() > 0:
         raise ModelError(
@@ -92,7 +83,7 @@ def condense_massless(
     weight[weight == 0] = 1.0
     pivot = forces[:, s] / weight
     pivot_rows = np.linalg.norm(pivot, axis=1)
-    if not pivot_rows.all() or np.linalg.cond(pivot / pivot_rows[:, None]) > _CONDITION:
+    if not pivot_rows.all() or np.linalg.cond(pivot / pivot_rows[:, None]) > 1.0 / ROUNDING:
         raise ModelError(
             f"a motion without inertia has no stiffness either, at {', '.join(names(s[:6]))} among "
             "others: it does not follow from the others. Hold it: without([...])."

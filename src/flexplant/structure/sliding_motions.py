@@ -12,11 +12,9 @@ from ..arrays import FloatArray
 from ..errors import ModelError, require_known
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.symmetric import dense, unit_diagonal
+from ..tolerances import NULL
 from ..words import name_list
 from .model import FEModel
-
-#: relative: eigenvalues of the scaled K up to this are zero
-_ZERO = 1e-11
 
 
 def slides(model: FEModel) -> dict[str, FloatArray]:
@@ -55,7 +53,7 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
         )
     scaled, scale = unit_diagonal(model.K)
     values, vectors = la.eigh(dense(scaled))
-    zero = scale[:, None] * vectors[:, np.abs(values) <= _ZERO * max(float(values[-1]), 1.0)]
+    zero = scale[:, None] * vectors[:, np.abs(values) <= NULL * max(float(values[-1]), 1.0)]
     rigid = model.rigid_body
     left = zero - rigid @ (np.asarray(model.M @ rigid).T @ zero)
     extra = zero.shape[1] - rigid.shape[1]

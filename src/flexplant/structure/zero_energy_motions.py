@@ -12,19 +12,14 @@ import scipy.sparse as sp
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
+from ..sparse.factor import LARGEST_FULL
 from ..sparse.lowest import Lowest, lowest_modes
 from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal, orthonormalised
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from .rigid import ASIDE, bodies, farness, force_free, free_motions, rigid_motions
 
-#: a motion is in the space of others when less than this part of it is left over
-_LEFT = 1e-6
-#: a singular value below this part of the largest is none
-_RANK = 1e-8
 #: DOFs of a mechanism that move at least this part of the most moving one
 _MOVES = 0.05
-#: full matrices beyond this do not fit the memory comfortably
-_LARGEST = 6000
 
 
 @dataclass(frozen=True)
@@ -123,7 +118,7 @@ def _independent(motions: FloatArray) -> FloatArray:
         return motions
     lengths = np.linalg.norm(motions, axis=0)
     spread, sizes, _ = la.svd(motions / lengths, full_matrices=False)
-    return np.asarray(spread[:, sizes > _RANK * sizes[0]], dtype=np.float64)
+    return np.asarray(spread[:, sizes > SAME * sizes[0]], dtype=np.float64)
 
 
 def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
@@ -134,9 +129,10 @@ def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
 
 def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     """Return ``P^T K P``, ``P = I - R R^T M``, which the nearly free motions R cost nothing."""
-    if len(dofs) > _LARGEST:
+    if len(dofs) > LARGEST_FULL:
         raise ModelError(
-            f"freeing fills K: too large for {len(dofs)} DOFs (limit {_LARGEST}). Export in binary."
+            f"freeing fills K: too large for {len(dofs)} DOFs (limit {LARGEST_FULL}). "
+            "Export in binary."
         )
     motions = nearly_free(K, M, dofs, digits)
     if not motions.shape[1]:

@@ -13,7 +13,7 @@ from ...errors import ModelError
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING, TINY, divisor
+from ...tolerances import ROUNDING, TINY, TYPED, divisor
 
 #: directions of a Delta's change below this, relative to the largest, are left out
 _RANK = 1e-5
@@ -22,8 +22,6 @@ _RANK = 1e-5
 _BENT = 1e-3
 #: largest norm of a fraction's feedback: its pole lies well beyond the ends of the Delta
 _FEEDBACK = 0.5
-#: relative change of the plant in which its channels agree with a plant that is assembled anew
-_DIGITS = 1e-6
 
 
 class Opened(NamedTuple):
@@ -201,7 +199,7 @@ def require_exact(
     """Raise ModelError unless the channels give the plant with all Deltas changed at once."""
     made, own, new = (system_matrix(g) for g in (opened.closed(values), base, wanted))
     # of the change six digits, where rounding of the whole leaves them
-    allowed = _DIGITS * np.abs(new - own).max(axis=1) + ROUNDING * np.abs(new).max(axis=1)
+    allowed = TYPED * np.abs(new - own).max(axis=1) + ROUNDING * np.abs(new).max(axis=1)
     bad = np.flatnonzero(np.abs(made - new).max(axis=1) > allowed)
     if bad.size:
         name = (*base.states, *base.outputs)[int(bad[0])]

@@ -13,21 +13,14 @@ from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
-from ...tolerances import SAME
+from ...tolerances import ROUNDING, SAME
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .kind import DEVIATIONS, Known, Uncertainty
-from .mode_delta import (
-    KNOWN,
-    DampingDelta,
-    FrequencyDelta,
-    ModeDelta,
-    modal_realisation,
-    require_elastic,
-)
+from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, modal_realisation, require_elastic
 from .parameter_amounts import ParameterDelta
 
 #: largest relative uncertainty of a damping: an interval reaches farther above than below, where
@@ -155,7 +148,7 @@ class Fit(Uncertainty):
         order = np.stack([rising, rising + rising.size], axis=1).ravel()  # mode by mode
         scale = self.deviations * np.sqrt(np.diag(covariance))[order]
         every = _of_modes([poles.modes[i] for i in rising], scale)
-        keep = np.flatnonzero(scale > KNOWN)
+        keep = np.flatnonzero(scale > ROUNDING)
         if not keep.size:
             raise ModelError(
                 f"modes {list(poles.modes)} have no variance: there is nothing uncertain."

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import FloatArray, real_array
 from ...errors import ModelError, require_known, unknown_label
-from ...tolerances import TINY
+from ...tolerances import ROUNDING, SAME, TINY
 from ...updating.matrix_parameters import MatrixParameter
 from ..partitioned import Partition
 from ..realisation import MODAL, ModalRealisation
@@ -18,10 +18,6 @@ from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts, with_changes
 from .parameter_amounts import ParameterDelta
 
-#: relative shares below this open no channel
-KNOWN = 1e-12
-#: relative: a dependence of what a mode's stiffness or damping changes below which it is rounding
-_AFFINE = 1e-8
 #: relative change at which the plant's dependence on a Delta is read off
 _READ_OFF = 0.25
 
@@ -179,7 +175,7 @@ def stated_by_mode(
             f"the {name} is uncertain by a share of it, 0 or more, got {values.min()}."
         )
     every = [kind.of(n, factor * float(x)) for n, x in zip(chosen, values, strict=True)]
-    return [one for one in every if one.scale > KNOWN and one.acts(realisation)]
+    return [one for one in every if one.scale > ROUNDING and one.acts(realisation)]
 
 
 def changed_pairs(
@@ -210,7 +206,7 @@ def _channels(plant: Partition, delta: Delta, base: FloatArray) -> list[DeltaCha
     rate = R[:n] @ changed[:n]
     rate_size = float(np.linalg.norm(rate))
     seen = np.linalg.lstsq(np.array([R, rate / rate_size]).T, change.T, rcond=None)[0]
-    plain = np.abs(seen[1]) <= _AFFINE * np.linalg.norm(change, axis=1)
+    plain = np.abs(seen[1]) <= SAME * np.linalg.norm(change, axis=1)
     left = np.where(plain, change @ R, seen[0])
     again = np.where(plain, 0.0, seen[1] / rate_size)
     even = np.sqrt(max(float(np.abs(left[:n]).max()), TINY))

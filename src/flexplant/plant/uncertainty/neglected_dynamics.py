@@ -17,7 +17,7 @@ from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...store import Value
-from ...tolerances import ROUNDING, TINY
+from ...tolerances import RANK, ROUNDING, TINY, TYPED
 from ...words import name_list
 from ..building import sampled_like
 from ..evaluation_plants import evaluation_plant
@@ -28,8 +28,6 @@ Pair: TypeAlias = tuple[StateSpace, StateSpace]
 
 #: the weights lie this far above the largest difference found
 _MARGIN = 1.05
-#: part of the rigid-body accelerations by which two models of one body may differ
-_SAME_BODY = 1e-6
 #: offsets from a resonance, in its half widths, at which the bound is checked besides
 _BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 
@@ -227,7 +225,7 @@ def _elastic_pair(small: Partition, big: Partition) -> Pair:
 def _same_body(one: FloatArray, other: FloatArray) -> None:
     size = np.abs(one).max(initial=0.0), np.abs(other).max(initial=0.0)
     if one.shape != other.shape or np.any(
-        np.abs(one - other) > _SAME_BODY * np.abs(one).max(axis=-1, keepdims=True, initial=0.0)
+        np.abs(one - other) > TYPED * np.abs(one).max(axis=-1, keepdims=True, initial=0.0)
     ):
         raise ModelError(
             "the difference grows toward low frequencies: the two differ in their rigid body "
@@ -334,8 +332,6 @@ _PROMINENT = 3.0
 _HUMP, _APART = complex(-0.4, np.sqrt(1 - 0.4**2)), 1.1
 #: terms that add nowhere more than this part of the square of the weight are left out
 _NEGLIGIBLE = 1e-3
-#: constant term beside the largest residue: with less, rounding moves the zeros
-_LEAST = 1e-13
 
 
 def covering(
@@ -367,7 +363,7 @@ def covering(
     for i in kept.tolist():
         for pole, end in terms[i].residues:
             ends[pole] = ends.get(pole, 0.0) + gains[i + 1] * end
-    constant = max(float(gains[0]), _LEAST * max(map(abs, ends.values()), default=0.0))
+    constant = max(float(gains[0]), RANK * max(map(abs, ends.values()), default=0.0))
     total = constant + sum(gains[i + 1] * terms[i].at(x) for i in kept)
     rise = float(np.max(square / total))
     return _spectral_factor(rise * constant, {at: rise * end for at, end in ends.items()}, unit)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import FloatArray, positive, real_array
 from ...errors import ModelError
-from ...tolerances import TINY
+from ...tolerances import SAME, TINY
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from ..remade import rebuilt
@@ -18,9 +18,6 @@ from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts
 from .kind import DEVIATIONS, Known, Uncertainty
 from .mode_delta import modal_realisation, require_elastic
-
-#: relative: a dependence of what a mode's shape changes below which it is rounding
-_LEAST = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +93,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
     size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
     rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
     amount = rest @ beyond / max(float(beyond @ beyond), TINY)
-    amount[np.linalg.norm(rest, axis=1) <= _LEAST * size] = 0.0
+    amount[np.linalg.norm(rest, axis=1) <= SAME * size] = 0.0
     plain = seen - np.outer(amount, base[v])
     motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
     for column, right, rate in (
@@ -104,7 +101,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
         (plain[:, v], speed, None),
         (amount, base[v], np.eye(plant.system.n_states)[v]),
     ):
-        small = np.abs(column) * np.linalg.norm(right) <= _LEAST * size
+        small = np.abs(column) * np.linalg.norm(right) <= SAME * size
         parts += [] if np.all(small) else [(np.where(small, 0.0, column), right, rate)]
     if not parts:
         raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
