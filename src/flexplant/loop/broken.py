@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, short
-from ..lti.frequency_sweep import SOUGHT, highest, resonance_grid
+from ..lti.frequency_sweep import SOUGHT, climbed_grid, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..tolerances import TINY
+from ..words import instance
+from .blocks import references
 
 Side = Literal["u", "y"]
 #: loop gain below which |S| is at most 1 / (1 - 0.5), which is seldom the largest
@@ -248,3 +250,46 @@ def _optimised(S: ComplexArray, log: FloatArray, size: FloatArray) -> FloatArray
             # of singular vectors, of length one
             log = log + np.log((columns + 1e-12) / (rows + 1e-12)) / (4.0 * power)
     return size
+
+
+def reference_pair(loop: Any, reference: str | None, error: str | None) -> tuple[str, ...]:
+    """Return reference and error, or nothing when the loop has no reference."""
+    for name, given in (("reference", reference), ("error", error)):
+        instance(given, str | None, name, "Pass the name of a channel.", LabelError)
+    if reference is None:
+        known = [name for name in loop.plant.w if name.endswith(":ref")]
+        if len(known) > 1:
+            raise LabelError(
+                f"the loop has {len(known)} references {known}, each with an S of its own: say "
+                f"which, reference={known[0]!r}; fx.plot.sensitivity(loop) draws all."
+            )
+        if not known:
+            return ()
+        reference = known[0]
+    return reference, error if error is not None else f"{reference.removesuffix(':ref')}:error"
+
+
+def error_sensitivity(
+    loop: Any, reference: str | None = None, error: str | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies [Hz] and |S| from reference to error, refined where it is largest."""
+    if reference is None or error is None:
+        pair = reference_pair(loop, reference, error)
+        if not pair:
+            raise LabelError(
+                "the loop has no reference, so no sensitivity from it to an error: add "
+                "Reference(...) to the ports, or name the channels."
+            )
+        reference, error = pair
+    gain = loop.gain(reference, error)
+    return climbed_grid(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
+
+
+def axis_sensitivities(loop: Any) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return |S| of each axis that has a reference, by its name: frequencies [Hz] and sizes."""
+    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
+    return {
+        error.removesuffix(":error"): error_sensitivity(loop, ref, error)
+        for ref, error in pairs.items()
+        if error in loop.plant.z
+    }

@@ -10,13 +10,12 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
-from ..lti.frequency_sweep import climbed_grid, crossings, highest
+from ..lti.frequency_sweep import crossings, highest
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
-from ..words import instance, mapping
-from .blocks import references
-from .broken import BrokenLoop, inverted
+from ..words import mapping
+from .broken import BrokenLoop, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
 from .measured_loop import broken_count
 from .sensitivity_functions import Loop, first_crossing, taken_apart
@@ -443,7 +442,7 @@ def compare_loops(
     mapping(loops, "loops", hint, least=1, kind=ClosedLoop)
     alone = tuple(name for name, loop in loops.items() if loop.plant.unjudged)
     loops = {name: loop.completed or loop for name, loop in loops.items()}
-    pair = _reference_pair(next(iter(loops.values())), reference, error)
+    pair = reference_pair(next(iter(loops.values())), reference, error)
     for name, loop in loops.items():
         if pair and (pair[0] not in loop.plant.w or pair[1] not in loop.plant.z):
             raise LabelError(
@@ -468,49 +467,6 @@ def compare_loops(
         for name, loop in loops.items()
     }
     return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled, alone)
-
-
-def _reference_pair(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
-    """Return reference and error, or nothing when the loop has no reference."""
-    for name, given in (("reference", reference), ("error", error)):
-        instance(given, str | None, name, "Pass the name of a channel.", LabelError)
-    if reference is None:
-        known = [name for name in loop.plant.w if name.endswith(":ref")]
-        if len(known) > 1:
-            raise LabelError(
-                f"the loop has {len(known)} references {known}, each with an S of its own: say "
-                f"which, reference={known[0]!r}; fx.plot.sensitivity(loop) draws all."
-            )
-        if not known:
-            return ()
-        reference = known[0]
-    return reference, error if error is not None else f"{reference.removesuffix(':ref')}:error"
-
-
-def error_sensitivity(
-    loop: ClosedLoop, reference: str | None = None, error: str | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies [Hz] and |S| from reference to error, refined where it is largest."""
-    if reference is None or error is None:
-        pair = _reference_pair(loop, reference, error)
-        if not pair:
-            raise LabelError(
-                "the loop has no reference, so no sensitivity from it to an error: add "
-                "Reference(...) to the ports, or name the channels."
-            )
-        reference, error = pair
-    gain = loop.gain(reference, error)
-    return climbed_grid(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
-
-
-def axis_sensitivities(loop: ClosedLoop) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return |S| of each axis that has a reference, by its name: frequencies [Hz] and sizes."""
-    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
-    return {
-        error.removesuffix(":error"): error_sensitivity(loop, ref, error)
-        for ref, error in pairs.items()
-        if error in loop.plant.z
-    }
 
 
 def _bandwidth(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from ..arrays import FloatArray, positive
-from ..errors import ModelError, counted
+from ..errors import ModelError, counted, warn
 from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
 from ..lti.sampling import check_latency, check_rate, held_exactly, light_modes, sample_and_hold
@@ -23,6 +23,7 @@ from .partitioned import Partition
 from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural
+from .rigid_body import rigid_gain, rigid_modes
 
 
 class PortRows(NamedTuple):
@@ -367,3 +368,44 @@ def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
             "continuous system, which is sampled at the plant's rate."
         )
     return weight
+
+
+#: relative difference of rigid-body accelerations above which two models are different bodies; an
+#: updated mass stays below it
+_ANOTHER_BODY = 0.1
+
+
+def evaluation_plant(plant: P, model: EvaluationModel) -> P:
+    """Return the plant of a structure that judges another, with its channels, sampled alike."""
+    before: Any = plant.continuous
+    if before is not plant:
+        found: P = before.evaluation_plant
+    else:
+        found = continuous_plant(type(plant), model.realisation, plant.assembled.ports, None)
+    found = sampled_like(plant, loud_like(plant, found))
+    if before is plant:  # others were compared before they were sampled
+        warn_of_another_body(plant, found)
+    return found
+
+
+def warn_of_another_body(own: Partition, other: Partition) -> None:
+    """Warn where forces accelerate the rigid body of an evaluation model differently."""
+    if not (own.n_rigid and other.n_rigid):
+        return  # held, on springs, or of foreign matrices: no mode shows the mass alone
+    one, two = _rigid_gains(own), _rigid_gains(other)
+    size = float(np.linalg.norm(one))
+    if not size or not np.any(two):
+        return  # no force moves the body
+    off = float(np.linalg.norm(two - one)) / size
+    if off > _ANOTHER_BODY:
+        warn(
+            "the evaluation model moves as another rigid body: its acceleration per force differs "
+            f"by {off:.0%} from the plant's, so that answers would be judged on another machine. "
+            "Pass the model that the plant was made of, with more modes."
+        )
+
+
+def _rigid_gains(plant: Partition) -> FloatArray:
+    """Return the acceleration (p, m) of what is seen, per force, by the modes at 0 Hz."""
+    motions = rigid_modes(plant.assembled.realisation, None)
+    return rigid_gain(plant, motions, plant.assembled.ports.motions, plant.u)

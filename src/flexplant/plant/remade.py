@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import require_known
+from ..errors import LabelError, ModelError, require_known, some_names
 from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..store import Value
+from ..tolerances import SAME
 from ..words import name_list
 from .building import (
     P,
@@ -19,6 +20,7 @@ from .building import (
     continuous_plant,
     loud_like,
     sampled_like,
+    warn_of_another_body,
     wired,
     with_modes,
 )
@@ -204,3 +206,38 @@ def _with_states(g: StateSpace, stay: npt.NDArray[np.bool_]) -> StateSpace:
         states=[name for name, kept in zip(g.states, stay.tolist(), strict=True) if kept],
         blocks=blocks,
     )
+
+
+def check_channels(plant: Partition, other: Partition) -> None:
+    """Raise LabelError unless an evaluation model that is a plant has the plant's channels."""
+    for side in "wuzy":
+        own, others = getattr(plant, side), getattr(other, side)
+        if own != others:
+            raise LabelError(
+                f"the evaluation model has other channels in {side}: {some_names(others)}, the "
+                f"plant has {some_names(own)}. Assemble both with the same ports."
+            )
+
+
+def own_plant(kind: type[P], model: EvaluationModel) -> P:
+    """Return the plant that is an evaluation model, with the ports that it got since."""
+    found = kind.of(model.source)
+    return found if model.ports is None else rebuilt(found, ports=model.ports)
+
+
+def matched(plant: P, model: EvaluationModel) -> P:
+    """Return the evaluation plant of a plant whose evaluation model is a plant."""
+    other = own_plant(type(plant), model)
+    check_channels(plant, other)
+    other = other.replace(evaluation=None)
+    if plant.dt and not other.dt:
+        other = sampled_like(plant, other)
+    same = bool(np.isclose(other.dt, plant.dt, rtol=SAME, atol=0.0))
+    if not same or other.delay != plant.delay:
+        raise ModelError(
+            f"the evaluation model has dt {other.dt:g} s and delay {other.delay:g}, the plant "
+            f"{plant.dt:g} s and {plant.delay:g}: their responses could not be compared. Pass it "
+            "continuous, or sampled like the plant."
+        )
+    warn_of_another_body(plant, other)
+    return other

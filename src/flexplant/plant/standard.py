@@ -13,15 +13,14 @@ from ..errors import LabelError
 from ..labels import Place
 from ..lti.statespace import System, as_statespace
 from .assumptions import AssumptionReport
-from .building import continuous_plant, sampled
+from .building import continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
-from .evaluation_plants import check_channels, evaluation_plant, own_plant
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
 from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partitioned import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
-from .remade import rebuilt, selected
+from .remade import check_channels, matched, own_plant, rebuilt, selected
 from .rigid_body import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
@@ -345,7 +344,10 @@ class StandardPlant(Partition):
         LabelError or ModelError when a plant that was given as evaluation model has other channels,
         or another sampling time or delay.
         """
-        return evaluation_plant(self)
+        model = self.evaluation
+        if model is None:
+            return None
+        return evaluation_plant(self, model) if model.is_structure else matched(self, model)
 
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""

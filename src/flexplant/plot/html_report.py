@@ -17,7 +17,7 @@ from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
 from ..loop.blocks import references
-from ..loop.report import axis_sensitivities, error_sensitivity
+from ..loop.broken import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes

@@ -14,7 +14,7 @@ from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..loop import ClosedLoop, complementary_sensitivity, control_sensitivity
 from ..loop import sensitivity as sensitivity_of
 from ..loop.blocks import references
-from ..loop.report import axis_sensitivities, error_sensitivity
+from ..loop.broken import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.measured_lines import LINES, on_lines, steps_between
 from ..lti.response_solvers import continuous_poles

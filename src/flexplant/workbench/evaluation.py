@@ -25,8 +25,7 @@ from ..lti.measured_lines import low_slope, on_lines
 from ..lti.response_solvers import Responder, responder
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
-from ..synthesis.laws.law import Law
-from ..synthesis.laws.loop_design import Axes
+from ..synthesis.laws.law import Axes, Law
 
 #: standard deviations of a line that the band around it shows
 DEVIATIONS = 2.0

@@ -20,7 +20,6 @@ from ...store import Value
 from ...tolerances import RANK, ROUNDING, TINY, TYPED
 from ...words import name_list
 from ..building import sampled_like
-from ..evaluation_plants import evaluation_plant
 from ..partitioned import Partition, is_plant
 
 #: a plant and the larger one, without rigid-body motions
@@ -135,7 +134,8 @@ def neglected_modes(
     if is_plant(evaluation):
         big = Partition.of(evaluation).continuous
     else:
-        big = evaluation_plant(small.replace(evaluation=evaluation)) or small
+        judged: Any = small.replace(evaluation=evaluation)
+        big = judged.evaluation_plant or small
     follow = whole(resonances, "resonances")
     found = _bounding(_elastic_pair(small, big), follow)
     if not given.dt:

@@ -23,7 +23,8 @@ from ...parallel import one_thread
 from ...plant import AnyPlant
 from ...store import Value
 from ..controller import Controller, with_left_out
-from ..laws.loop_design import Axes, axes_of, connected
+from ..laws.law import Axes, connected
+from ..laws.loop_design import axes_of
 from .hinf_design import design_hinf
 from .ncf import (
     continuous,

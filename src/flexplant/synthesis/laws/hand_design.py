@@ -19,8 +19,8 @@ from ...lti.interconnection import among
 from ...lti.statespace import StateSpace
 from ...store import Value, checked
 from ...words import flag, instance, mapping
-from .law import Law, LawElement, SingleElement
-from .loop_design import Axes, DesignedLoops, axes_controller, axes_of, connected, made
+from .law import Axes, Law, LawElement, SingleElement, axes_controller, connected
+from .loop_design import DesignedLoops, axes_of, made
 
 #: what feedforward gains act on, in this order
 TERMS = ("position", *DERIVATIVES)

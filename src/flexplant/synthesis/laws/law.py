@@ -1,24 +1,26 @@
-"""The law of one axis: elements multiplied, continuous or sampled, in closed form and as system."""
+"""Laws as products of elements, and the controller of one law for each axis of a plant."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ...arrays import ComplexArray, FloatArray, below_half_rate, positive, real_array
-from ...errors import ModelError, short
+from ...errors import ModelError, require_known, short
 from ...lti.blocks_of_states import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.frequency import sampled_freq
+from ...lti.interconnection import series, side_by_side
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
+from ...plant import AnyPlant
 from ...store import Value
-from ...words import flag, instance
+from ...words import flag, instance, name_list
 
 
 class Section(NamedTuple):
@@ -289,3 +291,44 @@ def product(sections: Iterable[Section | BlockSection], s: ComplexArray) -> Comp
     for section in sections:
         value *= section.gain(s)
     return value
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A square plant in its axes, and the way there from y and from there to u."""
+
+    plant: Any
+    before: StateSpace
+    after: StateSpace
+    rate: float
+    given: AnyPlant | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The axes."""
+        return tuple(self.after.outputs)
+
+
+def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
+    """Return motions to commands of the axes, ``-diag(laws)``."""
+    dt = 1.0 / axes.rate if axes.rate else 0.0
+    each = [(-laws[name].system).replace(dt=dt) for name in axes.names]
+    return side_by_side(each, axes.names).replace(outputs=axes.before.inputs)
+
+
+def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> StateSpace:
+    """Return [y, references] -> u of a controller in the axes."""
+    require_known("axis", references, axes.names)
+    names = name_list(references.values(), "references")
+    chosen = np.zeros((len(axes.names), len(names)))
+    for column, name in enumerate(references):
+        chosen[axes.names.index(name), column] = 1.0
+    none = np.zeros((len(axes.names), len(axes.after.inputs)))
+    if len(inner.inputs) > len(axes.names):
+        read = np.block([[none, chosen], [axes.after.D, np.zeros(chosen.shape)]])
+    else:
+        read = np.hstack([axes.after.D, -chosen])
+    inputs = [*axes.after.inputs, *names]
+    first = StateSpace([], [], [], read, inner.dt, inputs=inputs)
+    system = series(series(first, inner), axes.before.replace(dt=inner.dt))
+    return system.replace(inputs=inputs, outputs=axes.before.outputs)

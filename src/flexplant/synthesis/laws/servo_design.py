@@ -13,8 +13,8 @@ from ...arrays import FloatArray, below_half_rate, between, positive, real_array
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
+from ...loop.broken import axis_sensitivities
 from ...loop.other_machines import growing_modes, modes_in_words
-from ...loop.report import axis_sensitivities
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
@@ -22,7 +22,7 @@ from ...plant.axes import driven_axes
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
-from .loop_design import Axes, axes_controller, connected
+from .law import Axes, axes_controller, connected
 from .servo_loops import (
     POWERS,
     TARGET,

@@ -24,8 +24,8 @@ from ...plant import AnyPlant
 from ...plant.axes import real_gain
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
-from .law import Law, decoupled, tustin_s
-from .loop_design import Axes, DesignedLoops, axes_of, made
+from .law import Axes, Law, decoupled, tustin_s
+from .loop_design import DesignedLoops, axes_of, made
 from .servo_loops import TARGET
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
