@@ -14,14 +14,13 @@ from ..arrays import FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..plant.evaluation_model import NOT_JUDGED
 from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
 from .filter_models import FilterModel, KalmanCertificate, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
-from .left_out_modes import NODES, NOTED, LeftOut, left_out
+from .left_out_modes import NODES, NOTED, LeftOut, beyond_text, left_out
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,16 +71,7 @@ class KalmanEstimator(PoiFilter):
     left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
-        count = self.certificate.left_out
-        beyond = (
-            "no modes are left out"
-            if count is None and not self.plant.unjudged
-            else f"{NOT_JUDGED}: truncation is not in these numbers"
-            if count is None
-            else f"with {counted(count, 'mode')} left out"
-            if count
-            else "as if no modes were left out"
-        )
+        beyond = beyond_text(self.plant, self.certificate.left_out)
         share = self.certificate.unresolved
         if share is not None and share > NOTED:
             beyond += (

@@ -20,6 +20,7 @@ from ..modes import Modes
 from ..modes.matching import assigned
 from ..plant import AnyPlant, StandardPlant
 from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
+from ..plant.evaluation_model import NOT_JUDGED
 from ..plant.origins import Assembled
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
@@ -35,6 +36,14 @@ from .estimator_channels import poi_channels, read_alike, sensors
 _SAME = 0.15
 #: how much another shape weighs beside another frequency when modes are paired
 _SHAPE = 0.02
+
+
+def beyond_text(plant: AnyPlant, count: int | None) -> str:
+    """Return, in words, whether predicted errors hold the modes left out; their number, if so."""
+    if count is None:
+        alone = f"{NOT_JUDGED}: truncation is not in these numbers"
+        return alone if plant.unjudged else "no modes are left out"
+    return f"with {counted(count, 'mode')} left out" if count else "as if no modes were left out"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -36,6 +36,7 @@ from .filter_models import (
     filter_model,
     filter_system,
 )
+from .left_out_modes import LeftOut, beyond_text, left_out
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000
@@ -84,9 +85,13 @@ class PeriodicEstimator(Value):
         L, columns of sensors that are not read are zero.
     predictor_gains : (period, n, ny) array
         K of ``x[k+1|k] = A x[k|k-1] + B2 u + K e``.
+    poi_gains : (period, nz, ny) array
+        L_z of ``hat = C1 x[k|k-1] + D1 u + L_z e``.
     variances : (period, nz) array [m^2 or rad^2]
         Of the errors at the POIs in each sample of a period.
     certificate : PeriodicCertificate
+    left_out : LeftOut, optional
+        The modes of the evaluation model that the plant lacks: white noise on sensors and POIs.
     """
 
     plant: AnyPlant
@@ -94,21 +99,29 @@ class PeriodicEstimator(Value):
     measured: FloatArray
     gains: FloatArray
     predictor_gains: FloatArray
+    poi_gains: FloatArray
     variances: FloatArray
     certificate: PeriodicCertificate
+    left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
+        judged = self.plant.machine.evaluation is not None
+        count = len(self.left_out.modes) if self.left_out else 0 if judged else None
         rms = sizes_of({n: self.rms(n) for n in poi_channels(self.plant)}, self.plant.units)
         return (
             f"<PeriodicEstimator: {counted(self.gains.shape[1], 'state')}, "
             f"{counted(len(self.sensors), 'sensor')}, "
-            f"period {self.period} samples;\n  rms error {rms}>"
+            f"period {self.period} samples;\n  rms error {rms} ({beyond_text(self.plant, count)})>"
         )
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """The sensors, in the order of the columns of the gains."""
         return sensors(self.plant)
+
+    @property
+    def _model(self) -> FilterModel:
+        return filter_model(self.plant, self.left_out)
 
     def rms(self, channel: str, phase: int | None = None) -> float:
         """Return the rms of the error of a POI's motion (`die`, `die:z`, `die:hat`) over a period.
@@ -124,8 +137,8 @@ class PeriodicEstimator(Value):
     def system(self, phase: int) -> StateSpace:
         """Return the filter of one sample of a period, from sensors and u to the estimates."""
         k = whole(phase, "phase", minimum=0, maximum=self.period - 1)
-        model = filter_model(self.plant)
-        gains = self.predictor_gains[k], model.C1 @ self.gains[k]
+        model = self._model
+        gains = self.predictor_gains[k], self.poi_gains[k]
         return filter_system(self.plant, model, *gains, f"sample {k} of a period")
 
     def estimate(self, records: Any, *, start: Any = None) -> dict[str, FloatArray]:
@@ -135,7 +148,7 @@ class PeriodicEstimator(Value):
         which a sensor is not read may be NaN, or anything. `start` is x (n,) at the first sample;
         rest when not given.
         """
-        model = filter_model(self.plant)
+        model = self._model
         record = recorded(records, model)
         due = np.resize(self.measured.astype(bool), record.y.shape)
         if np.any(np.isnan(record.y) & due):
@@ -151,7 +164,7 @@ class PeriodicEstimator(Value):
         for k, (measured, u) in enumerate(zip(y, record.u, strict=True)):
             at = k % self.period
             e = np.where(due[k], measured - model.C2 @ x - model.D2 @ u, 0.0)
-            hat[k] = model.C1 @ (x + self.gains[at] @ e) + model.D1 @ u
+            hat[k] = model.C1 @ x + self.poi_gains[at] @ e + model.D1 @ u
             x = model.A @ x + model.B @ u + self.predictor_gains[at] @ e
         return dict(zip(estimates(model.channels), hat.T, strict=True))
 
@@ -207,7 +220,9 @@ def design_multirate(
     (4, True)
     """
     plant = checked_plant(plant)
-    model = filter_model(plant)
+    judge = plant.machine.evaluation_plant
+    found = None if judge is None else left_out(plant, judge)
+    model = filter_model(plant, found)
     check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     measured = _reading_times(model.sensors, every)
@@ -215,13 +230,16 @@ def design_multirate(
     C, Q, R, S, A = _lifted(model, measured)
     solution = filter_dare(A, C, Q=Q, R=R, S=S)
     P = solution.P
-    gains, predictors, variances = [], [], []
+    gains, predictors, shown, variances = [], [], [], []
     moved = np.eye(len(P))
     for read in measured:
-        gain, predictor, after, ahead = _joseph_step(model, P, read)
+        gain, predictor, to_pois, ahead = _joseph_step(model, P, read)
         gains.append(gain)
         predictors.append(predictor)
-        variances.append(np.sum((model.C1 @ after) * model.C1, axis=1))
+        shown.append(to_pois)
+        left = model.C1 - to_pois @ model.C2
+        noise = np.sum((to_pois @ model.R - 2.0 * model.N) * to_pois, axis=1)
+        variances.append(np.sum((left @ P) * left, axis=1) + model.V.diagonal() + noise)
         moved = (model.A - predictor @ model.C2) @ moved
         P = ahead
     first = solution.P.diagonal()
@@ -240,8 +258,10 @@ def design_multirate(
         measured.astype(np.float64),
         np.array(gains),
         np.array(predictors),
+        np.array(shown),
         np.array(variances),
         PeriodicCertificate(radius, solution.residual, difference),
+        found,
     )
 
 
@@ -297,8 +317,9 @@ def _lifted(
 def _joseph_step(
     m: FilterModel, P: FloatArray, read: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return L, K, P[k|k] and P[k+1|k] of one sample, in Joseph's form."""
+    """Return L, K, L_z and P[k+1|k] of one sample, in Joseph's form."""
     g = filter_gains(m, P, read)
     closed = m.A - g.K @ m.C2
     ahead = closed @ P @ closed.T + m.driven(g.K)
-    return g.L, g.K, m.updated(P, g.L), 0.5 * (ahead + ahead.T)
+    to_pois = m.C1 @ g.L + m.N @ g.W.T @ g.W
+    return g.L, g.K, to_pois, 0.5 * (ahead + ahead.T)

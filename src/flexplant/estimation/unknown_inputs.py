@@ -21,7 +21,8 @@ from ..plant import AnyPlant
 from ..store import Value, checked
 from ..tolerances import TINY, TYPED, divisor
 from ..words import instance, sizes_of
-from .estimator_channels import checked_plant, poi_channels, row_of
+from .error import error_variances
+from .estimator_channels import checked_plant, poi_channels, read_alike, row_of
 from .filter_models import (
     AGREEMENT,
     FilterModel,
@@ -39,6 +40,7 @@ from .invertible_inputs import (
     unknown_names,
 )
 from .kalman import filter_design
+from .left_out_modes import beyond_text, left_out
 from .noise_from_records import with_densities
 
 #: Newton steps, and the relative change of a variance at which they end
@@ -173,15 +175,25 @@ def design_input_estimator(
     )
     design = find(wider, d._replace(at_pois=np.vstack([d.at_pois, np.eye(k)])), found)
     _check_certificate(design.certificate)
+    system = filter_system(plant, design.model, design.K, design.L, "input_estimator", names)
+    variances, missing = design.variances[:nz], None
+    whole = plant.machine.evaluation_plant
+    if whole is not None:
+        still, missed = _without_noise(whole, names), left_out(plant, whole)
+        missing = 0 if missed is None else missed.modes.size
+        if missing:
+            hats = system.select(outputs=system.outputs[:nz])
+            variances = error_variances(read_alike(plant, still), hats).values
     return InputEstimator(
-        filter_system(plant, design.model, design.K, design.L, "input_estimator", names),
+        system,
         plant,
         names,
         int(design.late),
-        design.variances[:nz],
+        variances,
         design.variances[nz:],
         found,
         design.certificate,
+        missing,
     )
 
 
@@ -405,6 +417,8 @@ class InputEstimator(Value):
     invertibility : InvertibilityReport
         Whether the sensors determine the inputs without any assumption of them.
     certificate : InputCertificate
+    left_out : int, optional
+        Number of modes of the evaluation model that the plant lacks: they are in `variances`.
     """
 
     system: StateSpace
@@ -415,6 +429,7 @@ class InputEstimator(Value):
     input_variances: FloatArray
     invertibility: InvertibilityReport
     certificate: InputCertificate
+    left_out: int | None = None
 
     def __repr__(self) -> str:
         names = [*poi_channels(self.plant), *self.inputs]
@@ -423,7 +438,8 @@ class InputEstimator(Value):
         return (
             f"<InputEstimator: {counted(self.system.n_states, 'state')}, inputs {late}, spectral "
             "radius "
-            f"{self.certificate.spectral_radius:.6f}\n  rms error {rms}>"
+            f"{self.certificate.spectral_radius:.6f}\n  rms error {rms} "
+            f"({beyond_text(self.plant, self.left_out)})>"
         )
 
     def rms(self, channel: str) -> float:

@@ -10,12 +10,14 @@ import scipy.sparse as sp
 from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
 from ..sparse.lowest import lowest_modes, multifrontal_inertia
-from ..tolerances import SAME, TINY
+from ..tolerances import TINY
 
 #: frequencies beyond those asked for, among which a gap to count in is looked for
 _EXTRA = 4
 #: frequencies that are given at most: inverse iteration keeps all shapes at once
 MOST = 60
+#: residual of a shape relative to the largest forces in it
+_RESIDUAL = 1e-8
 
 
 def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> FloatArray:
@@ -33,7 +35,7 @@ def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> Float
     values[: found.n_zero] = 0.0
     force, size = K @ shapes - (M @ shapes) * values, abs(K) @ np.abs(shapes)
     off = np.linalg.norm(force, axis=0) / (np.linalg.norm(size, axis=0) + TINY)
-    if off.max(initial=0.0) > max(SAME, rounding):
+    if off.max(initial=0.0) > max(_RESIDUAL, rounding):
         raise SolverError(
             f"a shape leaves {off.max():.1g} of its forces: the frequencies are not accurate. "
             "Scale the matrices, or give the DOFs and solve_modes."
