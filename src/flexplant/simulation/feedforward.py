@@ -13,7 +13,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, real_array, whole
 from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
-from ..loop.report import error_sensitivity
+from ..loop.broken import error_sensitivity
 from ..loop.sensitivity_functions import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
