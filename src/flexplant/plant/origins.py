@@ -122,3 +122,5 @@ class Foreign(Value):
 
 #: where a plant may have come from
 Origin: TypeAlias = "Assembled | Foreign"
+#: nothing is known but the names
+ELSEWHERE = Foreign()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self, TypeGuard
 
 import numpy as np
@@ -26,7 +26,7 @@ from ..store import Value
 from ..structure import FEModel
 from ..words import mapping, name_list
 from .evaluation_model import NOT_JUDGED, EvaluationModel
-from .origins import Assembled, Foreign, Origin, PlantChannel
+from .origins import ELSEWHERE, Assembled, Foreign, Origin, PlantChannel
 from .ports import Ports
 from .realisation import MODAL, ModalRealisation
 from .sides import TYPE_THIS, sides_of
@@ -334,7 +334,7 @@ def is_plant(given: object) -> TypeGuard[PartitionedSystem | System]:
 class Partition(PartitionedSystem):
     """The data of a standard plant, in the fields of `StandardPlant`, and derived quantities."""
 
-    origin: Origin = field(default_factory=Foreign)
+    origin: Origin = ELSEWHERE
     uncertainty: Any = None
     evaluation: EvaluationModel | None = None
 
