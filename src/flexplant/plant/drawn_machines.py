@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, IntArray
+from ..errors import LabelError
+from ..labels import DofSet, Place
 from ..tolerances import SAME
-from .realisation import ModalRealisation, natural
+from .realisation import ModalRealisation, Structure, natural
 from .remade import rebuilt
 from .standard import StandardPlant
 from .uncertainty.delta import Delta
@@ -43,6 +45,7 @@ def draws_with_left_out(
     unknown = _Unmeasured.of(uncertain, whole)
     if unknown is None:
         return None
+    seen = _at_ports(whole) if shapes else modal_realisation(whole)
     deltas, covariance = list(uncertain.deltas), uncertain.covariance
     deviation = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(
@@ -59,17 +62,64 @@ def draws_with_left_out(
         scattered = np.exp(_DAMPING * apart.standard_normal(len(unknown.modes)))
         every = [*deltas, *unknown.frequencies]
         changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
-        modes = _changed_modes(whole, [*changes, *unknown.damped(scattered)])
+        modes = _changed_modes(seen, [*changes, *unknown.damped(scattered)])
         return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
 
     return (one(each) for each in rng.spawn(count))
 
 
 def _changed_modes(
-    plant: StandardPlant, changes: Sequence[tuple[Delta, float]]
+    realisation: ModalRealisation, changes: Sequence[tuple[Delta, float]]
 ) -> ModalRealisation:
-    realisation = modal_realisation(plant)
     return realisation.replace(pairs=changed_pairs(realisation, changes))
+
+
+@dataclass(frozen=True)
+class _SomeCoordinates:
+    """A structure of which only those coordinates are held that its ports see or push."""
+
+    model: Structure
+    kept: IntArray
+
+    @property
+    def full_dofs(self) -> DofSet:
+        return self.model.full_dofs
+
+    def row(self, at: Place, direction: str = "z") -> FloatArray:
+        row = self.model.row(at, direction)
+        if np.count_nonzero(row) > np.count_nonzero(row[self.kept]):
+            raise LabelError(
+                f"no port is at {at!r}, so that this machine does not hold its motion."
+            )
+        return row[self.kept]
+
+    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
+        return np.array([self.row(point, direction) for point in points])
+
+    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        return self.model.rigid_motions(about)[self.kept]
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        return self.model.missed_motions(about)
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        whole = np.zeros((self.model.rigid_motions().shape[0], motions.shape[1]))
+        whole[self.kept] = motions
+        return self.model.inertia(whole)[self.kept]
+
+
+def _at_ports(plant: StandardPlant) -> ModalRealisation:
+    """Return the modes of a plant over the coordinates that its ports see or push."""
+    realisation, ports = modal_realisation(plant), plant.assembled.ports
+    rows = [poi.row(realisation, axis) for poi in ports.z for axis in poi.axes]
+    rows += [sensor.row(realisation) for sensor in ports.y]
+    rows += [force.push(realisation) for force in ports.forces]
+    kept = np.flatnonzero(np.any(rows, axis=0))
+    arrays = ("inputs", "outputs", "static_inputs", "static_outputs")
+    return realisation.replace(
+        model=_SomeCoordinates(realisation.model, kept),
+        **{name: getattr(realisation, name)[kept] for name in arrays},
+    )
 
 
 def damped_less(
@@ -87,7 +137,8 @@ def damped_less(
     ranges = {delta.mode: 0.5 * delta.scale for delta in unknown.frequencies}
     given = uncertain.frequencies.items()
     own = {mode: 0.5 * share for mode, share in given if mode in unknown.modes}
-    return rebuilt(whole, realisation=_changed_modes(whole, lower)), ranges | own
+    modes = _changed_modes(modal_realisation(whole), lower)
+    return rebuilt(whole, realisation=modes), ranges | own
 
 
 @dataclass(frozen=True)

@@ -187,10 +187,14 @@ def tolerant(
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
     progress: bool | None = None,
+    found: SolvedController | None = None,
 ) -> Controller:
-    """Return the verified controller of a plant with channels for its modes."""
+    """Return the verified controller of a plant with channels for its modes.
+
+    `found`: what the method has found for it already.
+    """
     channels = given.channels
-    answer = _design_one(with_mode_channels(plant, channels), method, progress)
+    answer = _design_one(with_mode_channels(plant, channels), method, progress, found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
@@ -230,7 +234,10 @@ def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, Solved
 
 
 def _design_one(
-    plant: AnyPlant, method: SynthesisMethod | None, progress: bool | None
+    plant: AnyPlant,
+    method: SynthesisMethod | None,
+    progress: bool | None,
+    found: SolvedController | None = None,
 ) -> Controller:
     """Return the verified controller of a plant."""
     problem = prepared(plant.system, plant.u, plant.y)
@@ -241,7 +248,8 @@ def _design_one(
         require_reach(problem)
         if plant.modal_blocks.size:  # whatever a method makes of it: this motion would drift
             require_shown(problem)
-        found = method.solve(problem)
+        if found is None:
+            found = method.solve(problem)
         answer = _verified(plant, problem, type(method).__name__, found)
         norm = float(answer.gamma or 0.0)
         lower = raised_bound(problem, norm, max(found.lower, pointwise_bound(problem)))

@@ -28,7 +28,7 @@ from ...plant.drawn_machines import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import generator
-from ..controller import Controller, with_left_out
+from ..controller import Controller, SolvedController, with_left_out
 from .hinf_design import Evened, evened, solved, tolerant
 from .hinf_riccati import Riccati
 from .tolerated_modes import with_mode_channels
@@ -210,8 +210,8 @@ class _StageTask:
             (SolverError, InfeasibleError, CertificateError),
         ):
             opened = with_mode_channels(weighted, given.channels)
-            system, _ = solved(opened, Riccati(progress=False))
-            return _StageTry(bandwidth, weighted, given, system)
+            system, solution = solved(opened, Riccati(progress=False))
+            return _StageTry(bandwidth, weighted, given, system, solution=solution)
         try:
             found = tolerant(weighted, given, known)
             return _StageTry(bandwidth, weighted, given, found.system, found)
@@ -302,7 +302,9 @@ class _StageTask:
         best, found, drawn = self.best, self.best.found, self.best.drawn
         if found is None:
             try:
-                found = tolerant(best.weighted, best.given, self.uncertain, Riccati())
+                found = tolerant(
+                    best.weighted, best.given, self.uncertain, Riccati(), found=best.solution
+                )
             except CertificateError:  # rounding: what takes its place must hold as well
                 found = tolerant(best.weighted, best.given, self.uncertain)
                 margin, drawn = self._judged(found.system)
@@ -330,4 +332,6 @@ class _StageTry(NamedTuple):
     system: StateSpace
     #: what was verified of it, where other methods than `Riccati` found it
     found: Controller | None = None
+    #: what `Riccati` found, not verified
+    solution: SolvedController | None = None
     drawn: float = 0.0
