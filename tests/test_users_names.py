@@ -69,7 +69,16 @@ class Case:
         return self.plant.uncertain(measured)
 
     def level(self):
-        return pl.HinfLevel(z={f"{self.die}:x": 1e6}, w={self.amp: 1.0}, effort=0.1, noise=1e-9)
+        def level(plant):
+            z = dict.fromkeys(plant.z) | {f"{self.die}:x": 1e6}
+            z |= {name: 0.1 for name in z if name.endswith(":effort")}
+            w = dict.fromkeys(plant.w) | {self.amp: 1.0}
+            w |= {name: 1e-9 for name in w if name.endswith(":noise")}
+            read = [name for name in plant.y if w.get(name, 1.0) is not None]
+            sums = fx.StateSpace([], [], [], np.eye(len(read)), plant.dt, inputs=read, outputs=read)
+            return fx.design_hinf(plant.weighted(z=z, w=w).through(sums)).gamma
+
+        return level
 
 
 USES = {

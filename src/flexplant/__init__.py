@@ -157,6 +157,7 @@ lower bound too, by a perturbation that reaches it.
 | ``simulation.certify_speed`` | gone: `simulation.rms_along(..., repeats=True)`, one path |
 | ``kirchhoff_plate(holes=, ribs=)`` | gone: a mesh of scikit-fem, `examples/from_skfem.py` |
 | ``structure.Disc``, ``structure.Rectangle`` | `placement.Disc`, `placement.Rectangle` |
+| ``placement.HinfLevel`` | ``lambda plant: fx.design_hinf(plant.weighted(...)).gamma`` |
 | ``structure.Hysteretic`` | `ModalDamping` of eta / 2; a complex K is read as that |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 

@@ -1,21 +1,128 @@
-"""Certificates in words: what was verified after an answer was computed."""
+"""Certificates: what was verified after an answer was computed, each figure with its limit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from .arrays import ComplexArray
+from .errors import aligned
 from .store import Value
 
 
-class Certificate(Value):
-    """The base of certificates with fields; prints them as a line of words and numbers."""
+@dataclass(frozen=True, eq=False)
+class Verified(Value):
+    """One figure that was computed to verify an answer.
+
+    Parameters
+    ----------
+    what : str
+        What was checked, with its unit in brackets where it has one: "norm", "corner [Hz]".
+    figure : float
+        The figure that was found.
+    route : str
+        How it was computed; empty: by the method that gave the answer.
+    limit : float, optional
+        The figure must be below this limit. None: the figure informs, nothing is required of it.
+    at_least : bool
+        The figure must be above the limit instead.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.loop.Verified("spectral radius", 0.97, "eigenvalues of the closed loop", limit=1.0).holds
+    True
+    """
+
+    what: str
+    figure: float
+    route: str = ""
+    limit: float | None = None
+    at_least: bool = False
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the limit is kept; None without a limit."""
+        if self.limit is None:
+            return None
+        return self.figure >= self.limit if self.at_least else self.figure <= self.limit
+
+    @property
+    def row(self) -> list[str]:
+        """What was checked, the figure, its limit and the route, in words."""
+        sign = "at least" if self.at_least else "at most"
+        limit = "" if self.limit is None else f"{sign} {figure(self.what, self.limit)}"
+        failed = ", not kept" if self.holds is False else ""
+        return [self.what, figure(self.what, self.figure), limit + failed, self.route]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Value, Mapping[str, float]):
+    """What was verified of an answer: figures with their limits, found by other routes.
+
+    ``certificate["norm"]`` is the figure of a check; ``certificate.checks`` holds all of them.
+
+    Parameters
+    ----------
+    checks : sequence of Verified
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.design_kalman(fx.testbeds.three_masses()).certificate
+    >>> round(found["spectral radius"], 4), found.holds
+    (0.9601, True)
+    """
+
+    checks: tuple[Verified, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._set(checks=tuple({check.what: check for check in self.checks}.values()))
+
+    @classmethod
+    def of(cls, figures: Mapping[str, Any], *, route: str = "") -> Certificate:
+        """Return the certificate of figures without limits; one that is a certificate stays."""
+        if isinstance(figures, Certificate):
+            return figures
+        return cls(tuple(Verified(str(what), float(one), route) for what, one in figures.items()))
+
+    @property
+    def holds(self) -> bool:
+        """Whether all limits are kept."""
+        return all(check.holds is not False for check in self.checks)
+
+    def __getitem__(self, what: str) -> float:
+        """Return the figure of a check; KeyError where there is no such check."""
+        return {check.what: check.figure for check in self.checks}[what]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over what was checked."""
+        return (check.what for check in self.checks)
+
+    def __len__(self) -> int:
+        """Return the number of checks."""
+        return len(self.checks)
+
+    def __or__(self, other: Mapping[str, float]) -> Certificate:
+        """Return the checks of both; those of the other replace checks of the same thing."""
+        return Certificate((*self.checks, *Certificate.of(other).checks))
+
+    def __ror__(self, other: Mapping[str, float]) -> Certificate:
+        """Return the checks of both, for a mapping of figures on the left."""
+        return Certificate.of(other) | self
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__}: {one_line(self._fields())}>"
+        """Return a table of the checks."""
+        lines = aligned(["checked", "figure", "limit", "route"], (c.row for c in self.checks))
+        return "\n".join(["<Certificate", *(f"  {line}" for line in lines)]) + ">"
+
+
+def as_certificate(value: Any, name: str) -> Certificate:
+    """Return a certificate, from one or from a mapping of figures."""
+    return Certificate.of(value or {})
 
 
 def stability_name(sampled: Any) -> str:
@@ -27,6 +134,11 @@ def stability(poles: ComplexArray, sampled: Any) -> float:
     """Return that number of poles: a loop is stable below 1 (sampled) or 0."""
     size = np.abs(poles) if sampled else poles.real
     return float(np.max(size, initial=0.0 if sampled else -np.inf))
+
+
+def stability_check(least: float, sampled: Any, of: str = "") -> Verified:
+    """Return the check of a loop's stability, by its poles."""
+    return Verified(stability_name(sampled) + of, least, "poles", 1.0 if sampled else 0.0)
 
 
 def one_line(found: Mapping[str, Any]) -> str:

@@ -126,10 +126,10 @@ def test_closed_form_error_is_the_prediction(kind):
     channels = [name for name in plant.z if not name.endswith((":error", ":effort"))]
     predicted = np.array([estimator.rms(name) for name in channels])
     np.testing.assert_allclose(np.sqrt(variance), predicted, rtol=1e-6)
-    assert estimator.certificate.difference < 1e-9
-    assert estimator.certificate.residual < 1e-11
+    assert estimator.certificate["difference"] < 1e-9
+    assert estimator.certificate["residual"] < 1e-11
     radius = np.abs(np.linalg.eigvals(estimator.system.A)).max()
-    assert estimator.certificate.spectral_radius == pytest.approx(radius, rel=1e-6)
+    assert estimator.certificate["spectral radius"] == pytest.approx(radius, rel=1e-6)
     assert radius < 1
 
 

@@ -87,7 +87,7 @@ def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_evaluation_model():
     shares = []
     for given in (plant.replace(evaluation=coarse), plant.replace(evaluation=modes), small):
         with pytest.warns(FlexplantWarning, match="evaluation= of a finer mesh"):
-            shares.append(design_kalman(given).certificate.unresolved)
+            shares.append(design_kalman(given).certificate["unresolved share"])
     assert shares == pytest.approx([shares[0]] * 3, abs=0.1)
 
 
@@ -98,9 +98,9 @@ def test_a_mesh_that_is_too_coarse_is_warned_of_and_one_that_is_fine_is_not():
     with pytest.warns(FlexplantWarning, match="evaluation= of a finer mesh"):
         wrong = design_kalman(sampled(solve_modes(coarse, count=24)).replace(evaluation=coarse))
     assert wrong.rms("die") > 1.25 * wrong.rms("die", on=truth)
-    assert wrong.certificate.unresolved > 0.5 and "nodes of the mesh" in repr(wrong)
+    assert wrong.certificate["unresolved share"] > 0.5 and "nodes of the mesh" in repr(wrong)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         right = design_kalman(sampled(solve_modes(fine, count=24)).replace(evaluation=fine))
     assert right.rms("die") == pytest.approx(right.rms("die", on=truth), rel=0.05, abs=0)
-    assert right.certificate.unresolved < 0.15 and "nodes" not in repr(right)
+    assert right.certificate["unresolved share"] < 0.15 and "nodes" not in repr(right)

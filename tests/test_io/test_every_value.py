@@ -175,7 +175,7 @@ def made():
     yield from (loss, placement.Penalised(loss, placement.LeftOutModes(), 0.5))
     yield from (placement.SensorIndices("hinf"), placement.ActuatorIndices("hankel"))
     yield from (placement.ModeInformation(), placement.AutoMac(), placement.KineticEnergy(fe))
-    yield from (placement.ClosedLoopH2("die"), placement.HinfLevel({"die:z": 1e6}))
+    yield placement.ClosedLoopH2("die")
     yield placement.RowSelection(fx.reduction.PivotedQr())
     yield from (placement.OverMachines(loss, [small]), placement.CountLimits(["a", "b"], at_most=1))
     yield placement.OverPositions(loss, 3, measure="mean")

@@ -44,7 +44,7 @@ def test_the_smallest_gamma_in_closed_form(G, least):
     assert least * (1 - 1e-9) < found.gamma < 1.001 * least
     assert brute(G, found.system) == pytest.approx(found.gamma, rel=1e-3)
     assert ncf_margin(G, found) == pytest.approx(1.0 / found.gamma, rel=1e-6)
-    assert found.certificate["smallest gamma by the Hankel norm"] == pytest.approx(least, rel=1e-6)
+    assert found.certificate["smallest gamma"] == pytest.approx(least, rel=1e-6)
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.2], ids=["continuous", "sampled"])

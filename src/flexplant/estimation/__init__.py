@@ -37,7 +37,6 @@ from .error import errors_on_machines as errors_on_machines
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_models import FilterModel as FilterModel
-from .filter_models import KalmanCertificate as KalmanCertificate
 from .filter_models import check_gain as check_gain
 from .invertible_inputs import InvertibilityReport as InvertibilityReport
 from .invertible_inputs import check_bias as check_bias
@@ -52,13 +51,11 @@ from .lag_report import StaticEstimator as StaticEstimator
 from .lag_report import design_static as design_static
 from .left_out_modes import LeftOut as LeftOut
 from .mode_changes import MovedModes as MovedModes
-from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate
 from .noise_from_records import NoiseLevels as NoiseLevels
 from .noise_from_records import estimate_noise as estimate_noise
 from .unknown_inputs import Augmented as Augmented
-from .unknown_inputs import InputCertificate as InputCertificate
 from .unknown_inputs import InputEstimator as InputEstimator
 from .unknown_inputs import Unbiased as Unbiased
 from .unknown_inputs import design_input_estimator as design_input_estimator

@@ -164,7 +164,7 @@ def offset(observer: KalmanEstimator, white: FloatArray, alpha: float) -> Offset
 
 def settling(observer: KalmanEstimator) -> int:
     """Return after how many samples an error of the filter has faded to a thousandth."""
-    radius = observer.certificate.spectral_radius
+    radius = observer.certificate["spectral radius"]
     return int(np.ceil(np.log(1e-3) / np.log(radius))) if 0 < radius < 1 else 1
 
 

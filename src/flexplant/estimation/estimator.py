@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray, positive, real_array
+from ..certificates import Certificate
 from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
@@ -18,7 +19,7 @@ from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
-from .filter_models import FilterModel, KalmanCertificate, Sight, filter_model
+from .filter_models import LEFT_OUT, UNRESOLVED, FilterModel, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
 from .left_out_modes import NODES, NOTED, LeftOut, beyond_text, left_out
 
@@ -46,7 +47,7 @@ class KalmanEstimator(PoiFilter):
         L, per sensor.
     covariance : (n, n) array
         Of the error of x[k|k], after the measurement, on the filter's own model.
-    certificate : KalmanCertificate
+    certificate : Certificate
     variances : (nz,) array [m^2 or rad^2]
         Predicted, of the errors at the POIs: on the plant with the modes left out where these are
         known.
@@ -66,24 +67,25 @@ class KalmanEstimator(PoiFilter):
     plant: AnyPlant
     gain: FloatArray
     covariance: FloatArray
-    certificate: KalmanCertificate
+    certificate: Certificate
     variances: FloatArray
     left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
-        beyond = beyond_text(self.plant, self.certificate.left_out)
-        share = self.certificate.unresolved
+        count = self.certificate.get(LEFT_OUT)
+        beyond = beyond_text(self.plant, None if count is None else int(count))
+        share = self.certificate.get(UNRESOLVED)
         if share is not None and share > NOTED:
             beyond += (
                 f";\n  up to {share:.0%} of a variance is from modes with fewer than {NODES:g} "
                 "nodes of the mesh a wavelength:\n  a finer evaluation model would change it"
             )
-        if self.certificate.difference > TYPED:
-            beyond += f";\n  variances hold to {self.certificate.difference:.0e}"
+        if self.certificate["difference"] > TYPED:
+            beyond += f";\n  variances hold to {self.certificate['difference']:.0e}"
         return (
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "
             f"{counted(len(self.sensors), 'sensor')}, "
-            f"spectral radius {self.certificate.spectral_radius:.6f}\n"
+            f"spectral radius {self.certificate['spectral radius']:.6f}\n"
             f"  rms error {self.rms_text} ({beyond})>"
         )
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, real_array
-from ..certificates import Certificate
+from ..certificates import Verified
 from ..errors import CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import difference_of, solve_stein, square_root
 from ..lti.sampling import reaches_at_once
@@ -317,42 +317,16 @@ class Steady:
 AGREEMENT, ROUNDED = 1e-6, 1e-2
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class KalmanCertificate(Certificate):
-    """What was checked about a Kalman filter after it was computed.
+#: what a certificate says of modes left out: how many there are, and the share of a variance from
+#: those with fewer than 4 nodes of the mesh per wavelength
+LEFT_OUT, UNRESOLVED = "modes left out", "unresolved share"
+#: the route of a residual
+RICCATI = "the Riccati equation, relative, in states of unit variance"
 
-    Parameters
-    ----------
-    spectral_radius : float
-        Of the estimation error, below 1.
-    residual : float
-        Of the Riccati equation, relative, in states of unit variance.
-    difference : float
-        Largest relative difference between two ways to the POI variances: on the filter's own
-        model the Riccati equation and a Stein equation of the gain, at most 1e-6 (1 % where noise
-        is so little that square roots were needed); on the plant with
-        the modes left out the joint Stein equation and its dual, at most 1 %, with what rounding of
-        hardly damped poles may change.
-    left_out : int, optional
-        How many modes left out are in the predicted error; None: none are known, truncation is not
-        in the number.
-    unresolved : float, optional
-        Largest share of a predicted variance that is from modes left out with fewer than 4 nodes
-        of the larger model's mesh per wavelength; None: its mesh is not known.
 
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.design_kalman(fx.testbeds.three_masses()).certificate
-    >>> round(found.spectral_radius, 4), found.difference < 1e-6
-    (0.9601, True)
-    """
-
-    spectral_radius: float
-    residual: float
-    difference: float
-    left_out: int | None = None
-    unresolved: float | None = None
+def difference_check(difference: float, limit: float = AGREEMENT) -> Verified:
+    """Return the check of two routes to the variances at the POIs."""
+    return Verified("difference", difference, "variances by a Stein equation of the gain", limit)
 
 
 def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:

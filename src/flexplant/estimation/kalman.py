@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray
+from ..certificates import Certificate, Verified, stability_check
 from ..errors import CertificateError, ModelError, SolverError
 from ..lti.lyapunov import dual_variances
 from ..lti.riccati import filter_dare, riccati_root
@@ -19,11 +20,15 @@ from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
 from .filter_models import (
+    AGREEMENT,
+    LEFT_OUT,
+    RICCATI,
     ROUNDED,
+    UNRESOLVED,
     FilterModel,
-    KalmanCertificate,
     agreement,
     check_noises,
+    difference_check,
     error_of,
     filter_model,
     filter_system,
@@ -99,17 +104,18 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
     observer = _observer(plant, found)
-    certificate = observer.certificate
-    if whole is None or found is None:
-        return observer.replace(
-            certificate=certificate.replace(left_out=None if whole is None else 0)
-        )
+    if whole is None:
+        return observer
+    if found is None:
+        return observer.replace(certificate=observer.certificate | {LEFT_OUT: 0.0})
     complete = error_variances(read_alike(plant, whole), observer.system)
-    certificate = certificate.replace(
-        difference=max(certificate.difference, complete.difference),
-        left_out=int(found.modes.size),
-        unresolved=unresolved_share(plant, whole, found.modes, observer.system, complete.values),
-    )
+    counted = {LEFT_OUT: float(found.modes.size)}
+    share = unresolved_share(plant, whole, found.modes, observer.system, complete.values)
+    if share is not None:
+        counted[UNRESOLVED] = share
+    certificate = observer.certificate | counted
+    if complete.difference > certificate["difference"]:
+        certificate |= Certificate((difference_check(complete.difference, ROUNDED),))
     return observer.replace(certificate=certificate, variances=complete.values)
 
 
@@ -130,9 +136,8 @@ def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     design = filter_design(model)
     own = plant if found is None else found.plant
     system = filter_system(own, model, design.K, design.L_z, "kalman")
-    certificate = KalmanCertificate(design.radius, design.residual, design.difference)
     return KalmanEstimator(
-        system, plant, design.gain, design.covariance, certificate, design.variances, found
+        system, plant, design.gain, design.covariance, design.certificate, design.variances, found
     )
 
 
@@ -147,6 +152,16 @@ class FilterDesign(NamedTuple):
     radius: float
     residual: float
     difference: float
+    allowed: float = AGREEMENT
+
+    @property
+    def certificate(self) -> Certificate:
+        """What was checked."""
+        checks = (
+            stability_check(self.radius, sampled=True),
+            Verified("residual", self.residual, RICCATI),
+        )
+        return Certificate((*checks, difference_check(self.difference, self.allowed)))
 
 
 def filter_design(model: FilterModel) -> FilterDesign:
@@ -197,4 +212,6 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
     ) + np.sum((poi_rows @ H) ** 2, axis=1)
     difference = agreement(variances, truth, ROUNDED)
     L_z = poi_rows + found.weighed(model.N)
-    return FilterDesign(gain, found.K, L_z, covariance, variances, radius, found.change, difference)
+    return FilterDesign(
+        gain, found.K, L_z, covariance, variances, radius, found.change, difference, ROUNDED
+    )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray, real_array, whole
-from ..certificates import Certificate
+from ..certificates import Certificate, Verified, stability_check
 from ..errors import (
     CertificateError,
     LabelError,
@@ -30,6 +30,7 @@ from ..words import instance, sizes_of
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
 from .filter_models import (
     AGREEMENT,
+    RICCATI,
     FilterModel,
     check_noises,
     filter_gains,
@@ -40,33 +41,6 @@ from .left_out_modes import LeftOut, beyond_text, left_out
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class PeriodicCertificate(Certificate):
-    """What was checked about a periodic filter after it was computed.
-
-    Parameters
-    ----------
-    spectral_radius : float
-        Of the estimation error over one period, below 1.
-    residual : float
-        Of the lifted Riccati equation, relative.
-    difference : float
-        Largest relative difference between the variances at the start of a period, from the
-        lifted equation, and those after one period of the recursion that it does not contain.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.estimation.design_multirate(fx.testbeds.three_masses(), {"y2": 2})
-    >>> found.certificate.spectral_radius < 1
-    True
-    """
-
-    spectral_radius: float
-    residual: float
-    difference: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,7 +63,7 @@ class PeriodicEstimator(Value):
         L_z of ``hat = C1 x[k|k-1] + D1 u + L_z e``.
     variances : (period, nz) array [m^2 or rad^2]
         Of the errors at the POIs in each sample of a period.
-    certificate : PeriodicCertificate
+    certificate : Certificate
     left_out : LeftOut, optional
         The modes of the evaluation model that the plant lacks: white noise on sensors and POIs.
     """
@@ -101,7 +75,7 @@ class PeriodicEstimator(Value):
     predictor_gains: FloatArray
     poi_gains: FloatArray
     variances: FloatArray
-    certificate: PeriodicCertificate
+    certificate: Certificate
     left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
@@ -246,7 +220,13 @@ def design_multirate(
     known = first > TINY
     difference = float(np.max(np.abs(P.diagonal() - first)[known] / first[known], initial=0.0))
     radius = float(np.max(np.abs(np.linalg.eigvals(moved)), initial=0.0))
-    if radius >= 1 or not difference <= AGREEMENT:
+    stable = stability_check(radius, sampled=True, of=" over a period")
+    repeated = Verified(
+        "difference", difference, "variances after one period of the recursion", AGREEMENT
+    )
+    solved = Verified("residual", solution.residual, RICCATI)
+    certificate = Certificate((stable, solved, repeated))
+    if not certificate.holds:
         raise CertificateError(
             f"one period of the recursion changes the variances by {difference:.1e} (allowed "
             f"{AGREEMENT:.0e}), spectral radius {radius:.9f}. The filter cannot be trusted. Choose "
@@ -260,7 +240,7 @@ def design_multirate(
         np.array(predictors),
         np.array(shown),
         np.array(variances),
-        PeriodicCertificate(radius, solution.residual, difference),
+        certificate,
         found,
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import FloatArray, positive
-from ..certificates import Certificate
+from ..certificates import Certificate, Verified, stability_check
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
@@ -27,6 +27,7 @@ from .filter_models import (
     AGREEMENT,
     FilterModel,
     check_noises,
+    difference_check,
     filter_model,
     filter_system,
     noise_root,
@@ -303,7 +304,7 @@ def _augmented(
             f"no filter holds {', '.join(found.inputs)} as states: {error} The condition without "
             f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
         ) from error
-    certificate = InputCertificate(design.radius, 0.0, design.difference)
+    certificate = _certificate(design.radius, 0.0, design.difference)
     return _InputDesign(larger, design.K, design.L_z, design.variances, certificate)
 
 
@@ -312,7 +313,7 @@ class _InputDesign(NamedTuple):
     K: FloatArray
     L: FloatArray
     variances: FloatArray
-    certificate: InputCertificate
+    certificate: Certificate
     late: bool = False
 
 
@@ -322,17 +323,25 @@ def _input_design(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArr
     both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
     difference = float(np.max(np.abs(both[0] - both[1]) / divisor(both[1])))
     radius = float(np.max(np.abs(np.linalg.eigvals(g.closed)), initial=0.0))
-    certificate = InputCertificate(radius, g.bias, difference)
+    certificate = _certificate(radius, g.bias, difference)
     return _InputDesign(m, g.K, g.L, both[1], certificate, g.late)
 
 
-def _check_certificate(found: InputCertificate) -> None:
-    if found.spectral_radius >= 1 or max(found.bias, found.difference) > AGREEMENT:
+def _certificate(radius: float, bias: float, difference: float) -> Certificate:
+    """Return what was checked: stability, what of an input enters the errors, the variances."""
+    stable, differing = stability_check(radius, sampled=True), difference_check(difference)
+    return Certificate(
+        (stable, Verified("bias", bias, "M F - I and G - L F", AGREEMENT), differing)
+    )
+
+
+def _check_certificate(found: Certificate) -> None:
+    if not found.holds:
         raise CertificateError(
             f"the estimator of unknown inputs fails its check: spectral radius "
-            f"{found.spectral_radius:.9f}, bias {found.bias:.1e}, variances differ by "
-            f"{found.difference:.1e} (allowed {AGREEMENT:.0e}). The sensors hardly determine the "
-            "inputs. Add a sensor, or use estimation.Augmented(drift=...)."
+            f"{found['spectral radius']:.9f}, bias {found['bias']:.1e}, variances differ by "
+            f"{found['difference']:.1e} (allowed {AGREEMENT:.0e}). The sensors hardly determine "
+            "the inputs. Add a sensor, or use estimation.Augmented(drift=...)."
         )
 
 
@@ -367,36 +376,6 @@ def _bias(M: FloatArray, F: FloatArray, L: FloatArray, G: FloatArray) -> float:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InputCertificate(Certificate):
-    """What was checked about an estimator of unknown inputs after it was computed.
-
-    Parameters
-    ----------
-    spectral_radius : float
-        Of the estimation error, below 1.
-    bias : float
-        How much of an unknown input enters the errors, relative: the largest entry of
-        ``M F - I`` and of ``(G - L F)`` beside G; 0 when inputs are assumed to be random walks.
-    difference : float
-        Largest relative difference between the variances with the P that the gains were computed
-        from and those with the P of the gains' own Stein equation, at most 1e-6.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> method = fx.estimation.Augmented(drift=1.0)
-    >>> found = fx.estimation.design_input_estimator(plant, ["amp"], method)
-    >>> found.certificate.spectral_radius < 1
-    True
-    """
-
-    spectral_radius: float
-    bias: float
-    difference: float
-
-
-@dataclass(frozen=True, eq=False, repr=False)
 class InputEstimator(Value):
     """A stationary filter of the motions at the POIs and of unknown inputs d.
 
@@ -416,7 +395,7 @@ class InputEstimator(Value):
         Of the errors of the inputs.
     invertibility : InvertibilityReport
         Whether the sensors determine the inputs without any assumption of them.
-    certificate : InputCertificate
+    certificate : Certificate
     left_out : int, optional
         Number of modes of the evaluation model that the plant lacks: they are in `variances`.
     """
@@ -428,7 +407,7 @@ class InputEstimator(Value):
     variances: FloatArray
     input_variances: FloatArray
     invertibility: InvertibilityReport
-    certificate: InputCertificate
+    certificate: Certificate
     left_out: int | None = None
 
     def __repr__(self) -> str:
@@ -438,7 +417,7 @@ class InputEstimator(Value):
         return (
             f"<InputEstimator: {counted(self.system.n_states, 'state')}, inputs {late}, spectral "
             "radius "
-            f"{self.certificate.spectral_radius:.6f}\n  rms error {rms} "
+            f"{self.certificate['spectral radius']:.6f}\n  rms error {rms} "
             f"({beyond_text(self.plant, self.left_out)})>"
         )
 

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray, whole
+from ..certificates import Certificate, Verified
 from ..errors import LabelError, ModelError, counted, warn
 from ..labels import DofSet
 from ..modes import Modes
@@ -101,13 +102,15 @@ def structural_modes(
     A, G, fast = at.smooth(beside)
     body = at.rigid(A, dofs, rows) if free else np.zeros((len(labels), 0))
     residual = at.residual(G, fast)
-    certificate = {"imaginary": imaginary}
+    certificate = Certificate.of({"imaginary": imaginary}, route="imaginary parts of the shapes")
     columns = [body, shapes.real, np.hstack([beside.shapes.real, residual])]
     place = dofs
     if over is not None:
         E = expansion(over, rows)
         left = np.linalg.norm(columns[1] - E[rows] @ columns[1], axis=0)
-        certificate["expansion"] = float(np.max(left / np.linalg.norm(columns[1], axis=0)))
+        worst = float(np.max(left / np.linalg.norm(columns[1], axis=0)))
+        check = Verified("expansion", worst, "least squares of the shapes", MISSED)
+        certificate |= Certificate((check,))
         columns = [E @ one for one in columns]
     else:
         place = dofs.select(labels)

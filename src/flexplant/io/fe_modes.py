@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
+from ..certificates import Certificate
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
@@ -234,7 +235,8 @@ def read_modes(
     if matrices is None:
         return modes
     instance(matrices, FEMatrices | FEModel, "matrices", "read_matrices(...) reads them.")
-    return modes.replace(certificate={"mass": _with_mass(modes, matrices, str(path))})
+    found = {"mass": _with_mass(modes, matrices, str(path))}
+    return modes.replace(certificate=Certificate.of(found, route="phi^T M phi - I"))
 
 
 def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float:

@@ -25,7 +25,7 @@ from .component import JoinedShape as JoinedShape
 from .component import PlacedShape as PlacedShape
 from .component import Pose as Pose
 from .frf_coupling import uncoupled as uncoupled
-from .join import JoiningCertificate as JoiningCertificate
+from .join import JoiningReport as JoiningReport
 from .join import joined as joined
 from .joint import Joint as Joint
 from .joint import Patch as Patch

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from ..arrays import FloatArray, IntArray
+from ..certificates import Certificate, Verified
 from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
@@ -258,9 +259,7 @@ class JoinedMachine:
         names, dofs = zip(*((part.name, part.dofs) for part in self.parts), strict=True)
         return JoinedShape(names, dofs, expansion, motions)
 
-    def model(
-        self, motions: FloatArray, certificate: JoiningCertificate, name: str | None
-    ) -> FEModel:
+    def model(self, motions: FloatArray, certificate: JoiningReport, name: str | None) -> FEModel:
         """Return the machine of models."""
         T, held = self.done.T, None
         if any(part.model.held_inertia is not None for part in self.parts):
@@ -278,7 +277,7 @@ class JoinedMachine:
         )
 
     def reduced_model(
-        self, motions: FloatArray, rigid: FloatArray, certificate: JoiningCertificate
+        self, motions: FloatArray, rigid: FloatArray, certificate: JoiningReport
     ) -> ReducedModel:
         """Return the machine of which some components are reduced."""
         kept, reduced = self.done.kept, [part for part in self.parts if part.is_reduced]
@@ -355,7 +354,7 @@ class JoinedMachine:
 
     def certified(
         self, rigid: FloatArray, expected: int, patches: Mapping[str, float]
-    ) -> JoiningCertificate:
+    ) -> JoiningReport:
         """Return the checks of the machine."""
         both: Any = abs(self.B @ self.done.T), abs(self.B) @ abs(self.done.T)
         opening, most = (part.max(axis=1).toarray().ravel() for part in both)
@@ -369,7 +368,7 @@ class JoinedMachine:
             moved = np.any(rigid[np.isin(owner, group)] != 0, axis=0)
             names = ", ".join(self.parts[i].name for i in group)
             pieces[names] = int(np.count_nonzero(moved))
-        found = JoiningCertificate(
+        found = JoiningReport(
             gap=gap,
             balance=float(max((part for _, part in felt), default=0.0)),
             mass=float(max(np.diag(apart)[:3])) or float("nan"),
@@ -382,7 +381,8 @@ class JoinedMachine:
             rigid_force=_force(self.matrices["K"], rigid),
             patches=patches,
         )
-        if not max(gap, balance, error, found.rigid_force) < _LIMIT:
+        # springs may carry a resultant, rigid joints may not
+        if balance > _LIMIT or not found.certificate.holds:
             raise CertificateError(
                 f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer "
                 "axes, or look for joints that nearly repeat each other."
@@ -479,7 +479,7 @@ def compliances(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JoiningCertificate(Value):
+class JoiningReport(Value):
     """What `joined` checked.
 
     Parameters
@@ -532,6 +532,18 @@ class JoiningCertificate(Value):
     rigid_force: float
     patches: Mapping[str, float]
 
+    @property
+    def certificate(self) -> Certificate:
+        """What the machine keeps, each relative to what cancels."""
+        return Certificate(
+            (
+                Verified("gap", self.gap, "opening of the rigid joints", _LIMIT),
+                Verified("inertia", self.inertia_error, "sum over the components", _LIMIT),
+                Verified("rigid force", self.rigid_force, "K times rigid-body motions", _LIMIT),
+                Verified("balance", self.balance, "resultants between components"),
+            )
+        )
+
     def __repr__(self) -> str:
         before = ", ".join(f"{name} {count}" for name, count in self.rigid.items())
         pieces = "one piece"
@@ -542,6 +554,6 @@ class JoiningCertificate(Value):
         errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
         errors += f", rigid force {self.rigid_force:.1g}"
         head = f"{counted(self.n_rigid, 'rigid-body motion')} (alone: {before}), {pieces}"
-        text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
+        text = [f"<JoiningReport: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
         text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
         return "\n".join(text) + ">"

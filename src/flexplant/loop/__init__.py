@@ -25,6 +25,8 @@ gain L (a system or a measured `fx.Frf`), of ``(plant, controller)`` or of a clo
 ``loopsens``: `sensitivity` and its like.
 """
 
+from ..certificates import Certificate as Certificate
+from ..certificates import Verified as Verified
 from ..rooms import public_names as _public_names
 from .budget import ErrorBudget as ErrorBudget
 from .budget import Spectrum as Spectrum

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, real_array
+from ..certificates import Certificate
 from ..errors import (
     AssumptionError,
     CertificateError,
@@ -57,7 +58,7 @@ class ErrorBudget(Value):
     left_out : float [unit]
         The rms on the plant with the modes left out; NaN where these are not known, infinite where
         the loop is unstable with them.
-    certificate : mapping {str: float}
+    certificate : Certificate
         Relative differences of the variance computed in other ways.
 
     Examples
@@ -78,7 +79,7 @@ class ErrorBudget(Value):
     freq: FloatArray
     cumulative: FloatArray
     left_out: float
-    certificate: Mapping[str, float]
+    certificate: Certificate
 
     def __getitem__(self, source: str) -> float:
         """Return the rms that one source causes."""
@@ -178,10 +179,10 @@ def error_budget(
         names.append(RESIDUE)
         variances = np.append(variances, float(np.mean(part**2)))
         cumulative = np.vstack([cumulative, stairs])
-    certificate = {
-        "by both Lyapunov equations": between,
-        "by the integral of the spectrum": integral,
-    }
+    certificate = Certificate.of(
+        {"by both Lyapunov equations": between, "by the integral of the spectrum": integral},
+        route="the variance computed again, relative difference",
+    )
     unit = monitored.units.get(channel, "")
     return ErrorBudget(
         channel, unit, tuple(names), variances, freq, cumulative, left_out, certificate

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import FloatArray, IntArray, floats, positive, real_array, whole
-from ..certificates import one_line, stability_name
+from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
 from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
@@ -101,12 +101,11 @@ class SpillOver(Value):
         return self.stability
 
     @property
-    def certificate(self) -> dict[str, float]:
-        """The numbers, named for a certificate."""
-        return {
-            f"{self._measure} with modes left out": self.stability,
-            "modulus margin with modes left out": self.modulus_margin,
-        }
+    def certificate(self) -> Certificate:
+        """What was verified on the plant with the modes left out."""
+        beyond = " with modes left out"
+        margin = Verified(f"modulus margin{beyond}", self.modulus_margin, "a sweep of |1 + L|")
+        return Certificate((stability_check(self.stability, self.sampled, of=beyond), margin))
 
     @property
     def _measure(self) -> str:
@@ -334,7 +333,7 @@ class ModeTolerances(Value):
         )
 
     @property
-    def certificate(self) -> dict[str, float]:
+    def certificate(self) -> Certificate:
         """What the mode that is nearest to what is known of it holds to, and the draws."""
         found: dict[str, float] = {}
         if self.modes.size:
@@ -348,7 +347,7 @@ class ModeTolerances(Value):
                     found[f"{name} known to"] = float(self.known[worst])
         if self.draws is not None:
             found |= {"stable of draws": self.draws.stable, "margin kept of draws": self.draws.kept}
-        return found
+        return Certificate.of(found, route="the loop closed on changed machines")
 
     def warn_of_critical(self) -> None:
         """Warn of modes that hold to less than twice what is known of them."""

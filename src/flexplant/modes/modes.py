@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -18,6 +18,7 @@ from ..arrays import (
     real_array,
     real_or_complex,
 )
+from ..certificates import Certificate, as_certificate
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..labels import DofSet, Place
 from ..store import Value, checked
@@ -253,7 +254,7 @@ class Modes(Placed, Value):
         ``eps |phi|^T |K| |phi| / (2 omega^2)`` of each mode (rigid-body ones: 0): the relative
         error of its frequency when the entries of K are rounded to double precision, which no
         solver can undo; empty where it is not known.
-    certificate : mapping
+    certificate : Certificate
         What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I),
         `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
         `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
@@ -293,7 +294,7 @@ class Modes(Placed, Value):
     vector_dofs: Sequence[str] = ()
     residual: FloatArray = field(default_factory=_nothing)
     rounding: FloatArray = field(default_factory=_nothing)
-    certificate: Mapping[str, float] = field(default_factory=dict)
+    certificate: Certificate = field(default_factory=Certificate)
     notes: Sequence[str] = ()
     calibration: Value | None = None
 
@@ -323,10 +324,7 @@ class Modes(Placed, Value):
             vectors=real_array(self.vectors if m else np.zeros((n, 0)), "vectors", (n, m)),
             residual=real_array(self.residual, "residual", (k if np.size(self.residual) else 0,)),
             rounding=real_array(self.rounding, "rounding", (k if np.size(self.rounding) else 0,)),
-            certificate={
-                str(name): float(real_array(value, f"certificate {name}", ()))
-                for name, value in self.certificate.items()
-            },
+            certificate=as_certificate(self.certificate, "certificate"),
             notes=tuple(str(note) for note in self.notes),
         )
 
@@ -460,7 +458,12 @@ class Modes(Placed, Value):
         omega, zeta = self.omega.copy(), self.zeta.copy()
         omega[places], zeta[places] = np.abs(poles), -poles.real / np.abs(poles)
         return self.replace(
-            omega=omega, zeta=zeta, certificate={}, residual=(), rounding=(), calibration=measured
+            omega=omega,
+            zeta=zeta,
+            certificate=Certificate(),
+            residual=(),
+            rounding=(),
+            calibration=measured,
         )
 
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:

@@ -11,6 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..arrays import ComplexArray, FloatArray, positive
+from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted, short, warn
 from ..labels import Place
 from ..parallel import Progress
@@ -148,11 +149,16 @@ def solve_modes(
         factored = stiffness_factor(model, factor) if at and is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
     orthonormality, residual, rounding = check_modes(model, omega, phi)
-    certificate["orthonormality"] = orthonormality
+    certificate |= Certificate(
+        (Verified("orthonormality", orthonormality, "phi^T M phi - I", _ORTHONORMAL),)
+    )
     if model.rigid_body.shape[1]:
-        certificate["rigid_residual"] = rigid_residual(model)
         held = float(rounding_of(model.K, model.rigid_body).max())
-        certificate["rigid_rounding"] = float(np.sqrt(held) / (2 * np.pi))
+        rigid = {
+            "rigid_residual": rigid_residual(model),
+            "rigid_rounding": float(np.sqrt(held) / (2 * np.pi)),
+        }
+        certificate |= Certificate.of(rigid, route="K times the rigid-body motions")
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _coupled_modes(model, phi, kept, top, names, factor)
     inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
@@ -244,10 +250,10 @@ def _vector_zeta(
 
 def _undamped(
     model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
-) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+) -> tuple[FloatArray, FloatArray, Certificate]:
     rigid = model.rigid_body
     n, r = rigid.shape
-    certificate: dict[str, float] = {}
+    certificate = Certificate()
     if np.isfinite(top) and DENSE_LIMIT < n <= _DENSE_MANY and is_large(model):
         # how many there are decides whether a dense solution is faster
         count = min(count, max(modes_below(model, top), r))
@@ -438,7 +444,7 @@ def damped_modes(
                     model.dofs,
                     n_rigid=r,
                     residual=_RESIDUAL[0] * part[: keep.size],
-                    certificate={"basis": V.shape[1]},
+                    certificate=Certificate.of({"basis": float(V.shape[1])}),
                 ),
                 top,
             )

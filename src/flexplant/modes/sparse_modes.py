@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import FloatArray, IntArray, Matrix
+from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
 from ..seeds import Rng
@@ -53,7 +54,7 @@ _JUDGED = 8
 @one_thread()
 def counted_modes(
     model: FEModel, count: int, top: float = np.inf, method: Pardiso | Cholmod | None = None
-) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+) -> tuple[FloatArray, FloatArray, Certificate]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
     # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
     # beside
@@ -132,12 +133,15 @@ def counted_modes(
     )
 
 
-def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
-    return {
-        "shift": float(np.sqrt(shift) / (2 * np.pi)),
-        "counted": float(counted),
-        "found": float(found),
-    }
+def _certificate(shift: float, counted: int, found: int) -> Certificate:
+    """Return how many modes there are below a frequency, by the signs of a factor (Sylvester)."""
+    return Certificate(
+        (
+            Verified("shift", float(np.sqrt(shift) / (2 * np.pi)), "frequency [Hz] of the count"),
+            Verified("counted", float(counted), "signs of the factor of K - shift M"),
+            Verified("found", float(found), "", float(counted), at_least=True),
+        )
+    )
 
 
 def _merge_modes(

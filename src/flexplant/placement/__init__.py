@@ -29,7 +29,6 @@ from .branch_and_bound import Exchange as Exchange
 from .branch_and_bound import Screened as Screened
 from .candidates import PlantChannel as PlantChannel
 from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
-from .closed_loop_h2 import HinfLevel as HinfLevel
 from .closed_loop_h2 import PoiLqr as PoiLqr
 from .constraints import Budget as Budget
 from .constraints import Constraint as Constraint

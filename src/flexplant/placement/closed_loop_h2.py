@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +16,9 @@ from ..estimation.estimator_channels import sensors
 from ..lti.lyapunov import solve_stein, square_root
 from ..lti.riccati import control_dare
 from ..lti.sampling import held_exactly
-from ..lti.statespace import StateSpace, as_statespace
+from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import checked
-from ..synthesis import design_hinf
-from ..words import mapping
 from .candidates import Port, side_of
 from .convex import Quadratic, chosen_rows, measured, quadratic
 from .criterion import AGREEMENT, Criterion, Scorer
@@ -163,9 +160,6 @@ class PoiLqr(MotionAndEffort):
                 f"{error} The effort of {self.effort:g} m/N may be too small to distinguish gains: "
                 "try a larger one."
             ) from error
-
-
-_WEIGHTS = "Type HinfLevel(z={'die:z': 1e9}, w={'amp1': 1e-3})."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -361,49 +355,3 @@ def of_actuators(p: Separation) -> Quadratic:
     constant = float(np.einsum("ij,jk,ik->", p.rows, p.ahead(P), p.rows) + np.sum(seen**2))
     H = p.rows.T @ p.rows
     return quadratic(p.A, H, innovations @ p.A.T, p.actuators, constant=constant)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class HinfLevel(Criterion):
-    """Least H-infinity norm of the weighted plant over all controllers, for sensors and actuators.
-
-    A synthesis per layout, by bisection: seconds, not milliseconds. Score the best few by another
-    criterion with `score_sensors(plant, layouts, HinfLevel(...))`.
-
-    Parameters
-    ----------
-    z, w : mapping {channel: weight}
-        Weights of motions and disturbances, numbers or systems, as for `plant.weighted`.
-    effort : float
-        Weight of the effort of each actuator, whichever is chosen.
-    noise : float
-        Weight of the noise of each sensor.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> level = fx.placement.HinfLevel(z={"die:x": 1e6}, w={"amp": 1.0}, effort=0.1, noise=1e-9)
-    >>> level.effort, level.noise
-    (0.1, 1e-09)
-    """
-
-    z: Mapping[str, Any] = field(default_factory=dict, metadata=checked(mapping, hint=_WEIGHTS))
-    w: Mapping[str, Any] = field(default_factory=dict, metadata=checked(mapping, hint=_WEIGHTS))
-    effort: float = field(default=1.0, kw_only=True, metadata=checked(positive))
-    noise: float = field(default=1.0, kw_only=True, metadata=checked(positive))
-
-    def __call__(self, plant: StandardPlant) -> float:
-        """Return the level that was reached and verified on a plant.
-
-        Channels of w and z that are not weighted, nor noise or effort, do not count.
-        """
-        z = {name: self.z.get(name) for name in plant.z}
-        w = {name: self.w.get(name) for name in plant.w}
-        z |= {name: self.effort for name in z if name.endswith(":effort")}
-        w |= {name: self.noise for name in w if name.endswith(":noise")}
-        # a reference that is not weighted is zero in y: D21 would lack rank
-        read = [name for name in plant.y if w.get(name, 1.0) is not None]
-        rows = as_statespace(np.eye(len(read))).replace(inputs=read, outputs=read)
-        level = design_hinf(plant.weighted(z=z, w=w).through(rows)).gamma
-        return np.inf if level is None else level

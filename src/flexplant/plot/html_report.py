@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..certificates import Certificate, figure, one_line, stability_name
+from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
 from ..errors import FlexplantError, ModelError, counted, short
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
@@ -23,7 +23,6 @@ from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
-from ..placement.criterion import in_words
 from ..plant import AnyPlant, StandardPlant, driven_axes
 from ..plant.evaluation_model import NOT_JUDGED
 from ..reduction import ReducedModel
@@ -58,17 +57,6 @@ _HEADINGS = {
 _CHANNELS = 9
 #: parameters of an update that are drawn, each by itself
 _PARAMETERS = 6
-
-#: what numbers of a Kalman filter's certificate are, where their names alone do not say it
-_WORDS = {
-    "difference": "difference between two ways to the variances",
-    "left_out": "modes left out, counted as noise",
-    "unresolved": "share of a variance from modes the mesh hardly resolves",
-    "residual": "residual of the equation that was solved, relative",
-    "orthonormality": "shapes less orthonormal in the mass matrix",
-    "rigid_residual": "force that rigid-body motions take, relative",
-    "rigid_rounding": "what rounding could hide of rigid-body frequencies, Hz",
-}
 
 Picture = tuple[str, Callable[[], Any]]
 
@@ -213,36 +201,33 @@ def _ports_table(plant: StandardPlant) -> str:
 
 def certificates(design: Design) -> Chapter | None:
     """Return the section of all that was verified after it was computed."""
-    rows = []
-    for name, value in design.named.items():
-        for what, number in _certificate_lines(value):
-            plain = _WORDS.get(what, what.replace("_", " "))
-            rows.append([name, plain, figure(what, number)])
+    rows = [
+        [name, *check.row] for name, value in design.named.items() for check in _checks_of(value)
+    ]
     if not rows:
         return None
-    return Chapter("Certificates", table(["value", "verified by another computation", ""], rows))
+    return Chapter("Certificates", table(["value", "checked", "figure", "limit", "route"], rows))
 
 
-def _certificate_lines(value: Any) -> Iterator[tuple[str, Any]]:
+def _checks_of(value: Any) -> Iterator[Verified]:
     own = getattr(value, "certificate", None)
     if isinstance(own, Certificate):
-        own = {n: v for n, v in own._fields().items() if v is not None}
-    if isinstance(own, Mapping):
-        yield from own.items()
+        yield from own.checks
     if isinstance(value, ClosedLoop):
-        if value.plant.dt:
-            yield "spectral radius", value.spectral_radius
-        else:
-            yield "largest real part", value.spectral_abscissa
-        yield "modulus margin", value.modulus_margin
+        sampled = bool(value.plant.dt)
+        least = value.spectral_radius if sampled else value.spectral_abscissa
+        yield stability_check(least, sampled)
+        yield Verified("modulus margin", value.modulus_margin, "a sweep of |1 + L|")
         if value.left_out is not None:
-            yield from value.left_out.certificate.items()
+            yield from value.left_out.certificate.checks
     if isinstance(value, UpdateResult) and value.chi2 is not None:
-        yield "chi-square of the fit", value.chi2
-        yield "its degrees of freedom", value.dof
+        yield Verified("chi-square of the fit", value.chi2, "residuals over their covariance")
+        yield Verified("degrees of freedom", float(value.dof))
     if isinstance(value, Placement):
-        yield "value", in_words(value.value, value.unit)
-        yield "no choice is below", in_words(value.bound, value.unit)
+        what = f"value [{value.unit}]" if value.unit else "value"
+        yield Verified(
+            what, value.value, "no choice is below the limit", value.bound, at_least=True
+        )
 
 
 Tile = tuple[str, str, str, str]

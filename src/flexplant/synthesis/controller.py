@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ..arrays import FloatArray
-from ..certificates import one_line, stability, stability_name
+from ..certificates import (
+    Certificate,
+    Verified,
+    as_certificate,
+    one_line,
+    stability,
+    stability_check,
+    stability_name,
+)
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
@@ -19,7 +27,7 @@ from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..store import Value
+from ..store import Value, checked
 from .preparation import Prepared
 
 
@@ -37,7 +45,7 @@ class Controller(Value):
         The norm that its closed loop was verified to stay below: H-infinity, of `design_h2` the H2.
     lower : float, optional
         A bound from below on what controllers reach; see the method for its conditions.
-    certificate : mapping {str: float}
+    certificate : Certificate
         Numbers computed after the design by another computation.
     reached : mapping {str: float}
         Of a weighted design: the norm from each group of w to each group of z, beside 1, which
@@ -67,7 +75,7 @@ class Controller(Value):
     method: str
     gamma: float | None = None
     lower: float | None = None
-    certificate: Mapping[str, float] | None = None
+    certificate: Certificate = field(default_factory=Certificate, metadata=checked(as_certificate))
     reached: Mapping[str, float] | None = None
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
@@ -76,11 +84,9 @@ class Controller(Value):
     tolerances: ModeTolerances | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._set(
-            certificate=dict(self.certificate or {}),
-            reached=dict(self.reached or {}),
-            notes=tuple(self.notes),
-            tried=dict(self.tried or {}),
+            reached=dict(self.reached or {}), notes=tuple(self.notes), tried=dict(self.tried or {})
         )
 
     def to_control(self) -> Any:
@@ -92,7 +98,7 @@ class Controller(Value):
         if self.gamma is not None and self.lower is not None:
             gamma += f" (lower bound {self.lower:.4g})"
         lines = [f"<Controller {self.method}: {counted(self.system.n_states, 'state')}{gamma}>"]
-        if self.reached and not self.reached.keys() <= (self.certificate or {}).keys():
+        if self.reached and not self.reached.keys() <= self.certificate.keys():
             shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
             lines.append(f"  reached, of 1 that the weights require: {shown}")
         if self.certificate:
@@ -148,9 +154,7 @@ def required_stability(loop: StateSpace, cause: str = _SIGN) -> float:
     return least
 
 
-def certified_norm(
-    loop: StateSpace, claim: float, respond: Responder | None = None
-) -> dict[str, float]:
+def certified_norm(loop: StateSpace, claim: float, respond: Responder | None = None) -> Certificate:
     """Return what was verified of a closed loop: its norm by two routes, and its stability."""
     least = required_stability(loop)
     norm, _ = peak_gain(loop)
@@ -171,7 +175,16 @@ def certified_norm(
             f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
             "the controller is refused."
         )
-    return {"norm": norm, "swept norm": swept, stability_name(loop.dt): least, "claim": claim}
+    return Certificate(
+        (
+            Verified(
+                "norm", norm, "Hamiltonian eigenvalues of the closed loop", claim * (1 + AGREEMENT)
+            ),
+            Verified("swept norm", swept, "a refined sweep over frequency", norm * (1 + AGREEMENT)),
+            stability_check(least, loop.dt),
+            Verified("claim", claim, "the method"),
+        )
+    )
 
 
 def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
@@ -255,12 +268,12 @@ def with_left_out(
 def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) -> Controller:
     """Return an answer with what its loop says of modes left out and of uncertain ones."""
     left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
-    certificate = dict(answer.certificate or {})
+    verified = answer.certificate
     for found in (left_out, tolerances):
-        certificate |= {} if found is None else found.certificate
+        verified |= {} if found is None else found.certificate
     alone = (plant.unjudged,) if left_out is None and plant.unjudged else ()
     return answer.replace(
-        certificate=certificate,
+        certificate=verified,
         left_out=left_out,
         tolerances=tolerances,
         notes=(*answer.notes, *alone),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arrays import FloatArray
-from ..certificates import stability_name
+from ..certificates import Certificate, Verified, stability_check
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
@@ -37,7 +37,7 @@ def design_h2(
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
     A sampled plant is solved by its discrete equations; its K uses y of the same sample. The norm
-    is found a second time by both Gramians of the closed loop, which have to agree with it.
+    is found a second time by Gramians of the loop, which have to agree with it.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def design_h2(
         "H2 by two Riccati equations",
         gamma=certificate["H2 norm"],
         lower=None if found.notes else min(certificate["claim"], certificate["H2 norm"]),
-        certificate=certificate | dict(found.certificate),
+        certificate=certificate | found.certificate,
         notes=found.notes,
     )
     return with_left_out(answer, plant)
@@ -157,7 +157,7 @@ _UNDAMPED = (
 )
 
 
-def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
+def _certified(P: StateSpace, K: StateSpace, claim: float) -> Certificate:
     """Return what was verified of lft(P, K): its H2 norm by both Gramians, and its stability."""
     loop = lft(P, K)
     least, norm = required_stability(loop, _UNDAMPED), h2_norm(loop)
@@ -171,4 +171,6 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
             "synthesis: the problem is too badly conditioned to trust. Bring the "
             "sizes of the weights closer together."
         )
-    return {"H2 norm": norm, stability_name(loop.dt): least, "claim": claim}
+    limit = claim * (1.0 + AGREEMENT)
+    checks = (Verified("H2 norm", norm, "Gramians of the loop", limit), Verified("claim", claim))
+    return Certificate((*checks, stability_check(least, loop.dt)))

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray, positive, whole
-from ...certificates import stability, stability_name
+from ...certificates import Certificate, Verified, stability, stability_check, stability_name
 from ...errors import CertificateError, FlexplantError, FlexplantWarning, ModelError
 from ...loop import close_loop
 from ...lti.balancing import balanced
@@ -249,9 +249,10 @@ class LoopFacts(NamedTuple):
         return f"{stability_name(self.sampled)} {self.stability:.6g}, at {self.freq:.4g} Hz"
 
     @property
-    def certificate(self) -> dict[str, float]:
-        """The numbers, named."""
-        found = {stability_name(self.sampled): self.stability, "modulus margin": self.margin}
+    def certificate(self) -> Certificate:
+        """What the controller keeps."""
+        margin = Verified("modulus margin", self.margin, "a sweep of |1 + L| at u")
+        found = Certificate((stability_check(self.stability, self.sampled), margin))
         return found if np.isnan(self.gamma) else found | {"gamma": self.gamma}
 
 

@@ -199,7 +199,7 @@ def tolerant(
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
     return answer.replace(
-        certificate=dict(answer.certificate or {}) | {TOLERATED: share},
+        certificate=answer.certificate | {TOLERATED: share},
         reached={},  # of the weights beside the channels of modes
         tried={"before the scales were evened out": given.first, "after": answer.gamma},
         notes=(
@@ -309,7 +309,7 @@ def _verified(plant: AnyPlant, problem: Prepared, name: str, found: SolvedContro
         K,
         f"H-infinity by {name}",
         gamma=gamma,
-        certificate=certificate | dict(found.certificate),
+        certificate=certificate | found.certificate,
         reached=reached_norms(plant, loop, respond),
         notes=found.notes,
         tried={f"{name}()": gamma},

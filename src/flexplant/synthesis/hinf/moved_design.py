@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import FloatArray, number
+from ...certificates import Certificate
 from ...errors import CertificateError, FlexplantError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
@@ -83,7 +84,7 @@ class PlantRange:
 
     def certified(
         self, norm_of: Callable[[AnyPlant], float], norms: Sequence[float]
-    ) -> dict[str, float]:
+    ) -> Certificate:
         """Return the norm at each position, the worst one, and the worst half way between two."""
         found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
         found["worst position"] = float(self.places[int(np.argmax(norms))])
@@ -98,7 +99,7 @@ class PlantRange:
                 ) from error
         if self.middles.size:
             found |= {"norm between positions": worst[0], "worst position between": worst[1]}
-        return found
+        return Certificate.of(found, route="the loop closed at each position")
 
     @property
     def middles(self) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray, below_half_rate, positive
-from ...certificates import stability, stability_name
+from ...certificates import Certificate, Verified, stability, stability_check
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
@@ -184,7 +184,7 @@ def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
 
 def verified_controller(
     shaped: StateSpace, back_off: float
-) -> tuple[StateSpace, float, dict[str, float]]:
+) -> tuple[StateSpace, float, Certificate]:
     """Return the controller of a shaped plant, the smallest gamma, and what was verified."""
     part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
     K, gamma, least = _robust(part, back_off)
@@ -205,12 +205,12 @@ def verified_controller(
             f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
             f"by the Hankel norm of the factors: {cause}."
         )
-    found = {
-        "margin": margin,
-        "smallest gamma by the Hankel norm": other,
-        stability_name(shaped.dt): least_stable,
-    }
-    return K, least, found
+    found = (
+        Verified("margin", margin, "gain of four blocks", (1.0 - AGREEMENT) / gamma, at_least=True),
+        Verified("smallest gamma", other, "Hankel norm of the factors", least * (1.0 + AGREEMENT)),
+        stability_check(least_stable, shaped.dt),
+    )
+    return K, least, Certificate(found)
 
 
 def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:

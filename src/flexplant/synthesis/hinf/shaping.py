@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import ComplexArray, FloatArray, below_half_rate, positive
-from ...certificates import stability_name
+from ...certificates import Certificate, Verified, stability_check
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
@@ -218,7 +218,7 @@ def _unusual(bandwidth: float, rolloff: float | None, rho: float | None) -> None
 
 def _shaped_controller(
     shaped: StateSpace, model: StateSpace | None, rho: float, back_off: float
-) -> tuple[StateSpace, float, float, dict[str, float]]:
+) -> tuple[StateSpace, float, float, Certificate]:
     """Return the controller of a shaped plant, y or [references; y] to u, gamma, least, and more.
 
     With one degree of freedom, or with two where there is a model; the last is what was verified.
@@ -234,9 +234,12 @@ def _shaped_controller(
             "claimed: the shaped plant is too badly conditioned to trust. Bring its gains at u "
             "and y to size 1."
         )
-    certificate |= {"margin": margin, stability_name(shaped.dt): stability}
-    certificate["error of following"] = _following_error(shaped, model, K)
-    return K, gamma, least, certificate
+    kept = Verified(
+        "margin", margin, "norm of the four blocks", (1.0 - 1e-3) / gamma, at_least=True
+    )
+    error = Verified("error of following", _following_error(shaped, model, K), "peak of T - model")
+    checks = kept, stability_check(stability, shaped.dt), error
+    return K, gamma, least, certificate | Certificate(checks)
 
 
 def _following_error(shaped: StateSpace, model: StateSpace, K: StateSpace) -> float:

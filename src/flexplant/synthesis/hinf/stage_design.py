@@ -310,7 +310,7 @@ class _StageTask:
                 margin, drawn = self._judged(found.system)
                 if margin < self.margin or drawn < _KEPT * self.margin:
                     raise
-        certificate = dict(found.certificate or {}) | {
+        certificate = found.certificate | {
             f"least modulus margin of {_DRAWS} machines drawn": drawn,
             "weights for Hz": best.bandwidth,
         }

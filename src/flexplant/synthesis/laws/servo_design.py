@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import FloatArray, below_half_rate, between, positive, real_array
+from ...certificates import Certificate, Verified, stability_check
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
@@ -131,25 +132,23 @@ def design_servo(
     task.require_phase(law)
     law = task.notched(law)
     closed = task.closed(law)
-    certificate = {
-        "spectral radius": closed.spectral_radius,
-        "modulus margin": closed.modulus_margin,
-    }
+    margin = Verified("modulus margin", closed.modulus_margin, "a sweep of |1 + L| at u")
+    certificate = Certificate((stability_check(closed.spectral_radius, sampled=True), margin))
     left_out, advice = closed.left_out, ""
-    known = certificate | ({} if left_out is None else left_out.certificate)
+    known = certificate if left_out is None else certificate | left_out.certificate
     if min(known[key] for key in known if key.startswith("modulus margin")) < 1.0 / TARGET:
         try:
             reach = task.largest(TARGET)
         except SolverError as none:
             advice = str(none)
         else:
-            certificate["largest bandwidth at 6 dB [Hz]"] = reach
+            certificate |= {"largest bandwidth at 6 dB [Hz]": reach}
             advice = f"The largest bandwidth that holds 6 dB there is {reach:.3g} Hz."
     at = _in_words(law)
     if not closed.is_stable:
         _refuse(closed, at, observer is not None, advice)
     elif closed.is_stable and any(name.endswith(":ref") for name in closed.plant.w):
-        certificate["|S| of the references below 1 up to [Hz]"] = suppressed_up_to(closed)
+        certificate |= {"|S| of the references below 1 up to [Hz]": suppressed_up_to(closed)}
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
             f"with the modes that the plant left out the servo's loop at {at} is "

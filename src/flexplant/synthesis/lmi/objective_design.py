@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import below_half_rate, positive, whole
+from ...certificates import Certificate
 from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted, short
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
@@ -122,7 +123,8 @@ def design_lmi(
             K,
             "several objectives by LMIs",
             gamma=reached[repr(minimize)],
-            certificate={"LMI optimum": claim, "LMI bound": bound, **reached},
+            certificate=Certificate.of({"LMI optimum": claim, "LMI bound": bound})
+            | Certificate.of(reached, route="the closed loop"),
             reached=reached,
         )
         return with_left_out(answer, given)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import FloatArray, whole
+from ...certificates import Certificate
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -50,6 +51,8 @@ from .uncertain_loops import (
 from .uncertainty_blocks import FullBlock, Scalings, block_places, osborne
 from .upper import upper_level
 
+#: the route of the certificate of an iteration
+STEPS_OF_MU = "upper bound of mu after each step"
 #: frequencies at which D is found
 _POINTS = 40
 #: relative decrease of mu below which the iteration ends: D(s), one channel a mode
@@ -143,7 +146,7 @@ def design_mu(
         best.controller,
         f"D-K iteration, {counted(len(found), 'step')}",
         gamma=best.mu,
-        certificate={"mu": best.mu, "at Hz": best.freq} | found,
+        certificate=Certificate.of({"mu": best.mu, "at Hz": best.freq} | found, route=STEPS_OF_MU),
     )
     return with_left_out(answer, uncertain.plant)
 
@@ -319,7 +322,7 @@ def _by_mode_channels(
         best.controller,
         f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
         gamma=best.mu,
-        certificate={"mu": best.mu} | found | largest,
+        certificate=Certificate.of({"mu": best.mu} | found | largest, route=STEPS_OF_MU),
     )
 
 

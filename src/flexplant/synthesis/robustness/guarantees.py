@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from ...arrays import ComplexArray, FloatArray, whole
-from ...certificates import stability
+from ...certificates import Certificate, as_certificate, stability
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
 from ...lti.frequency import frequency_response
@@ -21,7 +21,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
-from ...store import Value
+from ...store import Value, checked
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, smallest_with_block
 from .mu_bounds import INTERVALS, Cover, Covered, sought
@@ -64,7 +64,7 @@ class RobustStability(Value):
     frequencies, bounds : (k,) arrays [Hz, 1]
         Upper bounds at single frequencies; where they are not near the largest they need not be
         the smallest.
-    certificate : mapping {str: float}
+    certificate : Certificate
         Machines that were drawn and closed exactly, and how stable the least stable was; the
         distance of sampled channels from sampled machines; how many intervals between frequencies
         were proven by Hamiltonian matrices (0 above 260 states: sampled); the check with modes
@@ -80,7 +80,7 @@ class RobustStability(Value):
     machine: AnyPlant | None
     frequencies: FloatArray
     bounds: FloatArray
-    certificate: Mapping[str, float]
+    certificate: Certificate = field(metadata=checked(as_certificate))
     left_out: SpillOver | None = None
 
     @property
@@ -267,7 +267,7 @@ def _tried_on(
     count: int,
     rng: np.random.Generator,
     beside: Mapping[str, float],
-) -> tuple[dict[str, float], SpillOver | None]:
+) -> tuple[Certificate, SpillOver | None]:
     """Return how stable machines at corners are, each closed exactly, and the modes left out."""
     size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
     for _ in range(count):
@@ -283,7 +283,8 @@ def _tried_on(
         kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
         found[f"{kind} of {counted(count, 'machine')}"] = worst
     left_out = nominal.left_out
-    return found | dict(beside) | dict(left_out.certificate if left_out else {}), left_out
+    tried = Certificate.of(found | dict(beside), route="machines at corners, each closed exactly")
+    return tried if left_out is None else tried | left_out.certificate, left_out
 
 
 @dataclass(frozen=True, eq=False, repr=False)

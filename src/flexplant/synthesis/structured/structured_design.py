@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import FloatArray, whole
-from ...certificates import stability_name
+from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, short
 from ...lti.interconnection import lft
 from ...lti.response_solvers import responder
@@ -197,7 +197,8 @@ def design_structured(
     reached = reached_norms(plants[worst], loop, responder(loop)) if plain else {}
     radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
     slope, decrease = decrease_left(search.pieces(found.x), radius)
-    certificate = each[worst] | {"slope": slope, "radius": radius, "decrease left": decrease}
+    certificate = each[worst] | {"slope": slope, "radius": radius}
+    certificate |= Certificate((Verified("decrease left", decrease, "a linear model", _SHORT),))
     if moving is not None:
         certificate |= moving.certified(
             lambda one: _verified_loop(one, lft(one.system, K), objectives, np.inf)["norm"], norms
@@ -291,7 +292,7 @@ def _require_no_feedthrough(
 
 def _verified_loop(
     plant: AnyPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
-) -> dict[str, float]:
+) -> Certificate:
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
     if _measure_word(objectives) == "H-infinity":
         return certified_norm(loop, claim)
@@ -301,7 +302,12 @@ def _verified_loop(
         w, z = one.chosen(plant)
         found[repr(one)] = one.measured(loop.select(z, w))
         norm = max(norm, found[repr(one)] / (one.below or 1.0))
-    return {"norm": norm, stability_name(loop.dt): least, "claim": claim} | found
+    checks = (
+        Verified("norm", norm, "objectives of the closed loop", claim * (1.0 + _AGREEMENT)),
+        stability_check(least, loop.dt),
+        Verified("claim", claim, "the search in scaled time"),
+    )
+    return Certificate(checks) | Certificate.of(found, route="measured on the closed loop")
 
 
 class _End(NamedTuple):
