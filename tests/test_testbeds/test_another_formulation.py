@@ -214,9 +214,9 @@ def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
 
 @pytest.mark.long
 def test_the_search_judges_the_modes_left_out():
-    """On a small thick plate these limit the bandwidth: without them the machine is unstable.
+    """On a small thick plate with six elastic modes known these limit the bandwidth.
 
-    Its own modes keep a margin of 0.4 to 212 Hz of the weights, those left out to 110 Hz.
+    A search that ignores them promises 100 Hz with a margin of 0.5, which make the machine unstable.
     """
     size, material = (
         (0.5, 0.35),
@@ -226,8 +226,8 @@ def test_the_search_judges_the_modes_left_out():
     coarse = fx.kirchhoff_plate(size=size, elements=(8, 6), **material)
     at = coarse.dofs.nearest((0.25, 0.0875, 0.0), "z")
     low = fx.ModalDamping(0.001)
-    modes = fx.solve_modes(coarse, count=24, damping=low, compliance_at=[at])
-    rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 25, required=[at]).labels))
+    modes = fx.solve_modes(coarse, count=9, damping=low, compliance_at=[at])
+    rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 10, required=[at]).labels))
     poles = one.poles(range(4, 14), deviation=1e-5, rng=221)
     first = fx.MeasuredModes(poles.poles[:4], modes=poles.modes[:4])
     unknown = [fx.AddedMass(at), fx.MatrixParameter("E", dK=rom.K)]
@@ -250,21 +250,24 @@ def test_the_search_judges_the_modes_left_out():
         ],
         references=[fx.Reference("die")],
     )
-    plant = fx.assemble_plant(fit.calibrated(poles), own).discretized(RATE, delay=one.delay)
-    off = fit.frequency_uncertainty(poles)
+    known = fx.MeasuredModes(poles.poles[:6], modes=poles.modes[:6])
+    plant = fx.assemble_plant(fit.calibrated(known), own).discretized(RATE, delay=one.delay)
+    off = fit.frequency_uncertainty(known)
     fast = fx.design_stage(plant.uncertain(frequency=off), bandwidth=100.0)
-    assert fx.close_loop(plant, fast).modulus_margin >= 0.4
+    assert fx.close_loop(plant, fast).modulus_margin > 0.45
+    assert one.loop(own, fast).spectral_radius > 1.003
     judged = plant.replace(evaluation=whole)
-    with pytest.raises(InfeasibleError, match="150 Hz gives a loop"):
+    with pytest.raises(InfeasibleError, match="no loop with weights for .* keeps"):
         fx.design_stage(judged.uncertain(frequency=off), bandwidth=100.0)
-    controller = fx.design_stage(judged.uncertain(frequency=off), bandwidth=70.0)
+    controller = fx.design_stage(judged.uncertain(frequency=off), bandwidth=50.0)
     promised = fx.close_loop(judged, controller)
-    assert min(promised.modulus_margin, promised.completed.modulus_margin) >= 0.4
+    assert min(promised.modulus_margin, promised.completed.modulus_margin) > 0.5
     loop = one.loop(own, controller)
     assert loop.is_stable
     assert loop.modulus_margin > 0.9 * promised.completed.modulus_margin
-    assert fx.compare_loops({"machine": loop}).rows["machine"].bandwidth > 60.0
-    assert one.loop(own, fast).modulus_margin < 0.3
+    reached = fx.compare_loops({"promised": promised, "machine": loop}).rows
+    assert reached["promised"].bandwidth == pytest.approx(50.0, rel=0.03)
+    assert reached["machine"].bandwidth == pytest.approx(50.0, rel=0.1)
 
 
 @pytest.mark.long

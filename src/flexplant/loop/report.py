@@ -15,6 +15,7 @@ from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
 from ..words import mapping
+from .blocks import references
 from .broken import BrokenLoop, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
 from .measured_loop import broken_count
@@ -467,6 +468,16 @@ def compare_loops(
         for name, loop in loops.items()
     }
     return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled, alone)
+
+
+def axis_bandwidths(loop: ClosedLoop) -> dict[str, float]:
+    """Return where |S| of each reference first crosses 1 from below [Hz], 0 if never below."""
+    pairs = [(name, f"{name.removesuffix(':ref')}:error") for name in references(loop.plant)]
+    return {
+        pair[0]: _bandwidth(loop, pair, error_sensitivity(loop, *pair))
+        for pair in pairs
+        if pair[1] in loop.plant.z
+    }
 
 
 def _bandwidth(

@@ -252,7 +252,9 @@ class _Sizes:
         ports = plant.assembled.ports
         sensors, pushed = [s.name for s in ports.y], [p.name for p in ports.w if not p.added_to]
         T = sigma**2 * driven.T
-        Y = real_gain(plant.system, sigma, sensors, plant.u) @ T
+        held = np.exp(-0.5 * sigma * plant.dt)  # what the hold leaves of an input, without delay
+        late = held * np.exp(-sigma * plant.dt * plant.delay)
+        Y = real_gain(plant.system, sigma, sensors, plant.u) @ T / late
         shown = np.linalg.norm(Y, axis=0)
         first, r, m = float(shown[0]), len(driven.channels), len(plant.u)
         d = shown / first if first and np.all(shown > SAME * first) else np.ones(r)
@@ -261,7 +263,7 @@ class _Sizes:
         forces = np.maximum(forces, _IDLE * forces.max())
         noises = np.linalg.norm(Y / d, axis=1) / np.sqrt(r)
         noises = np.maximum(noises, _IDLE * noises.max(initial=0.0))
-        W = real_gain(plant.system, sigma, driven.channels, pushed)
+        W = real_gain(plant.system, sigma, driven.channels, pushed) / held
         moved = np.linalg.norm(d[:, None] * W, axis=0) * np.sqrt(m / r)
         equal = dict(zip(pushed, (1.0 / divisor(moved)).tolist(), strict=True))
         # accelerations of the floor are those of unit axes: of a rotation a unit over its arm

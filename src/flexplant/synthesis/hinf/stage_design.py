@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from ...errors import (
 )
 from ...loop import ClosedLoop, close_loop
 from ...loop.other_machines import BEYOND, mode_tolerances
+from ...loop.report import axis_bandwidths
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
@@ -35,6 +36,9 @@ from .tolerated_modes import with_mode_channels
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
 _CROSSES = 2.0 / 3.0
+#: relative difference between a stated bandwidth and where |S| crosses 1 that ends the search of
+#: weights, and the most designs that it takes: three or four suffice on plates and driven machines
+_REACHED, _DESIGNS = 0.01, 8
 #: first guess: |S| crosses 1 at this part of the first frequency that the actuators move
 _FIRST = 1.0 / 3.0
 #: factor between bandwidths tried, how many, and halvings of the last interval: 3 % of a bandwidth
@@ -81,8 +85,9 @@ def design_stage(
         taken with all its frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})``
         and ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
     bandwidth : float [Hz], optional
-        Below which |S| from the reference to the error shall stay under 1, about; the largest
-        that holds when not given.
+        Bandwidth of the loop: where |S| from reference to error crosses 1 on the slowest axis. The
+        weights are moved until it does, within 1 %; without a reference they are those of 1.5 times
+        the bandwidth. The largest bandwidth that holds when not given.
     margin : float
         Least modulus margin, broken at u.
     poi : str, optional
@@ -123,7 +128,7 @@ def design_stage(
     task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
     with Progress(_MOST, "bandwidths", progress=progress) as bar:
         if bandwidth is not None:
-            task.holds(positive(bandwidth, "bandwidth") / _CROSSES)
+            task.reaches(positive(bandwidth, "bandwidth"))
         else:
             task.search(bar)
     return with_left_out(task.answer(), uncertain.plant)
@@ -178,33 +183,68 @@ class _StageTask:
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
-        weighted = self.through.weighted(self.weights(bandwidth))
-        self.tried[bandwidth], damped = 0.0, None
+        return self._kept(bandwidth, lambda below: self._designed(bandwidth, below))
+
+    def reaches(self, wanted: float) -> bool:
+        """Design a loop whose |S| crosses 1 at a bandwidth, and return whether it holds."""
+        if self.errors is None:
+            return self.holds(wanted / _CROSSES)
+        return self._kept(wanted / _CROSSES, lambda below: self._moved(wanted, below))
+
+    def _kept(self, bandwidth: float, design: Callable[[float], _StageTry | None]) -> bool:
+        """Keep the first design that holds, of those that damp more and more modes."""
+        damped = None
         for factor in _DAMPED:
-            now = int(np.count_nonzero(self._frequencies < factor * bandwidth))
+            below = factor * bandwidth
+            now = int(np.count_nonzero(self._frequencies < below))
             if now == damped:
                 break
-            damped = now
-            one = self._designed(bandwidth, weighted, factor * bandwidth)
+            damped, one = now, design(below)
+            self.tried.setdefault(bandwidth if one is None else one.bandwidth, 0.0)
             if one is None:
                 continue
             margin, drawn = self._judged(one.system)
             if margin < self.margin:  # of the model itself: more damping is no cure
-                self.tried[bandwidth] = max(self.tried[bandwidth], margin)
+                self.tried[one.bandwidth] = max(self.tried[one.bandwidth], margin)
                 break
             if drawn >= _KEPT * self.margin:
-                self.tried[bandwidth] = margin
-                if self.best is None or bandwidth > self.best.bandwidth:
+                self.tried[one.bandwidth] = margin
+                if self.best is None or one.bandwidth > self.best.bandwidth:
                     self.best = one._replace(drawn=drawn)
                 return True
         return False
 
-    def _designed(
-        self, bandwidth: float, weighted: StandardPlant, damped_below: float
-    ) -> _StageTry | None:
+    def _moved(self, wanted: float, below: float) -> _StageTry | None:
+        """Return a design whose |S| crosses 1 at a bandwidth, the slowest weights that have it."""
+        at, ends = wanted, [0.0, np.inf]  # of weights that are too slow, and too fast
+        known: list[tuple[float, float]] = []
+        for _ in range(_DESIGNS):
+            one = self._designed(at, below)
+            if one is None:
+                return None
+            reached = self._crossing(one.system)
+            if abs(reached / wanted - 1.0) <= _REACHED:
+                return one
+            ends[int(reached > wanted)] = at
+            known.append((at, reached))
+            if not 0.0 < reached < np.inf or at == self.highest and reached < wanted:
+                break
+            at = min(_next(known, wanted, ends), self.highest)
+        tried = ", ".join(f"{there:.4g} Hz" for _, there in known)
+        self.failures[wanted] = InfeasibleError(f"|S| crosses 1 at {tried}")
+        return None
+
+    def _crossing(self, system: StateSpace) -> float:
+        """Return where |S| of the slowest axis that is followed crosses 1 [Hz]."""
+        reached = axis_bandwidths(close_loop(self.plant, self._block(system)))
+        followed = () if self.errors is None else self.errors.inputs
+        return min(hertz for ref, hertz in reached.items() if ref in followed)
+
+    def _designed(self, bandwidth: float, below: float) -> _StageTry | None:
         """Return a controller, from the other methods where the first finds none."""
         known = self.uncertain
-        given = evened(weighted, known, progress=False, damped_below=damped_below)
+        weighted = self.through.weighted(self.weights(bandwidth))
+        given = evened(weighted, known, progress=False, damped_below=below)
         with attempted(
             f"one Riccati method for {bandwidth:.4g} Hz",
             (SolverError, InfeasibleError, CertificateError),
@@ -294,7 +334,7 @@ class _StageTask:
         if self.best is None:
             causes = "; ".join(f"{f:.4g} Hz: {error}" for f, error in self.failures.items())
             raise InfeasibleError(
-                f"no bandwidth of {', '.join(tried)} gives a loop that keeps the modulus margin "
+                f"no loop with weights for {', '.join(tried)} keeps the modulus margin "
                 f"{self.margin:g} with its modes off as far as they are uncertain, each alone and "
                 "on machines drawn. Measure their poles, lower margin=, or move the actuators."
                 + (f" ({causes})" if causes else "")
@@ -321,6 +361,20 @@ class _StageTask:
             tried=tried,
             reached={},
         )
+
+
+def _next(known: Sequence[tuple[float, float]], wanted: float, ends: Sequence[float]) -> float:
+    """Return the next bandwidth of weights: by the secant, between the ends, at most twice."""
+    (at, reached), (low, high) = known[-1], ends
+    twice, slope = float(np.log(2.0)), 1.0
+    if len(known) > 1:
+        before, there = known[-2]
+        slope = float(np.log(reached / there) / np.log(at / before))
+    # weights that are faster without a faster loop say nothing of how far to go
+    step = float(np.log(wanted / reached)) / slope if slope > 0.0 else np.inf
+    step = np.sign(wanted - reached) * min(abs(step), twice)
+    guess = at * float(np.exp(step))
+    return guess if low < guess < high else float(np.sqrt(low * high))
 
 
 class _StageTry(NamedTuple):
