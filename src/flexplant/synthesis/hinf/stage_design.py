@@ -236,7 +236,7 @@ class _StageTask:
 
     def _crossing(self, system: StateSpace) -> float:
         """Return where |S| of the slowest axis that is followed crosses 1 [Hz]."""
-        reached = axis_bandwidths(close_loop(self.plant, self._block(system)))
+        reached = axis_bandwidths(self._loop(system))
         followed = () if self.errors is None else self.errors.inputs
         return min(hertz for ref, hertz in reached.items() if ref in followed)
 
@@ -265,9 +265,8 @@ class _StageTask:
         """Return the modulus margin of a controller, and the least with its modes off."""
         # the latter is 0 where a mode may not be off by itself. No further machine is drawn after
         # one on which the loop does not hold
-        block = self._block(system)
-        loop = close_loop(self.plant, block)
-        wholes = [] if loop.completed is None else [loop.completed]
+        loop = self._loop(system)
+        wholes = [] if self.whole is None else [loop.around(self.whole)]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
         if margin < self.margin or not self._tolerates(loop, self.ranges):
             return margin, 0.0
@@ -283,6 +282,10 @@ class _StageTask:
             if least < _KEPT * self.margin:
                 break
         return margin, least
+
+    def _loop(self, system: StateSpace) -> ClosedLoop:
+        """Return the loop on the plant alone: what a rejected loop does is no news."""
+        return close_loop(self.plant.replace(evaluation=None), self._block(system))
 
     def _block(self, system: StateSpace) -> StateSpace:
         block = system if self.errors is None else series(self.errors, system)
