@@ -41,7 +41,7 @@ L, RATE, DELAY, DAMPING = 0.6, 10e3, 1.3, 0.002
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 MEASURED, ERROR = range(4, 16), 1e-5  # modes whose poles are identified, and how well
-OWN, TRIED = (60.0, 40.0), (15.0, 20.0, 25.0, 30.0, 40.0, 60.0)  # Hz
+OWN, TRIED = (70.0, 50.0), (15.0, 20.0, 25.0, 30.0, 40.0, 60.0)  # Hz
 MARGIN, MA = 0.4, 12e-9  # modulus margin, m: the specification
 TRAINING = 8  # machines that the controller for all is chosen on
 

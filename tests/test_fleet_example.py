@@ -43,8 +43,9 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
         # promised on the updated, calibrated model with the modes left out
         np.testing.assert_allclose(table["modulus margin"], table["margin expected"], rtol=0.05)
     assert np.all(own["modulus margin"] > 0.4)
-    np.testing.assert_allclose(own["bandwidth"], 62.4, rtol=0.02)
-    np.testing.assert_allclose(every["bandwidth"], 33.2, rtol=0.05)
+    # of 70 Hz asked, from reference to error; this is |S| at u, of all axes together
+    np.testing.assert_allclose(own["bandwidth"], 68.0, rtol=0.02)
+    np.testing.assert_allclose(every["bandwidth"], 33.0, rtol=0.05)
     assert np.all(own["MA"] < 0.5 * every["MA"])
     assert own["passed"].all()
     assert not every["passed"].any()
