@@ -217,7 +217,7 @@ def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
 def test_the_search_judges_the_modes_left_out():
     """On a small thick plate with six elastic modes known these limit the bandwidth.
 
-    A search that ignores them promises 100 Hz with a margin of 0.5, which make the machine unstable.
+    A search that ignores them promises 100 Hz with a margin of 0.5: the machine is unstable.
     """
     size, material = (
         (0.5, 0.35),

@@ -227,7 +227,7 @@ class _StageTask:
                 return one
             ends[int(reached > wanted)] = at
             known.append((at, reached))
-            if not 0.0 < reached < np.inf or at == self.highest and reached < wanted:
+            if not 0.0 < reached < np.inf or (at == self.highest and reached < wanted):
                 break
             at = min(_next(known, wanted, ends), self.highest)
         tried = ", ".join(f"{there:.4g} Hz" for _, there in known)
