@@ -211,6 +211,10 @@
    optimization, IEEE Trans. Autom. Control 42, 1997.
 .. [Seiler2020] Seiler, Packard, Gahinet, An introduction to disk margins, IEEE Control Syst. Mag.
    40(5), 2020, 78-95.
+.. [Singer1990] Singer, Seering, Preshaping command inputs to reduce system vibration, J. Dyn. Syst.
+   Meas. Control 112, 1990.
+.. [Singhose1994] Singhose, Seering, Singer, Residual vibration reduction using vector diagrams to
+   generate shaped inputs, J. Mech. Des. 116, 1994.
 .. [Skogestad2005] Skogestad, Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley, 2005.
 .. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
    generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.

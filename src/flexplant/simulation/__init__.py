@@ -4,7 +4,8 @@
   (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, one's own) and between
   samples where wished; noise as `fx.design_kalman` has it.
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
-- `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk.
+- `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
+  robust to a change of the frequency) and `quiet_setpoint` leave modes at rest.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: what is required of margins and errors; a verdict says what is reached.
 - `rms_along(loop, moving=)`: the errors of a moving machine along its path.
@@ -82,6 +83,9 @@ from .exposure import settling_time as settling_time
 from .feedforward import Feedforward as Feedforward
 from .feedforward import design_feedforward as design_feedforward
 from .feedforward import known_forces as known_forces
+from .input_shapers import InputShaper as InputShaper
+from .input_shapers import input_shaper as input_shaper
+from .input_shapers import quiet_setpoint as quiet_setpoint
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline

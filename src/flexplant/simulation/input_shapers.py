@@ -1,0 +1,279 @@
+"""Moves that leave modes at rest: input shapers, and set-points whose ramps last whole periods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import FloatArray, between, positive, positive_array, real_array
+from ..errors import ModelError, counted
+from ..store import Value
+from ..words import one_of
+from .motion import SetPointProfile, setpoint
+
+#: a shaper of more factors than this lasts longer than any machine waits
+_MOST = 6
+#: frequencies at which the residual of a band is looked at: a hundred on each lobe
+_LINES = 100
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class InputShaper(Value):
+    """A few impulses whose answers cancel in the modes that they are made for.
+
+    A command is replaced by ``sum_i a_i command(t - t_i)``, with ``sum_i a_i = 1``; made by
+    `input_shaper`.
+
+    Parameters
+    ----------
+    times : (n,) array [s]
+        From 0.
+    amplitudes : (n,) array
+        Positive: no actuator is asked for more than the command asks.
+    """
+
+    times: FloatArray
+    amplitudes: FloatArray
+
+    def __repr__(self) -> str:
+        count = counted(self.times.size, "impulse")
+        return f"<InputShaper: {count} in {1e3 * self.duration:.4g} ms>"
+
+    @property
+    def duration(self) -> float:
+        """By how much a move becomes longer [s]."""
+        return float(self.times[-1])
+
+    def residual(self, freq: npt.ArrayLike, damping: npt.ArrayLike) -> FloatArray:
+        """Return the vibration that is left of modes, as a part of that without the shaper.
+
+        ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta omega t_i) e^(j omega_d t_i)|``, after an
+        impulse [Singer1990]_.
+
+        Parameters
+        ----------
+        freq : float or (k,) array [Hz]
+            Undamped frequencies.
+        damping : float or (k,) array
+            Damping ratios.
+
+        Returns
+        -------
+        (k,) array
+        """
+        omega = 2.0 * np.pi * np.atleast_1d(positive_array(freq, "freq"))
+        zeta = np.broadcast_to(real_array(damping, "damping"), omega.shape)
+        # e^(s* t) with the conjugate pole turned back in time, from the last impulse
+        pole = zeta * omega + 1j * omega * np.sqrt(1.0 - zeta**2)
+        turns = np.exp(pole[:, None] * (self.times - self.times[-1]))
+        return np.asarray(np.abs(turns @ self.amplitudes))
+
+    def shaped(self, move: SetPointProfile) -> SetPointProfile:
+        """Return a move through the shaper: the same distance, later by `duration`.
+
+        It is exact at any time: each impulse moves the phases of the set-point by its own time.
+        """
+        delays = self.times / move.tick
+        edges = np.unique(np.concatenate([move.edges + late for late in delays]))
+        # edges that rounding separates are one
+        edges = edges[np.concatenate([[True], np.diff(edges) > 1e-12 * edges[-1]])]
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        states = np.zeros((edges.size - 1, 5))
+        for late, share in zip(self.times, self.amplitudes, strict=True):
+            at = np.stack(move.at(middle * move.tick - late), axis=1)
+            states += share * at
+        half = 0.5 * np.diff(edges) * move.tick
+        return move.replace(
+            edges=edges,
+            lengths=2.0 * half,
+            from_end=np.zeros(middle.size, dtype=bool),
+            states=_earlier(states, half),
+            gridded=False,
+            exposures=move.exposures + self.duration,
+        )
+
+    def then(self, other: InputShaper) -> InputShaper:
+        """Return both shapers, one after the other."""
+        times = (self.times[:, None] + other.times).ravel()
+        order = np.argsort(times, kind="stable")
+        sizes = (self.amplitudes[:, None] * other.amplitudes).ravel()
+        return InputShaper(times[order], sizes[order])
+
+
+def _earlier(states: FloatArray, by: FloatArray) -> FloatArray:
+    """Return position to snap (m, 5) a time [s] earlier, the snap being constant."""
+    p, v, a, j, s = states.T
+    h = -by
+    return np.stack(
+        [
+            p + h * (v + h / 2 * (a + h / 3 * (j + h / 4 * s))),
+            v + h * (a + h / 2 * (j + h / 3 * s)),
+            a + h * (j + h / 2 * s),
+            j + h * s,
+            s,
+        ],
+        axis=1,
+    )
+
+
+def input_shaper(
+    freq: npt.ArrayLike,
+    *,
+    damping: npt.ArrayLike = 0.0,
+    kind: Literal["ZV", "ZVD", "EI"] = "ZV",
+    change: float = 0.0,
+    left: float = 0.05,
+) -> InputShaper:
+    """Return the shaper that leaves one or several modes at rest after a move.
+
+    ZV has two impulses half a period apart; ZVD three, whose residual is level at the mode; EI
+    three, which leave `left` at the mode and nothing on both sides of it. With `change` as many ZV
+    shapers follow each other, at frequencies spread over the band, as it takes to leave less than
+    `left` everywhere in it. Several modes have a shaper each, one after the other.
+
+    Parameters
+    ----------
+    freq : float or (k,) array [Hz]
+        Undamped frequencies of the modes.
+    damping : float or (k,) array
+        Damping ratios below 1.
+    kind : {"ZV", "ZVD", "EI"}
+        Used where `change` is 0.
+    change : float
+        By which part of itself a frequency may be off, to both sides.
+    left : float
+        Part of the vibration that may be left.
+
+    Returns
+    -------
+    InputShaper
+
+    Raises
+    ------
+    ModelError
+        When a frequency is not positive, a damping ratio not below 1, or the band so wide that six
+        shapers leave more than `left`.
+
+    References
+    ----------
+    [Singer1990]_; [Singhose1994]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> zv = fx.simulation.input_shaper(10.0)
+    >>> zv.times.round(3), zv.amplitudes, zv.residual([10.0, 11.0], 0.0).round(3)
+    (array([0.  , 0.05]), array([0.5, 0.5]), array([0.   , 0.156]))
+    >>> robust = fx.simulation.input_shaper(10.0, change=0.2)
+    >>> bool(robust.residual([8.0, 12.0], 0.0).max() < 0.05)
+    True
+    """
+    modes = np.atleast_1d(positive_array(freq, "freq"))
+    ratios = np.broadcast_to(real_array(damping, "damping"), modes.shape)
+    one_of(kind, "kind", ("ZV", "ZVD", "EI"))
+    between(left, "left", 0.0, 1.0, "It is a part of the vibration.")
+    if np.any((ratios < 0) | (ratios >= 1.0)):
+        raise ModelError("damping ratios lie between 0 and 1: a mode that turns is shaped.")
+    if change:
+        between(change, "change", 0.0, 0.5, "It is a part of the frequency.")
+        found = [_over_band(f, zeta, change, left) for f, zeta in zip(modes, ratios, strict=True)]
+    else:
+        weights = {"ZV": (1, 1), "ZVD": (1, 2, 1), "EI": (1 + left, 2 - 2 * left, 1 + left)}[kind]
+        found = [_half_periods(f, zeta, weights) for f, zeta in zip(modes, ratios, strict=True)]
+    return reduce(InputShaper.then, found)
+
+
+def _half_periods(freq: float, zeta: float, weights: tuple[float, ...]) -> InputShaper:
+    """Return impulses half a damped period apart, as large as their answers must be at the end."""
+    root = np.sqrt(1.0 - zeta**2)
+    decay = np.exp(-np.pi * zeta / root)  # in half a period
+    sizes = np.array(weights) * decay ** np.arange(len(weights))
+    return InputShaper(np.arange(len(weights)) / (2.0 * freq * root), sizes / sizes.sum())
+
+
+def _over_band(freq: float, zeta: float, change: float, left: float) -> InputShaper:
+    """Return ZV shapers at Chebyshev's points of a band, as many as it takes."""
+    for count in range(1, _MOST + 1):
+        points = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+        one = reduce(
+            InputShaper.then,
+            (_half_periods(freq * (1.0 + change * x), zeta, (1, 1)) for x in points),
+        )
+        band = freq * (1.0 + change * np.linspace(-1.0, 1.0, count * _LINES + 1))
+        if one.residual(band, zeta).max() <= left:
+            return one
+    raise ModelError(
+        f"{_MOST} shapers leave more than {left:.0%} of a mode that is off by {change:.0%}: allow "
+        "more with left=, or measure the frequency better."
+    )
+
+
+def quiet_setpoint(
+    distance: float,
+    *,
+    velocity: float,
+    acceleration: float,
+    freq: npt.ArrayLike,
+    start: float = 0.0,
+    settle: float = 0.0,
+    exposure: float = 0.0,
+) -> SetPointProfile:
+    """Return a set-point of third order whose ramps last whole periods of one or two modes.
+
+    The motion is ``distance`` times three rectangles of lengths T_1 >= T_2 >= T_3 convolved, whose
+    transforms are zero where ``f T_i`` is a whole number: T_3 lasts a period of the first mode, and
+    T_2 one of the second. Bounds on velocity and acceleration hold; the jerk is what the first
+    period gives.
+
+    Parameters
+    ----------
+    distance : float [m or rad]
+    velocity, acceleration : float [m/s, m/s^2]
+        Bounds on the magnitudes.
+    freq : float or (2,) array [Hz]
+        Of the mode, or of two.
+    start, settle, exposure : float
+        As in `setpoint`.
+
+    Returns
+    -------
+    SetPointProfile
+
+    Raises
+    ------
+    ModelError
+        When a bound or frequency is not positive, or there are more than two modes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> move = fx.simulation.quiet_setpoint(0.1, velocity=0.5, acceleration=10.0, freq=40.0)
+    >>> round(move.duration, 4), round(float(move.peaks.acceleration), 3)
+    (0.275, 10.0)
+    """
+    modes = np.atleast_1d(positive_array(freq, "freq"))
+    if modes.size > 2:
+        raise ModelError(
+            f"ramps of a set-point serve two modes, got {modes.size}: use input_shaper for more."
+        )
+    v, a = positive(velocity, "velocity"), positive(acceleration, "acceleration")
+    length = abs(float(distance))
+    third = 1.0 / float(modes[0])
+    second = max(v / a, third)
+    if modes.size > 1:  # as many whole periods as the bound on acceleration asks for
+        second = float(np.ceil(second * modes[1] - 1e-9)) / float(modes[1])
+    first = max(length / v, second + third, length / (a * second))
+    speed = length / first
+    return setpoint(
+        distance,
+        velocity=speed,
+        acceleration=speed / second,
+        jerk=speed / second / third,
+        start=start,
+        settle=settle,
+        exposure=exposure,
+    )
