@@ -295,11 +295,11 @@ def step_info(
     >>> import flexplant as fx
     >>> print(fx.lti.step_info(fx.lti.tf([1.0], [1.0, 0.4, 1.0])))
     value at rest          1
-    rise time, 10 to 90 %  1.206 s
-    settling time          19.61 s
+    rise time, 10 to 90 %  1.2 s
+    settling time          19.6 s
     overshoot              52.7 %
     undershoot             0 %
-    peak                   1.527 at 3.206 s
+    peak                   1.53 at 3.2 s
     """
     g = as_statespace(sys)
     for name, given, known in (("output", output, g.outputs), ("input", input, g.inputs)):
@@ -329,7 +329,7 @@ def step_info(
         rise=_first(found.time, way, 0.9, held) - _first(found.time, way, 0.1, held),
         settling=settled,
         overshoot=100.0 * max(float(way.max()) - 1.0, 0.0),
-        undershoot=100.0 * max(-float(way.min()), 0.0),
+        undershoot=100.0 * max(0.0, -float(way.min())),
         peak=float(path[top]),
         peak_time=float(found.time[top]),
         unit=g.units.get(g.outputs[0], ""),

@@ -45,6 +45,12 @@ class DiskMargin(Value):
         the other bound of mu.
     freq : float [Hz]
         Where the loop is nearest.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.margins(fx.lti.tf([25.0], [1.0, 10.0, 10.0, 10.0])).disks[0][0]
+    <DiskMargin S-T: alpha 0.458 at 0.3112 Hz, gain 0.627 to 1.59, phase 26 deg>
     """
 
     kind: str
