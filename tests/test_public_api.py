@@ -198,6 +198,7 @@ TOGETHER = {
     "freq",  # after what the response is of
     "parameters",  # after the fit, as in `update`
     "n",  # after the seed
+    "level",  # after what the interval is of: observer.interval("die:z", 0.95)
 }
 
 

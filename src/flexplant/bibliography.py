@@ -203,6 +203,8 @@
    2nd ed., Wiley, 2012.
 .. [Reynders2008] Reynders, Pintelon, De Roeck, Uncertainty bounds on modal parameters obtained from
    stochastic subspace identification, Mech. Syst. Signal Process. 22, 2008.
+.. [Richardson1911] Richardson, The approximate arithmetical solution by finite differences of
+   physical problems, Phil. Trans. Royal Society A 210, 1911, 307-357.
 .. [Rubin1975] Rubin, Improved component-mode representation for structural dynamic analysis, AIAA
    J. 13, 1975.
 .. [SalimbahramiLohmann2006] Salimbahrami, Lohmann, Order reduction of large scale second-order

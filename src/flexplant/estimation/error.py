@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,7 @@ from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant
+from ..plant.machine_plants import LEVEL, FigureInterval, interval, interval_text
 from ..store import Value
 from ..tolerances import ROUNDING, SAME, TINY, TYPED, divisor
 from ..words import in_unit, instance, members, sizes_of
@@ -54,6 +56,8 @@ ON_CIRCLE = 1.0 - ROUNDING
 _HARDLY = 2e-8
 #: share of a variance from which such modes are named
 _MOST = 0.5
+#: channels that a print shows
+_SHOWN = 4
 
 
 class Variances(NamedTuple):
@@ -385,9 +389,54 @@ class PoiFilter(Value):
 
     @property
     def rms_text(self) -> str:
-        """The predicted rms errors in words."""
-        rms = {name: self.rms(name) for name in poi_channels(self.plant)}
-        return sizes_of(rms, self.plant.units)
+        """The predicted rms errors in words, with their intervals or what is missing for them."""
+        channels, units = poi_channels(self.plant), self.plant.units
+        known = self.plant.machine.machines if self.plant.dt else None
+        if known is None or known.missing:
+            rms = sizes_of({name: self.rms(name) for name in channels}, units)
+            return rms if known is None else f"{rms}\n  (no interval: {known.missing})"
+        said: list[str] = []
+        for name in channels[:_SHOWN]:
+            low, high, _ = self.interval(name)
+            ends = interval_text(float(low or 0.0), float(high or 0.0), units.get(name, ""))
+            on = f" on {100 * LEVEL:.3g} % of such machines" if not said else ""
+            said.append(f"{sizes_of({name: self.rms(name)}, units)} ({ends}{on})")
+        more = [f"... ({len(channels) - _SHOWN} more)"] if len(channels) > _SHOWN else []
+        return ",\n    ".join(said + more)
+
+    def interval(self, channel: str, level: float = LEVEL) -> FigureInterval:
+        """Return where the rms error lies on a share of the machines measured as this one.
+
+        Parameters
+        ----------
+        channel : str
+            A POI's motion under any of its names, as for `rms`.
+        level : float
+            Share of the machines, between 0 and 1.
+
+        Returns
+        -------
+        FigureInterval
+            ``(low, high, sentence)`` [m or rad]; low and high are None where something is missing
+            for an interval: the sentence says what.
+
+        Raises
+        ------
+        LabelError, ModelError
+            When it is no motion of a POI, or the level is out of range.
+        """
+        row = row_of(poi_channels(self.plant), channel)
+        unit = self.plant.units.get(poi_channels(self.plant)[row], "")
+        return interval(self.plant.machine.machines, lambda: self._on_machines[:, row], level, unit)
+
+    @cached_property
+    def _on_machines(self) -> FloatArray:
+        """Rms errors (n, n_poi) on each machine that the measurement allows."""
+        known = self.plant.machine.machines
+        plants = [] if known is None else known.plants
+        return np.sqrt([
+            error_variances(same_pois(self.plant, one), self.system).values for one in plants
+        ])  # fmt: skip
 
     def rms(self, channel: str, *, on: AnyPlant | ClosedLoop | System | None = None) -> float:
         """Return the rms of the estimation error at the sample instants.

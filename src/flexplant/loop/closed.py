@@ -19,6 +19,7 @@ from ..lti.modal_map import Obstacle, obstacle
 from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
+from ..plant.machine_plants import LEVEL, FigureInterval
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..words import name_list
@@ -35,6 +36,7 @@ from .budget import (
     sources,
     stationary_row,
 )
+from .machine_figures import MachineLoops, interval_line, loop_interval
 from .other_machines import (
     MARGIN,
     ModeTolerances,
@@ -103,6 +105,8 @@ class ClosedLoop(Value):
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         elif self.plant.unjudged:
             lines.append(f"  {self.plant.unjudged}")
+        if self.obstacle is None and self.plant.dt and (intervals := interval_line(self)):
+            lines.append(f"  {intervals}")
         if self.tolerances is not None:
             found = self.tolerances.certificate
             lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
@@ -297,6 +301,44 @@ class ClosedLoop(Value):
         `LoopReport.scaled_margin`. An unstable loop has none: 0.
         """
         return self.broken.margin()
+
+    @cached_property
+    def on_machines(self) -> MachineLoops:
+        """The same controller around the machines that the measurement allows.
+
+        ModelError when none are known of the plant.
+        """
+        known = self.plant.machine.machines
+        if known is None:
+            raise ModelError(
+                "nothing is known of other machines. Make the plant of fit.calibrated(measured) "
+                "with evaluation=, or of plant.uncertain(machines)."
+            )
+        return MachineLoops(self, known)
+
+    def interval(self, figure: str, level: float = LEVEL) -> FigureInterval:
+        """Return where a figure of the loop lies on a share of the machines measured as this one.
+
+        Parameters
+        ----------
+        figure : str
+            "modulus margin", "bandwidth" (the least of |S| < 1 of all axes with a reference, Hz),
+            "spectral radius", or a signal whose `rms` is meant.
+        level : float
+            Share of the machines, between 0 and 1.
+
+        Returns
+        -------
+        FigureInterval
+            ``(low, high, sentence)``; low and high are None where something is missing for an
+            interval, or the loop is unstable on a machine: the sentence says what.
+
+        Raises
+        ------
+        ModelError
+            When the figure is unknown, or the level is out of range.
+        """
+        return loop_interval(self, figure, level)
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:

@@ -15,11 +15,11 @@ from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
 from ..words import mapping
-from .blocks import references
 from .broken import BrokenLoop, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
+from .machine_figures import crossing
 from .measured_loop import broken_count
-from .sensitivity_functions import Loop, first_crossing, taken_apart
+from .sensitivity_functions import Loop, taken_apart
 
 #: a loop gain at the first or last line that counts as real
 _REAL = 0.05
@@ -460,7 +460,10 @@ def compare_loops(
         name: error_sensitivity(loop, *pair) if pair and loop.is_stable else None
         for name, loop in loops.items()
     }
-    reached = {name: _bandwidth(loops[name], pair, curve) for name, curve in curves.items()}
+    reached = {
+        name: float("nan") if curve is None else crossing(loops[name], pair[0], pair[1], curve)
+        for name, curve in curves.items()
+    }
     known = [value for value in reached.values() if np.isfinite(value)]
     low_freq = LOW * max(known, default=np.nan)
     rows = {
@@ -468,27 +471,6 @@ def compare_loops(
         for name, loop in loops.items()
     }
     return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled, alone)
-
-
-def axis_bandwidths(loop: ClosedLoop) -> dict[str, float]:
-    """Return where |S| of each reference first crosses 1 from below [Hz], 0 if never below."""
-    pairs = [(name, f"{name.removesuffix(':ref')}:error") for name in references(loop.plant)]
-    return {
-        pair[0]: _bandwidth(loop, pair, error_sensitivity(loop, *pair))
-        for pair in pairs
-        if pair[1] in loop.plant.z
-    }
-
-
-def _bandwidth(
-    loop: ClosedLoop, pair: tuple[str, ...], curve: tuple[FloatArray, FloatArray] | None
-) -> float:
-    """Return where |S| first crosses 1 from below; 0 where it is nowhere below."""
-    if curve is None:
-        return float("nan")
-    gain = loop.gain(*pair)
-    below = np.any(curve[1] < 1.0)
-    return first_crossing(*curve, lambda freq: np.abs(gain(freq)[0, 0])) if below else 0.0
 
 
 def _figures(

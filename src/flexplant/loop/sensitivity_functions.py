@@ -22,7 +22,6 @@ from ..errors import (
     warn,
 )
 from ..lti.frequency import Frf, frequency_response, sampled_freq
-from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
 from ..lti.measured_lines import on_lines
 from ..lti.response_solvers import remembered, responder
@@ -31,6 +30,7 @@ from ..plant import AnyPlant, SensorPort
 from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, movable_outputs
 from .closed import ClosedLoop
+from .machine_figures import first_crossing
 from .measured_loop import broken_count
 
 #: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
@@ -422,21 +422,6 @@ def broken_bandwidth(parts: BrokenLoop) -> float:
         )
     find = None if parts.measured is not None else partial(_sensitivity_along, acting, parts)
     return first_crossing(grid, values, find)
-
-
-def first_crossing(
-    freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
-) -> float:
-    """Return where a size first rises to 1 from below [Hz], infinite where it stays below."""
-    # between two points where it can be found there
-    beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
-    if not beyond.size:
-        return float("inf")
-    pair, found = slice(beyond[0] - 1, beyond[0] + 1), freq[beyond[:1]]
-    if find is not None:
-        between = crossings(lambda f: find(f) - 1.0, freq[pair], size[pair] - 1.0)
-        found = np.append(between, found)
-    return float(found[0])
 
 
 def _sensitivity_along(acting: ComplexArray, parts: BrokenLoop, grid: FloatArray) -> FloatArray:

@@ -48,6 +48,8 @@ class MeshError(Value):
         That both meshes point to, ``f_fine + (f_fine - f_coarse) / (r^p - 1)``.
     ratio : float
         r, of the sizes of elements.
+    partners : (m,) array of int
+        Places, from 0, of the same modes in the finer mesh.
 
     Examples
     --------
@@ -64,6 +66,7 @@ class MeshError(Value):
     freq: FloatArray
     limit: FloatArray
     ratio: float
+    partners: IntArray
 
     @property
     def error(self) -> FloatArray:
@@ -117,8 +120,10 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
             "no elastic mode of the two meshes has a shape in common: they are not of one "
             "structure, or its coordinates have other units."
         )
-    f, fine = coarse.freq[found], finer.freq[pairs.partner[found]]
-    return MeshError(found + 1, f, fine + (fine - f) / (ratio**p - 1.0), float(ratio))
+    partners = pairs.partner[found]
+    f, fine = coarse.freq[found], finer.freq[partners]
+    limit = fine + (fine - f) / (ratio**p - 1.0)
+    return MeshError(found + 1, f, limit, float(ratio), partners)
 
 
 def _at_common_places(coarse: Any, finer: Any) -> tuple[FloatArray, FloatArray]:
@@ -487,6 +492,45 @@ class Modes(Placed, Value):
         """
         hint = "Solve the finer model with the same damping."
         return mesh_error(self, instance(finer, Modes, "finer", hint), order)
+
+    def extrapolated(self, coarser: Modes, *, order: float = 2.0) -> Modes:
+        """Return the modes with the frequencies that this mesh and a coarser one point to.
+
+        Richardson's rule, as in `mesh_error`: ``f + (f - f_coarse) / (r^order - 1)`` with the ratio
+        r of element sizes. A mode without a partner in the coarser mesh, one of several of one
+        frequency for example, is corrected by the share that its neighbours in frequency are.
+        Shapes, damping ratios and rigid-body modes stay as they are.
+
+        Parameters
+        ----------
+        coarser : Modes
+            Of the same structure with larger elements: 1.5 or 2 times as large, say.
+        order : float
+            2 for plates and for bricks of eight nodes.
+
+        Raises
+        ------
+        ModelError
+            When the meshes are too alike, have no shape in common, or the modes are complex.
+
+        References
+        ----------
+        [Richardson1911]_.
+        """
+        found = instance(coarser, Modes, "coarser", "Solve the coarser mesh.").mesh_error(
+            self, order=order
+        )
+        places, share = found.partners, np.log(found.limit / self.freq[found.partners])
+        rising = np.argsort(self.freq[places])
+        elastic = slice(self.n_rigid + self.n_unstable, None)
+        omega = self.omega.copy()
+        known = np.interp(self.freq[elastic], self.freq[places][rising], share[rising])
+        omega[elastic] *= np.exp(known)
+        rank = np.argsort(omega, kind="stable")
+        return self.replace(
+            omega=omega[rank], zeta=self.zeta[rank], phi=self.phi[:, rank], certificate={},
+            residual=(), rounding=(),
+        )  # fmt: skip
 
     @property
     def orthonormal_basis(self) -> FloatArray:

@@ -91,6 +91,8 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
+from .machine_plants import FigureInterval as FigureInterval
+from .machine_plants import PlantMachines as PlantMachines
 from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled

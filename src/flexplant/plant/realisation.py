@@ -139,7 +139,7 @@ def realise(model: Structure | ModalRealisation) -> ModalRealisation:
         if np.iscomplexobj(model.phi):
             return _complex(model, model.omega, model.zeta, np.asarray(model.phi), model.n_rigid)
         omega, zeta, basis = model.basis_omega, model.basis_zeta, np.real(model.basis)
-        return _real(model, omega, zeta, basis, model.n_rigid, model.omega.size)
+        return modes_as_states(model, omega, zeta, basis, model.n_rigid, model.omega.size)
     if isinstance(model, FEModel | ReducedModel):
         if model.M.shape[0] > LARGEST_DENSE:
             raise ModelError(
@@ -185,7 +185,7 @@ def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisat
     if real.is_proportional:
         zeta = np.zeros_like(omega)
         zeta[r:] = 0.5 * np.diag(real.C)[r:] / np.abs(omega[r:])
-        return _real(model, omega, zeta, real.phi, r, omega.size)
+        return modes_as_states(model, omega, zeta, real.phi, r, omega.size)
     # rigid-body motions are undamped by convention, in both forms alike
     C = real.C.copy()
     C[:r], C[:, :r] = 0.0, 0.0
@@ -228,7 +228,7 @@ def _dense(model: Structure, real: RealForm, why: str) -> ModalRealisation:
         C[:r] = turned.T @ C[:r]
         C[: r - rank], C[:, : r - rank] = 0.0, 0.0
     b = real.omega.size
-    blocks = _real(model, real.omega, np.zeros(b), phi, r, b)
+    blocks = modes_as_states(model, real.omega, np.zeros(b), phi, r, b)
     pairs = np.array(blocks.pairs)
     pairs[:, 1, 1] = -np.diag(C)
     return blocks.replace(pairs=pairs, coupling=C - np.diag(np.diag(C)), form=f"dense: {why}")
@@ -242,7 +242,7 @@ def _turned(drag: FloatArray, size: float) -> tuple[int, FloatArray]:
     return rank, np.linalg.svd(drag)[2][::-1].T
 
 
-def _real(
+def modes_as_states(
     model: Structure, omega: FloatArray, zeta: FloatArray, phi: FloatArray, rigid: int, modes: int
 ) -> ModalRealisation:
     """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes."""
@@ -274,7 +274,7 @@ def _complex(
     elastic = pole_pairs(omega, zeta)[0][start:]
     swing, size = elastic.imag, omega[start:]
     first = float(np.abs(omega[rigid:]).min()) if omega.size > rigid else 1.0
-    real = _real(
+    real = modes_as_states(
         model, np.append(omega[:start], first), np.append(zeta[:start], 0.0),
         np.column_stack([phi[:, :start].real, np.zeros(n)]), rigid, start,
     )  # fmt: skip

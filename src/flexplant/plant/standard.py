@@ -16,6 +16,7 @@ from .assumptions import AssumptionReport
 from .building import continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
+from .machine_plants import PlantMachines, known_machines
 from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partitioned import Partition
 from .ports import Ports
@@ -334,6 +335,16 @@ class StandardPlant(Partition):
         or stiff springs bend an axis that its channels have part in.
         """
         return rigid_modes_of(self)
+
+    @cached_property
+    def machines(self) -> PlantMachines | None:
+        """The machines that the measurement allows, drawn once; None where none are known.
+
+        They are known of a plant of ``fit.calibrated(measured)``, or of ``plant.uncertain(
+        fit.machines(measured))``, that has an evaluation model.
+        """
+        known = None if self.evaluation is None else known_machines(self)
+        return None if known is None else PlantMachines(self, known)
 
     @cached_property
     def evaluation_plant(self) -> StandardPlant | None:

@@ -81,6 +81,8 @@ class ReducedModel(Value):
         Of a joined machine: how it was joined, with the checks that were made; not after an update.
     calibration : MeasuredModes, optional
         The measured poles that `calibrated` put in.
+    machines : Machines, optional
+        What the update that it is from leaves open of the machine.
 
     References
     ----------
@@ -113,6 +115,7 @@ class ReducedModel(Value):
     joint_motions: FloatArray | None = field(default=None, metadata=_COLUMNS)
     joining: Value | None = None
     calibration: Value | None = None
+    machines: Value | None = None
 
     def __post_init__(self) -> None:
         names = tuple(map(str, self.coordinates)) or self.dofs.labels

@@ -14,7 +14,7 @@ from ..errors import AssumptionError, LabelError, ModelError, counted, only_one,
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
 from ..loop.broken import error_sensitivity
-from ..loop.sensitivity_functions import first_crossing
+from ..loop.machine_figures import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency

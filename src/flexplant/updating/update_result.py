@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, between, positive, whole
-from ..errors import ModelError, counted, require_known, short
+from ..errors import ModelError, attempted, counted, require_known, short
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..seeds import MOST_DRAWS, Rng, generator
@@ -18,12 +19,16 @@ from ..words import with_deviation
 from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .judgement.goodness import chance, is_bad
+from .machines import COUNT, Machines
 from .parameters import AddedMass, Parameter
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
+from .trend import Trend, trend_of
 
 #: share of machines that two printed deviations hold
 SHARE = 0.95
+#: most DOFs of a full model whose modes are solved for a print
+_DENSE = 1500
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,6 +262,7 @@ class UpdateResult(Value):
             lines.append(f"  priors that took no part: {', '.join(unused[:5])}")
         if self.determined is not None:
             lines.append(f"  determined only: {'; '.join(self.determined) or 'nothing':.200}")
+        lines += self._trend_lines
         if self.negative_masses:
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         rivals = [] if self.starts is None else self.starts.rivals
@@ -273,6 +279,19 @@ class UpdateResult(Value):
         if self.p_value is not None:
             head += f", chi2 {self.chi2:.4g} for {self.dof} dof"
         return "\n".join([head, *lines]) + ">"
+
+    @cached_property
+    def _trend_lines(self) -> list[str]:
+        """What the fitted frequencies say of the model: a trend, and pairs that may be swapped."""
+        model = self.model
+        if self.fitted_poles is None or not (hasattr(model, "T") or model.n_dof <= _DENSE):
+            return []
+        found = None
+        with attempted("the trend of what is left", ModelError):
+            found = self.trend()
+        if found is None or found.dof < 1 or not found.missing:
+            return []
+        return [f"  {found.missing}"]
 
     def interval(self, level: float = 0.95) -> FloatArray:
         """Return confidence (credible) intervals (q, 2) of the parameters, of a level in 0 .. 1.
@@ -394,7 +413,39 @@ class UpdateResult(Value):
                 "a full model has more modes than can be solved and put back. Use "
                 "fit.modes(count=...).calibrated(measured)."
             )
-        return self.model.calibrated(measured)
+        found = self.model.calibrated(measured)
+        return found.replace(machines=self.machines(measured)) if self.unknowns else found
+
+    def machines(self, measured: MeasuredModes, *, count: int = COUNT, seed: int = 0) -> Machines:
+        """Return what is not known of the machine, as draws of whole machines; see `Machines`.
+
+        Parameters
+        ----------
+        measured : MeasuredModes
+            All measured modes, with numbers of this fit's model; with shapes where they were
+            measured.
+        count : int
+            Number of machines that are drawn for an interval.
+        seed : int
+            Seed of the draws.
+        """
+        return Machines(self, measured, count, seed)
+
+    def trend(self, measured: MeasuredModes | None = None) -> Trend:
+        """Return whether the model lacks something that grows with frequency; see `Trend`.
+
+        Parameters
+        ----------
+        measured : MeasuredModes, optional
+            Measured modes with numbers; the poles that were fitted when not given.
+        """
+        poles = self.fitted_poles if measured is None else measured
+        if poles is None:
+            raise ModelError(
+                "the fit was not made from one set of measured poles. Pass them: "
+                "fit.trend(measured)."
+            )
+        return trend_of(self, poles)
 
     def frequency_uncertainty(
         self, measured: Any, *, mesh: MeshError | None = None

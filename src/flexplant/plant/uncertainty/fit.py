@@ -14,7 +14,7 @@ from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
 from ...tolerances import ROUNDING, SAME
-from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
+from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ...words import members, several
 from ..partitioned import Partition
@@ -74,14 +74,14 @@ class Fit(Uncertainty):
       mode2:damping +- 33.7 %>
     """
 
-    source: UpdateResult | ModalUncertainty | MeasuredModes
+    source: UpdateResult | ModalUncertainty | MeasuredModes | Machines
     modes: Sequence[int] | None = field(default=None, kw_only=True)
     parameters: Sequence[Parameter] | None = field(default=None, kw_only=True)
     deviations: float = field(default=DEVIATIONS, kw_only=True)
 
     def __post_init__(self) -> None:
         given: Any = self.source
-        if not isinstance(given, UpdateResult | ModalUncertainty | MeasuredModes):
+        if not isinstance(given, UpdateResult | ModalUncertainty | MeasuredModes | Machines):
             raise ModelError(
                 "uncertainty comes from an UpdateResult, ModalUncertainty or MeasuredModes, got "
                 f"{short(given)}: pass one, fit.uncertainty(measured), or state it: "
@@ -97,6 +97,8 @@ class Fit(Uncertainty):
     def known(self, plant: Partition) -> Known:
         """Return Deltas of modes, or of parameters where damping couples the modes."""
         source = self.source
+        if isinstance(source, Machines):
+            source = source.fit
         if isinstance(source, UpdateResult):
             calibration = _calibration_of(plant)
             if plant.form.startswith("dense"):

@@ -16,7 +16,7 @@ from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
 from ...seeds import MOST_DRAWS, generator
 from ...store import Value
-from ...updating import ModalUncertainty, UpdateResult
+from ...updating import Machines, ModalUncertainty, UpdateResult
 from ...words import mapping
 from ..building import P
 from ..partitioned import Partition
@@ -330,7 +330,7 @@ def understood(given: Any) -> Uncertainty:
     """Return a kind of uncertainty; of a fit, a measurement or a bound what it stands for."""
     if isinstance(given, Uncertainty):
         return given
-    if isinstance(given, UpdateResult | ModalUncertainty | MeasuredModes):
+    if isinstance(given, UpdateResult | ModalUncertainty | MeasuredModes | Machines):
         return Fit(given)
     if isinstance(given, NeglectedModes):
         return Neglected(given)

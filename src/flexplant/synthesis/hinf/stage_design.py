@@ -19,8 +19,8 @@ from ...errors import (
     attempted,
 )
 from ...loop import ClosedLoop, close_loop
+from ...loop.machine_figures import axis_bandwidths
 from ...loop.other_machines import BEYOND, mode_tolerances
-from ...loop.report import axis_bandwidths
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress

@@ -1,0 +1,120 @@
+"""Figures of a loop on the machines that the measurement allows, and their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..lti.frequency_sweep import crossings
+from ..plant.machine_plants import LEVEL, FigureInterval, PlantMachines, interval, interval_text
+from ..words import one_of
+from .broken import axis_sensitivities
+
+#: what a loop's print has an interval of
+MARGIN, BANDWIDTH, RADIUS = FIGURES = ("modulus margin", "bandwidth", "spectral radius")
+
+
+class MachineLoops:
+    """One controller around every machine that the measurement allows; each figure found once."""
+
+    def __init__(self, loop: Any, machines: PlantMachines) -> None:
+        self.machines = machines
+        self.loops = [loop.around(loop.plant.around(plant)) for plant in machines.plants]
+        self._found: dict[str, FloatArray] = {}
+
+    @property
+    def unstable(self) -> int:
+        """On how many machines the loop is not stable."""
+        return sum(not loop.is_stable for loop in self.loops)
+
+    def values(self, figure: str) -> FloatArray:
+        """Return a figure, or the rms of a channel, on each machine."""
+        if figure not in self._found:
+            self._found[figure] = np.array([_figure(loop, figure) for loop in self.loops])
+        return self._found[figure]
+
+
+def first_crossing(
+    freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
+) -> float:
+    """Return where a size first rises to 1 from below [Hz], infinite where it stays below."""
+    # between two points where it can be found there
+    beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
+    if not beyond.size:
+        return float("inf")
+    pair, found = slice(beyond[0] - 1, beyond[0] + 1), freq[beyond[:1]]
+    if find is not None:
+        between = crossings(lambda f: find(f) - 1.0, freq[pair], size[pair] - 1.0)
+        found = np.append(between, found)
+    return float(found[0])
+
+
+def crossing(loop: Any, reference: str, error: str, curve: tuple[FloatArray, FloatArray]) -> float:
+    """Return where |S| first crosses 1 from below [Hz]; 0 where it is nowhere below."""
+    gain = loop.gain(reference, error)
+    below = np.any(curve[1] < 1.0)
+    return first_crossing(*curve, lambda freq: np.abs(gain(freq)[0, 0])) if below else 0.0
+
+
+def axis_bandwidths(loop: Any) -> dict[str, float]:
+    """Return where |S| of each reference first crosses 1 from below [Hz], 0 if never below."""
+    return {
+        f"{axis}:ref": crossing(loop, f"{axis}:ref", f"{axis}:error", curve)
+        for axis, curve in axis_sensitivities(loop).items()
+    }
+
+
+def _figure(loop: Any, figure: str) -> float:
+    if figure == BANDWIDTH:
+        return min(axis_bandwidths(loop).values())
+    if figure == RADIUS:  # the distance to the circle is log-normal, not the radius
+        return 1.0 - float(loop.spectral_radius)
+    return float(loop.modulus_margin if figure == MARGIN else loop.rms(figure))
+
+
+def loop_interval(loop: Any, figure: str, level: float) -> FigureInterval:
+    """Return the interval of a figure or a channel's rms; see `ClosedLoop.interval`."""
+    known = loop.plant.machine.machines
+    if figure not in loop.monitored.outputs:
+        one_of(figure, "figure", (*FIGURES, *loop.monitored.outputs))
+    if known is None or known.missing:
+        return interval(known, lambda: np.zeros(0), level, "")
+    loops = loop.on_machines
+    if loops.unstable:
+        return FigureInterval(
+            None, None, f"unstable on {loops.unstable} of {len(loops.loops)} such machines"
+        )
+    if figure == BANDWIDTH and not axis_sensitivities(loop):
+        return FigureInterval(None, None, "no interval: the loop has no reference")
+    unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
+    found = interval(known, partial(loops.values, figure), level, unit)
+    if figure != RADIUS or found.low is None or found.high is None:
+        return found
+    low, high = 1.0 - found.high, 1.0 - found.low
+    return FigureInterval(
+        low, high, f"{low:.6f} to {high:.6f} on {100 * level:.3g} % of such machines"
+    )
+
+
+def interval_line(loop: Any) -> str:
+    """Return the line of a loop's print: intervals of all figures, or what is missing for them."""
+    known = loop.plant.machine.machines
+    if known is None:
+        return ""
+    found = {figure: loop_interval(loop, figure, LEVEL) for figure in FIGURES}
+    if found[MARGIN].low is None:
+        return found[MARGIN].sentence
+    parts = []
+    for figure, one in found.items():
+        if one.low is not None and one.high is not None:
+            ends = (
+                f"{one.low:.6f} to {one.high:.6f}"
+                if figure == RADIUS
+                else interval_text(one.low, one.high, "Hz" if figure == BANDWIDTH else "")
+            )
+            parts.append(f"{figure} {ends}")
+    return f"on {100 * LEVEL:.3g} % of such machines: " + ", ".join(parts)

@@ -1,0 +1,181 @@
+"""What is not known of a machine after an update, as draws of whole machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..arrays import FloatArray, whole
+from ..errors import ModelError, counted
+from ..identification import MeasuredModes
+from ..modes import Modes
+from ..store import Value
+from ..words import instance
+from .parameters import AddedMass, Parameter, PointParameter
+from .residuals.modal_residuals import ZETA
+from .trend import Trend, trend_of
+
+#: draws of which a log-normal distribution makes an interval: the deviation of its logarithm is
+#: then known to 11 %
+COUNT = 40
+#: draws refused in a row after which the posterior holds no machine
+_REFUSED = 200
+
+
+class Draw(NamedTuple):
+    """One machine: the deviation s, changes (p,) of all parameters, the slope, its share as mass.
+
+    `damping` are the mean and deviation of the logarithm of a damping ratio over the model's.
+    """
+
+    deviation: float
+    parameters: FloatArray
+    slope: float
+    as_mass: float
+    damping: tuple[float, float]
+    poles: Any
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Machines(Value):
+    """What is not known of a machine after an update: draws of whole machines.
+
+    Made by ``fit.machines(measured)``; ``plant.uncertain(machines)`` puts it on a plant, and a
+    plant of ``fit.calibrated(measured)`` has it without asking. Machines are drawn in modal
+    coordinates of the plant's evaluation model, with frequencies Omega and unit mass:
+
+    - deviation s, changes dp of the parameters and slope b from their posterior (`Trend`);
+    - trend ``t = sign(b) log(1 + 2 |b| g) / 2`` with g the frequency over the largest measured, a
+      share r of it, uniform between 0 and 1, as mass and the rest as stiffness;
+    - ``M' = exp(-r t) (I + sum dp dM) exp(-r t)``, ``K' = Omega exp(E) Omega + sum dp dK``, E
+      symmetric with ``2 (s e + (1 - r) t)`` on its diagonal and deviations ``sqrt(2) s`` off it:
+      frequencies and shapes move together. Rigid-body masses have the deviation 2 s, as nobody
+      weighed them;
+    - poles of measured modes from their covariance; other dampings from Student's predictive
+      distribution of the measured ones.
+
+    Parameters
+    ----------
+    fit : UpdateResult
+        The update.
+    measured : MeasuredModes
+        Measured modes with numbers of the fit's model.
+    count : int
+        Number of machines that are drawn for an interval.
+    seed : int
+        Seed of the draws: machine i is the same whatever `count` is.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> drawing = fx.chain(masses=[1.0] * 5, stiffnesses=[4e5] * 4)
+    >>> poles = [-3.9 + 390j, -7.4 + 743j, -10 + 1023j, -12 + 1202j]
+    >>> measured = fx.MeasuredModes(poles, modes=[2, 3, 4, 5])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> fit.machines(measured)
+    <Machines: 40 draws of 4 measured modes, frequencies +- 0.031 %, 2 dof>
+    """
+
+    fit: Any
+    measured: MeasuredModes
+    count: int = COUNT
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        instance(self.measured, MeasuredModes, "measured", "Pass identify_modes(frf), numbered.")
+        self._set(
+            count=whole(self.count, "count", minimum=2), seed=whole(self.seed, "seed", minimum=0)
+        )
+
+    @cached_property
+    def trend(self) -> Trend:
+        """What is left of the measured frequencies."""
+        return trend_of(self.fit, self.measured)
+
+    @property
+    def missing(self) -> str:
+        """What is missing for an interval, one sentence; empty where nothing is."""
+        return self.trend.missing
+
+    @cached_property
+    def damping_changes(self) -> FloatArray:
+        """Logarithms of measured damping ratios over those of the model (of damped modes)."""
+        poles = self.measured.poles
+        found = -poles.real / np.abs(poles)
+        return np.log(found[found > ZETA] / self._own_damping[found > ZETA])
+
+    @cached_property
+    def _own_damping(self) -> FloatArray:
+        """Damping ratios of the model's measured modes; 1 where it has none."""
+        modes: Modes = self.fit.modes()
+        zeta = np.array([modes.zeta[number - 1] for number in self.measured.modes or ()])
+        return np.where(zeta > ZETA, zeta, 1.0)
+
+    def draw(self, rng: np.random.Generator) -> Draw:
+        """Return one machine that the measurement allows, masses not negative."""
+        for _ in range(_REFUSED):
+            s, moved, b = self.trend.posterior(rng)
+            dp = np.zeros(self.fit.values.size)
+            dp[list(self.trend.moves)] = moved
+            masses = (
+                value + change >= 0.0
+                for q, value, change in zip(self.fit.unknowns, self.fit.values, dp, strict=True)
+                if isinstance(q, AddedMass)
+            )
+            if all(masses):
+                return Draw(s, dp, b, rng.random(), self._damping(rng), self._poles(rng), rng)
+        raise ModelError(
+            f"{_REFUSED} draws in a row have a negative added mass: nothing was added there, or "
+            "the model lacks something else. Leave the parameter out."
+        )
+
+    def _damping(self, rng: np.random.Generator) -> tuple[float, float]:
+        """Return mean and deviation of log damping, from the posterior of the measured ones."""
+        known = self.damping_changes
+        if known.size < 2:
+            return 0.0, 0.0
+        dof = known.size - 1
+        size = float(np.std(known, ddof=1)) * np.sqrt(dof / rng.chisquare(dof))
+        return float(known.mean() + size / np.sqrt(known.size) * rng.standard_normal()), float(size)
+
+    def _poles(self, rng: np.random.Generator) -> Any:
+        """Return the measured poles, drawn from their covariance where they have one."""
+        poles, covariance = self.measured.poles, self.measured.covariance
+        if covariance is None:
+            return poles
+        moved = la.cholesky(covariance, lower=True) @ rng.standard_normal(2 * poles.size)
+        found = poles + moved[: poles.size] + 1j * moved[poles.size :]
+        return np.minimum(found.real, 0.0) + 1j * found.imag
+
+    def located(self) -> list[Parameter]:
+        """Return the parameters with points in place of labels, which another mesh has too."""
+        model = self.fit.model
+        dofs = getattr(model, "full_dofs", None) or model.dofs
+        return [_located(q, dofs) for q in self.fit.unknowns]
+
+    def __repr__(self) -> str:
+        trend = self.trend
+        if self.missing:
+            return f"<Machines: no interval: {self.missing}>"
+        return (
+            f"<Machines: {counted(self.count, 'draw')} of {len(trend.modes)} measured modes, "
+            f"frequencies +- {100 * trend.deviation:.2g} %, {trend.dof} dof>"
+        )
+
+
+def _located(parameter: Parameter, dofs: Any) -> Parameter:
+    """Return a parameter at a point where its label is; others as they are."""
+    if not isinstance(parameter, PointParameter):
+        return parameter
+    at = parameter.at
+    if isinstance(at, str) and parameter.to is None:
+        place = dofs.index(at)
+        return parameter.replace(
+            at=tuple(dofs.xyz[place].tolist()), direction=dofs.directions[place]
+        )
+    return parameter

@@ -1,0 +1,238 @@
+"""Whether what an update leaves grows with frequency: a test that needs no other machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..arrays import FloatArray
+from ..errors import ModelError
+from ..identification import MeasuredModes
+from ..store import Value
+from ..tolerances import ROUNDING, TINY
+from .sensitivities import eigenvalue_sensitivities
+
+#: probability with which a model that lacks nothing is said to lack something
+LEVEL = 0.003
+#: share of the machines that an interval of a frequency holds where pairs are compared
+_HELD = 0.95
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Trend(Value):
+    """What is left of measured frequencies, regressed on the parameters and on frequency.
+
+    ``log(f_measured / f_model) = S dp + b g + s e`` of m measured modes: S are the derivatives of
+    the logarithms of the q parameters that move frequencies, g the measured frequency over the
+    largest, e standard normal. Where the errors of a model are those of its parameters and scatter
+    b is zero: its estimate over its deviation follows Student's distribution with ``m - q - 1``
+    degrees of freedom. A slope means that the model lacks something that grows with frequency:
+    shear, rotary inertia, smaller elements.
+
+    Parameters
+    ----------
+    modes : sequence of m int
+        Numbers of the measured modes, from 1.
+    freq : (m,) array [Hz]
+        Measured frequencies.
+    model_freq : (m,) array [Hz]
+        Frequencies of the updated model.
+    S : (m, q) array [1/unit]
+        Derivatives of the logarithms of the model's frequencies to its parameters.
+    moves : sequence of int
+        Places, among all parameters of the fit, of the q that move frequencies.
+    shaped : bool
+        Whether the modes were numbered by measured shapes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> drawing = fx.chain(masses=[1.0] * 5, stiffnesses=[4e5] * 4)
+    >>> measured = fx.MeasuredModes(poles=[390j, 743j, 1023j, 1202j], modes=[2, 3, 4, 5])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> fit.trend(measured).dof
+    2
+    """
+
+    modes: tuple[int, ...]
+    freq: FloatArray
+    model_freq: FloatArray
+    S: FloatArray
+    moves: tuple[int, ...]
+    shaped: bool = False
+
+    @property
+    def highest(self) -> float:
+        """The largest measured frequency [Hz], to which `slope` belongs."""
+        return float(np.max(self.freq))
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom ``m - q - 1``; below 1 there is no estimate of what is left."""
+        return len(self.modes) - int(self.S.shape[1]) - 1
+
+    @cached_property
+    def _regression(self) -> tuple[FloatArray, FloatArray, float]:
+        """The estimates (q + 1,) of dp and b, a root of their covariance over s^2, and s."""
+        X = np.column_stack([self.S, self.freq / self.highest])
+        size = np.linalg.norm(X, axis=0)
+        y = np.log(self.freq / self.model_freq)
+        Q, R = la.qr(X / size, mode="economic")
+        found = la.solve_triangular(R, Q.T @ y)
+        left = y - Q @ (Q.T @ y)
+        s = float(np.sqrt(left @ left / self.dof))
+        return found / size, la.inv(R) / size[:, None], s
+
+    @property
+    def deviation(self) -> float:
+        """s, the relative deviation of a frequency that parameters and slope leave."""
+        return self._regression[2]
+
+    @property
+    def slope(self) -> float:
+        """b, the relative error at the highest measured frequency that grows with frequency."""
+        return float(self._regression[0][-1])
+
+    @property
+    def slope_deviation(self) -> float:
+        """Standard deviation of `slope`."""
+        return self.deviation * float(np.linalg.norm(self._regression[1][-1]))
+
+    @property
+    def p_value(self) -> float:
+        """The probability of a larger slope of either sign where the model lacks nothing."""
+        from scipy.special import stdtr
+
+        if self.dof < 1:
+            return 1.0
+        ratio = abs(self.slope) / max(self.slope_deviation, np.finfo(float).tiny)
+        return float(2.0 * stdtr(self.dof, -ratio))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether chance makes such a slope in less than 0.3 % of cases."""
+        return self.p_value < LEVEL
+
+    @property
+    def unshaped_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Neighbouring modes that scatter may have swapped, and no measured shape tells apart."""
+        from scipy.special import stdtrit
+
+        if self.shaped or self.dof < 1:
+            return ()
+        order = np.argsort(self.model_freq)
+        gaps = np.diff(np.log(self.model_freq[order]))
+        wide = float(stdtrit(self.dof, 0.5 * (1 + _HELD))) * np.sqrt(2.0) * self.deviation
+        numbers = [self.modes[i] for i in order]
+        return tuple((numbers[i], numbers[i + 1]) for i in np.flatnonzero(gaps < wide).tolist())
+
+    @cached_property
+    def outlier(self) -> tuple[int, float] | None:
+        """The mode that does not belong to the others, and its error beside theirs; or None.
+
+        By its externally studentised residual, which follows Student's distribution with one degree
+        of freedom less: chance alone names a mode in 0.3 % of fits.
+        """
+        from scipy.special import stdtr
+
+        m, dof = len(self.modes), self.dof
+        if dof < 2:
+            return None
+        X = np.column_stack([self.S, self.freq / self.highest])
+        Q = la.qr(X / np.linalg.norm(X, axis=0), mode="economic")[0]
+        y = np.log(self.freq / self.model_freq)
+        left, free = y - Q @ (Q.T @ y), 1.0 - np.sum(Q**2, axis=1)
+        alone = left / np.maximum(free, ROUNDING)
+        others = np.maximum(left @ left - left * alone, TINY) / (dof - 1)
+        chance = 2.0 * m * stdtr(dof - 1, -np.abs(alone) * np.sqrt(free / others))
+        worst = int(np.argmin(chance))
+        return (self.modes[worst], float(alone[worst])) if chance[worst] < LEVEL else None
+
+    @property
+    def missing(self) -> str:
+        """What is missing for a statement about machines, one sentence; empty where nothing is."""
+        q = self.S.shape[1]
+        if self.dof < 1:
+            return (
+                f"{len(self.modes)} measured frequencies for {q} parameters and a trend leave "
+                f"nothing to judge the model by: measure {q + 2} modes or more"
+            )
+        if self.outlier is not None:
+            mode, off = self.outlier
+            return (
+                f"mode {mode} is {100 * off:+.2g} % off by what the other modes say: its number "
+                "may be wrong, or its pole is not of this structure"
+            )
+        if self.is_significant:
+            return (
+                f"the model lacks something that grows with frequency ({self.text}): shear, "
+                "rotary inertia or smaller elements"
+            )
+        if self.unshaped_pairs:
+            pairs = ", ".join(f"{a} and {b}" for a, b in self.unshaped_pairs)
+            return (
+                f"modes {pairs} may be swapped: measure their shapes, numbered(identify_modes(frf),"
+                " model, at=...)"
+            )
+        return ""
+
+    @property
+    def text(self) -> str:
+        """The slope in words."""
+        return (
+            f"{100 * self.slope:+.2g} +- {100 * self.slope_deviation:.1g} % at "
+            f"{self.highest:.4g} Hz"
+        )
+
+    def posterior(self, rng: np.random.Generator) -> tuple[float, FloatArray, float]:
+        """Return a draw of s, dp (q,) and b, given what was measured and a flat prior.
+
+        ``s^2 = dof s_hat^2 / chi^2_dof``, and dp and b normal about their estimates with s.
+        """
+        if self.dof < 1:
+            raise ModelError(f"there is no posterior: {self.missing}.")
+        found, root, s_hat = self._regression
+        s = s_hat * float(np.sqrt(self.dof / rng.chisquare(self.dof)))
+        drawn = found + s * (root @ rng.standard_normal(found.size))
+        return s, drawn[:-1], float(drawn[-1])
+
+    def __repr__(self) -> str:
+        if self.dof < 1:
+            return f"<Trend: {self.missing}>"
+        held = "significant" if self.is_significant else "not significant"
+        return f"<Trend: {self.text}, {held} (p {self.p_value:.2g}, {self.dof} dof)>"
+
+
+def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
+    """Return the trend of a fit's model over measured modes."""
+    about = [q.about(v) for q, v in zip(fit.unknowns, fit.values.tolist(), strict=True)]
+    numbers = measured.modes
+    if numbers is None:
+        raise ModelError(
+            "measured modes need the numbers of the model's modes: MeasuredModes(poles, "
+            "modes=[...]), or flexplant.numbered(measured, model)."
+        )
+    found = eigenvalue_sensitivities(fit.model, about, modes=numbers)
+    own = [found.modes.index(number) for number in numbers]
+    poles, S = found.poles[own], found.S[own]
+    relative = np.real(S / poles[:, None])
+    size = np.abs(relative).max(axis=0, initial=0.0) * _amounts(fit)
+    moves = np.flatnonzero(size > ROUNDING * np.max(size, initial=0.0))
+    return Trend(
+        tuple(numbers),
+        np.abs(measured.poles) / (2 * np.pi),
+        np.abs(poles) / (2 * np.pi),
+        relative[:, moves],
+        tuple(moves.tolist()),
+        measured.shapes is not None,
+    )
+
+
+def _amounts(fit: Any) -> FloatArray:
+    """Return the size of each parameter, so that their effects compare whatever their units."""
+    std = np.zeros(fit.values.size) if fit.std is None else fit.std
+    return np.asarray(np.maximum(np.abs(fit.values), std))

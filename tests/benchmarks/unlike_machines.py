@@ -1,0 +1,109 @@
+"""Machines that share no code with a drawing: plates in polynomials and their poles and errors.
+
+Never imports flexplant. A machine is a set of modes with the rows of its channels; what a filter
+misses on it is a discrete Lyapunov equation over machine and filter.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from oracles_mindlin import _line, mindlin_matrices
+
+#: order of the polynomials and modes of a machine: to four times half the sampling rate
+ORDER, MODES = 13, 120
+
+
+@dataclass
+class Machine:
+    """Modes of a machine: omega [rad/s], damping ratios, rows (channels, modes)."""
+
+    omega: np.ndarray
+    zeta: np.ndarray
+    push: np.ndarray
+    sensors: np.ndarray
+    poi: np.ndarray
+    shapes: np.ndarray | None = None
+
+    def continuous(self):
+        """A, B of forces, C of sensors and POI; a rigid-body mode swings at 0.01 Hz."""
+        n = self.omega.size
+        omega = np.where(self.omega > 0, self.omega, 2 * np.pi * 0.01)
+        zeta = np.where(self.omega > 0, self.zeta, 0.7)
+        A = np.zeros((2 * n, 2 * n))
+        A[np.arange(n), n + np.arange(n)] = omega
+        A[n + np.arange(n), np.arange(n)] = -omega
+        A[n + np.arange(n), n + np.arange(n)] = -2 * zeta * omega
+        B = np.vstack([np.zeros((n, len(self.push))), self.push.T])
+        C = np.hstack(
+            [np.vstack([self.sensors, self.poi]) / omega, np.zeros((len(self.sensors) + 3, n))]
+        )
+        return A, B, C
+
+    def poles(self, count):
+        """The lowest poles that swing, by frequency."""
+        swings = self.omega > 0
+        omega, zeta = self.omega[swings][:count], self.zeta[swings][:count]
+        return omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+
+
+def _row(size, place, order, slope=None):
+    """Row over (deflection, slope x, slope y) of the motion at a place."""
+    at = [np.array([2 * p / n - 1]) for p, n in zip(place, size, strict=True)]
+    values = np.kron(*(_line(order, one)[0][0] for one in at))
+    none = np.zeros_like(values)
+    parts = {None: [values, none, none], "rx": [none, none, values], "ry": [none, -values, none]}
+    return np.concatenate(parts[slope])
+
+
+def plate_machine(
+    rng, size, thickness, density, E, nu, *, forces, sensors, poi, zeta, masses, scatter=0.02
+):
+    """A free Mindlin plate whose stiffness varies by `scatter`, and its dampings by a quarter."""
+    heights = rng.normal(size=(3, 3)) * scatter / 1.5
+
+    def stiff(x, y):
+        waves = [
+            np.cos(np.pi * np.arange(3) * at[..., None] / n)
+            for at, n in zip((x, y), size, strict=True)
+        ]
+        own = 1.0 + np.einsum("...i,ij,...j->...", waves[0], heights, waves[1])
+        return own * (E(x, y) if callable(E) else E)
+
+    M, K = mindlin_matrices(size, thickness, density, stiff, nu, order=ORDER, masses=masses)
+    values, phi = la.eigh(K, M, subset_by_index=(0, MODES - 1))
+    omega = np.sqrt(np.maximum(values, 0.0))
+    omega[:3] = 0.0
+    damping = zeta * np.exp(0.25 * rng.normal(size=MODES))
+    rows = {
+        "push": [_row(size, p, ORDER) for p in forces],
+        "sensors": [_row(size, p, ORDER) for p in sensors],
+        "poi": [_row(size, poi, ORDER, motion) for motion in (None, "rx", "ry")],
+    }
+    seen = {name: np.array(part) @ phi for name, part in rows.items()}
+    return Machine(omega, damping, **seen)
+
+
+def true_errors(machine, filter_system, forces_asd, noise_asd, rate, count):
+    """Rms errors of the estimates on a machine, u at rest: a Lyapunov equation in unit states.
+
+    `filter_system` is (A, B, C, D) from the sensors to the estimates.
+    """
+    A, B, C = machine.continuous()
+    n, h = A.shape[0], 1.0 / rate
+    # exact covariance of white forces over a sample (Van Loan), mode by mode
+    Q, Ad = np.zeros((n, n)), la.expm(A * h)
+    W = B @ B.T * 0.5 * forces_asd**2
+    steps, weights = np.polynomial.legendre.leggauss(24)
+    for s, w in zip(0.5 * h * (steps + 1), 0.5 * h * weights, strict=True):
+        part = la.expm(A * s)
+        Q += w * part @ W @ part.T
+    Af, Bf, Cf, Df = filter_system
+    y, z = C[:count], C[count:]
+    joint = np.block([[Ad, np.zeros((n, Af.shape[0]))], [Bf @ y, Af]])
+    R = np.eye(count) * noise_asd**2 * rate / 2
+    noise = la.block_diag(Q, Bf @ R @ Bf.T)
+    E = np.hstack([z - Df @ y, -Cf])
+    X = la.solve_discrete_lyapunov(joint, noise)
+    return np.sqrt(np.diag(E @ X @ E.T + Df @ R @ Df.T))

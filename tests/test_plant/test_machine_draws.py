@@ -1,0 +1,263 @@
+"""Draws of whole machines: against matrices that are changed by hand, and their own statistics."""
+
+import warnings
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+import scipy.stats
+
+import flexplant as fx
+from flexplant.errors import ModelError
+from flexplant.plant.machine_draws import MachineFamily
+from flexplant.plant.machine_plants import interval_of
+from flexplant.plant.realisation import realise
+from flexplant.updating.machines import Draw
+
+STEEL = {"density": 7850.0, "youngs_modulus": 210e9, "area": 1e-3, "inertia": 8e-8}
+HEAVIER = 0.3
+
+
+def beam(cells=12):
+    return fx.beam(length=1.0, elements=cells, **STEEL)
+
+
+def measured_of(model, count, rng, scatter=2e-3, covariance=True):
+    """Poles of the true machine: a mass more, scattered frequencies and dampings."""
+    true = model.with_parts(fx.PointMass("7:z", HEAVIER))
+    omega = fx.solve_modes(true, count=2 + count).omega[2:]
+    omega = omega * np.exp(scatter * rng.normal(size=count))
+    zeta = 0.01 * np.exp(0.2 * rng.normal(size=count))
+    poles = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    std = (1e-6 * np.abs(poles)) ** 2 if covariance else None
+    return fx.MeasuredModes(poles, modes=range(3, 3 + count), covariance=std)
+
+
+def ports():
+    return fx.Ports(
+        w=[fx.Disturbance(f"amp{i}", at=(x, 0, 0), asd=1e-3) for i, x in ((1, 0.25), (2, 0.75))],
+        u=[fx.Actuator(f"u{i}", at=(x, 0, 0)) for i, x in ((1, 0.25), (2, 0.75))],
+        z=[fx.Poi("die", at=(0.5, 0, 0), axes=("z", "ry"))],
+        y=[fx.Sensor(f"y{i}", at=(x, 0, 0), asd=1e-11) for i, x in ((1, 0.0), (2, 1.0))],
+        references=[fx.Reference("die", axes=("z", "ry"))],
+    )
+
+
+class Case:
+    def __init__(self, count=7, seed=1, **options):
+        rng = np.random.default_rng(seed)
+        self.full = beam()
+        damping = fx.ModalDamping(0.01)
+        modes = fx.solve_modes(self.full, count=12, damping=damping)
+        rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 12, required=["7:z"]).labels))
+        self.measured = measured_of(self.full, count, rng, **options)
+        unknown = [fx.AddedMass("7:z"), fx.MatrixParameter("E", dK=rom.K)]
+        with warnings.catch_warnings(action="ignore"):  # scatter is more than noise
+            self.fit = fx.update(rom, unknown, [fx.Eigenvalues(self.measured)])
+        mass, stiffer = self.fit.values
+        changed = beam().replace(K=self.full.K * (1 + stiffer))
+        self.changed = changed.with_parts(fx.PointMass("7:z", mass))
+        self.whole = fx.solve_modes(self.changed, count=26, damping=damping)
+        self.machines = self.fit.machines(self.measured)
+
+    def plant(self):
+        whole = self.whole.calibrated(self.measured)
+        model = self.fit.calibrated(self.measured)
+        return fx.assemble_plant(model, ports(), evaluation=whole).discretized(5e3, delay=1)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case()
+
+
+@pytest.fixture(scope="module")
+def plant(case):
+    return case.plant()
+
+
+def drawn(family, *, s=0.0, dp=(0.0, 0.0), b=0.0, r=0.5, seed=1):
+    poles = 2j * np.pi * family.machines.trend.model_freq  # where they are
+    draw = Draw(s, np.array(dp), b, r, (0.0, 0.0), poles, np.random.default_rng(seed))
+    return family._modes(draw)
+
+
+def own(realisation):
+    """Omega (b,) and shapes over the evaluation model's modes (b, b) of a drawn machine."""
+    omega = np.sqrt(np.maximum(np.linalg.det(realisation.pairs), 0.0))
+    omega[: realisation.n_rigid] = 0.0
+    return omega, realisation.inputs[:, 1::2]
+
+
+def unmeasured(case):
+    return slice(2 + len(case.measured), None)
+
+
+def test_parameters_move_modes_as_changed_matrices_do(case):
+    """All modes of the full model are in the evaluation model: the changes are exact."""
+    family = MachineFamily(realise(case.whole), case.machines)
+    omega, V = own(drawn(family, dp=(0.07, 0.0)))
+    M = case.changed.M.toarray()
+    row = case.full.dofs.row("7:z")
+    exact, _ = la.eigh(case.changed.K.toarray(), M + 0.07 * np.outer(row, row))
+    np.testing.assert_allclose(omega[unmeasured(case)] ** 2, exact[unmeasured(case)], rtol=1e-6)
+    # shapes have unit mass on the changed machine
+    shapes = family.over @ V
+    gram = shapes.T @ (M + 0.07 * np.outer(row, row)) @ shapes
+    assert np.abs(gram - np.eye(len(gram))).max() < 1e-6
+
+
+def test_a_stiffness_of_the_reduced_model_is_carried_to_all_modes(case):
+    family = MachineFamily(realise(case.whole), case.machines)
+    omega, _ = own(drawn(family, dp=(0.0, 0.02)))
+    at = unmeasured(case)
+    scale = np.sqrt(1.0 + 0.02 / (1.0 + case.fit["E"]))
+    np.testing.assert_allclose(omega[at] / family.omega[at], scale, rtol=2e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("slope", [-0.02, 0.01])
+def test_a_trend_moves_frequencies_and_its_share_of_mass_shapes(case, share, slope):
+    family = MachineFamily(realise(case.whole), case.machines)
+    omega, V = own(drawn(family, b=slope, r=share))
+    g = family.omega / (2 * np.pi * case.measured.freq.max())
+    t = 0.5 * np.sign(slope) * np.log(1 + 2 * abs(slope) * g)
+    at = unmeasured(case)
+    np.testing.assert_allclose(np.log(omega[at] / family.omega[at]), t[at], rtol=1e-6)
+    size = np.abs(np.diag(V))
+    np.testing.assert_allclose(size[at], np.exp(share * t[at]), rtol=1e-6)
+
+
+def test_scatter_moves_frequencies_and_shapes_together(case):
+    family = MachineFamily(realise(case.whole), case.machines)
+    s, at = 2e-3, unmeasured(case)
+    found = [own(drawn(family, s=s, seed=i)) for i in range(60)]
+    moved = np.array([np.log(omega[at] / family.omega[at]) for omega, _ in found])
+    assert moved.std() == pytest.approx(s, rel=0.15)
+    # first order: E_ij omega_i omega_j / (omega_j^2 - omega_i^2), of deviation sqrt(2) s
+    i, j = 12, 13
+    turned = np.array([V[i, j] * np.sign(V[j, j]) for _, V in found])
+    w = family.omega
+    expected = np.sqrt(2) * s * w[i] * w[j] / (w[j] ** 2 - w[i] ** 2)
+    assert turned.std() == pytest.approx(expected, rel=0.35)
+    # nobody weighed the machine: the rigid-body gain has twice the deviation of a frequency
+    gain = np.array([np.log(V[0, 0] ** 2 + V[1, 0] ** 2) for _, V in found])
+    assert gain.std() == pytest.approx(2 * s, rel=0.35)
+
+
+def test_measured_poles_are_put_back():
+    case = Case(covariance=False)
+    for modes in machines_of(case, 5):
+        poles = np.linalg.eigvals(modes.pairs[2 : 2 + len(case.measured)]).reshape(-1)
+        poles = np.sort_complex(poles[poles.imag > 0])
+        np.testing.assert_allclose(
+            np.sort(np.abs(poles)), np.sort(np.abs(case.measured.poles)), rtol=1e-9
+        )
+
+
+def machines_of(case, count):
+    """Drawn modes of a case."""
+    family = MachineFamily(realise(case.whole), case.machines)
+    return [family.machine(rng) for rng in np.random.default_rng(3).spawn(count)]
+
+
+def test_dampings_scatter_as_the_measured_ones(case):
+    """Student's predictive distribution of the logarithms of the measured dampings."""
+    logs = np.log(-case.measured.poles.real / np.abs(case.measured.poles))
+    m, at = logs.size, unmeasured(case)
+    drawn_logs = []
+    for modes in machines_of(case, 150):
+        omega = np.sqrt(np.linalg.det(modes.pairs[at]))
+        drawn_logs.append(np.log(-0.5 * np.trace(modes.pairs[at], axis1=1, axis2=2) / omega)[3])
+    ratio = (np.array(drawn_logs) - logs.mean()) / (logs.std(ddof=1) * np.sqrt(1 + 1 / m))
+    assert scipy.stats.kstest(ratio, scipy.stats.t(m - 1).cdf).pvalue > 0.01
+
+
+def test_a_plant_of_a_calibrated_model_has_machines_without_asking(case, plant):
+    assert len(plant.machines.plants) == 40
+    assert plant.machines.plants is plant.machines.plants
+    first = plant.machines.plants[0]
+    assert (first.u, first.y, first.dt, first.delay) == (plant.u, plant.y, plant.dt, plant.delay)
+    # another plant of the same evaluation model has the same machines
+    moved = plant.at(poi=(0.4, 0, 0))
+    again = moved.machines.plants[0]
+    assert again.assembled.realisation is first.assembled.realisation
+    other = fx.assemble_plant(case.fit.model, ports(), evaluation=case.whole)
+    assert other.machines is None
+    stated = other.uncertain(case.fit.machines(case.measured, count=5)).nominal
+    assert len(stated.machines.plants) == 5
+
+
+def test_machines_are_plants_of_their_matrices(case, plant):
+    """A drawn plant responds as one that is assembled from its modes by hand."""
+    found = plant.machines.plants[3]
+    modes = found.assembled.realisation
+    omega, V = own(modes)
+    zeta = -0.5 * np.trace(modes.pairs, axis1=1, axis2=2)[2:] / omega[2:]
+    by_hand = case.whole.replace(
+        omega=omega, zeta=np.append([0.0, 0.0], zeta), phi=case.whole.phi @ V, certificate={}
+    )
+    plain = fx.assemble_plant(by_hand, ports()).discretized(5e3, delay=1)
+    freq = np.array([3.0, 57.0, 411.0, 1300.0])
+    ours, theirs = (fx.frequency_response(one.Gyu, freq).data for one in (found, plain))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-7, atol=1e-7 * np.abs(theirs).max())
+
+
+def test_intervals_are_predictive_of_a_log_normal_figure():
+    rng = np.random.default_rng(6)
+    held = []
+    for _ in range(1500):
+        values = np.exp(0.1 + 0.2 * rng.normal(size=12))
+        low, high = interval_of(values, 0.9)
+        held.append(low < np.exp(0.1 + 0.2 * rng.normal()) < high)
+    assert np.mean(held) == pytest.approx(0.9, abs=0.03)
+    with pytest.raises(ModelError, match="positive"):
+        interval_of(np.array([1.0, 0.0]), 0.9)
+
+
+def test_an_observer_says_where_its_error_lies(plant):
+    observer = fx.design_kalman(plant)
+    low, high, sentence = observer.interval("die:z", 0.95)
+    assert low < observer.rms("die:z") < high
+    assert "on 95 % of such machines" in sentence
+    narrow = observer.interval("die", 0.5)
+    assert low < narrow.low < narrow.high < high
+    each = [observer.rms("die", on=machine) for machine in plant.machines.plants]
+    assert np.mean([(low <= one <= high) for one in each]) > 0.9
+    assert "on 95 % of such machines" in repr(observer)
+
+
+def test_a_loop_says_where_its_figures_lie(plant):
+    observer = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    margin = loop.interval("modulus margin")
+    assert 0 < margin.low < margin.high < 1
+    each = [loop.around(one).modulus_margin for one in plant.machines.plants]
+    assert margin.low < np.median(each) < margin.high
+    radius = loop.interval("spectral radius")
+    assert radius.low < loop.spectral_radius < radius.high < 1
+    width = loop.interval("bandwidth")
+    axes = ("die:ref", "die:ry:ref")
+    reached = [
+        fx.compare_loops({"servo": loop}, reference=axis).rows["servo"].bandwidth for axis in axes
+    ]
+    assert width.low < min(reached) < width.high
+    rms = loop.interval("die:z")
+    assert rms.low < loop.completed.rms("die:z") < rms.high
+    assert "modulus margin" in repr(loop).split("such machines")[1]
+    with pytest.raises(ModelError, match="figure"):
+        loop.interval("margins")
+
+
+def test_a_sentence_stands_where_something_is_missing():
+    few = Case(count=3)
+    plant = few.plant()
+    observer = fx.design_kalman(plant)
+    low, high, sentence = observer.interval("die:z")
+    assert (low, high) == (None, None)
+    assert "measure 4 modes or more" in sentence
+    assert "measure 4 modes or more" in repr(observer)
+    alone = fx.design_kalman(plant.replace(evaluation=None))
+    assert alone.interval("die:z").low is None
+    assert "evaluation=" in alone.interval("die:z").sentence
