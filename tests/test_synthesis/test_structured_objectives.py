@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 import scipy.linalg as la
 from test_structured import law, machine, named
 
@@ -129,6 +130,39 @@ def test_gradients_by_differences(kind, sampled):
         if kind is H2Judge:
             bend = step @ H @ step
             assert at(-1) - 2 * at(0) + at(1) == pytest.approx(bend, rel=1e-2, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_derivatives_of_a_peak_by_poles_of_unlike_speeds(seed):
+    """Modes of 1 to 1e4 rad/s: integrals between zeros that brentq finds, differences of them."""
+    rng = np.random.default_rng(seed)
+    speed, damping = 10.0 ** rng.uniform(0, 4, 3), rng.uniform(0.1, 0.9, 3)
+    upper = speed * (-damping + 1j * np.sqrt(1 - damping**2))
+    poles, residues = (
+        np.concatenate([one, one.conj()])
+        for one in (upper, rng.normal(size=3) + 1j * rng.normal(size=3))
+    )
+    end = 30.0 / np.min(-poles.real)
+    t = np.union1d(np.linspace(0, end, 20_001), np.geomspace(1e-8, end, 20_001))
+
+    def integral(poles):
+        def h(t):
+            return float(np.real(np.exp(poles * t) @ residues))
+
+        values = np.real(np.exp(np.outer(t, poles)) @ residues)
+        at = np.flatnonzero(values[1:] * values[:-1] < 0)
+        edges = [0.0, *(brentq(h, t[i], t[i + 1], xtol=1e-18) for i in at), end]
+        return np.abs(np.diff(np.real(np.exp(np.outer(edges, poles)) / poles @ residues))).sum()
+
+    _, S, slope = PeakJudge._continuous(poles, residues, 0.0, 0.0)
+    total = integral(poles)
+    assert np.real(residues @ S) == pytest.approx(total, rel=1e-9)
+    for k in range(3):
+        step = np.zeros(6, dtype=complex)
+        step[k] = 1e-6 * poles[k]
+        step[k + 3] = step[k].conj()
+        found = (integral(poles + step) - integral(poles - step)) / 2e-6
+        assert abs(2 * np.real(residues[k] * slope[k] * poles[k]) - found) < 1e-7 * total
 
 
 @pytest.mark.long

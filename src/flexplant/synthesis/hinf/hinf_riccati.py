@@ -109,7 +109,7 @@ class Riccati(Value):
             require_ranks(() if lack.is_full else lack.ranks)
             require_shown(problem)
             return self._regular(problem, _REGULAR)
-        if self.regularised is None and lack.is_nothing:
+        if self.regularised is None and not lack.words:
             return self._regular(problem, _REGULAR)
         back_off = _ADDED if lack.is_full else _SINGULAR
         return made_regular(problem, lambda regular: self._regular(regular, back_off), lack)
@@ -192,7 +192,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
     # seen at resonances alone
     quick = Riccati(tolerance=_QUICK, progress=False)
     lack = lacking(problem)
-    if lack.is_nothing:
+    if not lack.words:
         return quick._regular(problem, _REGULAR, _resonance_gain)
     regular = Regularised(problem, LEVELS[0], bool(lack.modes))
     found = quick._regular(regular.problem, _SINGULAR, _resonance_gain)

@@ -23,15 +23,11 @@ from ..scaling import FELT, THIRD, answers, normalised
 _RANK = 0.5
 #: what certificates call the size of what was added
 ADDED = "added noise"
-#: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken
-LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7)
-#: two more where D12 and D21 have full rank: what acts on a chain of k integrators costs the k-th
-#: root, and tiny efforts may be needed in full
-FINER = (*LEVELS, 1e-8, 1e-9)
+#: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
+#: What acts on a chain of k integrators costs the k-th root of its size
+LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 #: relative: what a level may cost in gamma, compared with a tenth of it
 _COST = 1e-3
-#: relative: a smaller gamma that is the same
-_SAME = 1e-6
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
 #: and by so much in all
@@ -61,62 +57,38 @@ class Lacking(NamedTuple):
 
     ranks: tuple[str, ...]
     modes: tuple[str, ...]
-    #: whether all that is missing of D12 and D21 is there, but too small to be felt
-    weak: bool = False
-
-    @property
-    def is_nothing(self) -> bool:
-        """Whether the problem is regular as it is."""
-        return not self.ranks and not self.modes
-
-    @property
-    def is_full(self) -> bool:
-        """Whether D12 and D21 have full rank, however small they are."""
-        return self.weak or not self.ranks
+    #: whether D12 and D21 have full rank, however small they are
+    is_full: bool
 
     @property
     def words(self) -> str:
-        """All of it, without a last stop."""
+        """All of it, without a last stop; empty where the problem is regular as it is."""
         return "; ".join(one.rstrip(".") for one in (*self.ranks, *self.modes))
 
 
-def lacking(problem: Prepared) -> Lacking:
+def lacking(p: Prepared) -> Lacking:
     """Return which of D12 and D21 has not full rank, and which slow modes z or w misses."""
-    p, modes = problem, missed_modes(problem, _SLOW, _SHOWN)
-    sides = (p.A, p.B2, p.C1, p.D12), (p.A.T, p.C2.T, p.B1.T, p.D21.T)
-    return Lacking(missing_ranks(p), modes, all(_is_weak(p, *side) for side in sides))
-
-
-def _is_weak(p: Prepared, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> bool:
-    """Return whether D has full rank, however small it is."""
-    if p.direct or not p.dt:
-        return _least(D) > ROUNDING
-    # the image of a sampled plant has the answers at half the rate for D: not felt below a third
-    third = 2j * THIRD / (p.dt * p.speed)
-    return _least(D) > float(np.max(answers(A, B, C, np.zeros_like(D), third)))
-
-
-def _least(D: FloatArray) -> float:
-    """Return the smallest singular value of the columns of a matrix."""
-    return float(la.svdvals(D)[-1]) if 0 < D.shape[1] <= len(D) else 0.0
-
-
-def missing_ranks(problem: Prepared) -> tuple[str, ...]:
-    """Return in words which of D12 and D21 has not full rank."""
-    found = []
-    for name, matrix, names, cause in (
-        ("D12", problem.D12, problem.u, "costs {}nothing in z at high frequencies"),
-        ("D21", problem.D21.T, problem.y, "shows {}no noise of w at high frequencies"),
+    ranks, is_full = [], True
+    for name, A, B, C, D, names, cause in (
+        ("D12", p.A, p.B2, p.C1, p.D12, p.u, "costs {}nothing in z at high frequencies"),
+        ("D21", p.A.T, p.C2.T, p.B1.T, p.D21.T, p.y, "shows {}no noise of w at high frequencies"),
     ):
-        needed = matrix.shape[1]
-        rank = int(np.linalg.matrix_rank(matrix, tol=_RANK)) if matrix.size else 0
-        if rank < needed:
-            little = "next to " if _least(matrix) > ROUNDING else ""
-            found.append(
-                f"{name} has rank {rank} of {needed}: a combination of {', '.join(names)} "
-                f"{cause.format(little)}"
+        values = np.zeros(D.shape[1])
+        values[: min(D.shape)] = la.svdvals(D) if D.size else 0.0
+        rank, felt = int(np.count_nonzero(values > _RANK)), ROUNDING
+        if p.dt and not p.direct:
+            # for D the image of a sampled plant has the answers at half the rate: they are not felt
+            # below a third
+            third = 2j * THIRD / (p.dt * p.speed)
+            felt = float(np.max(answers(A, B, C, np.zeros_like(D), third), initial=felt))
+        is_full &= bool(np.all(values > felt))
+        if rank < D.shape[1]:
+            little = cause.format("next to " if np.all(values > ROUNDING) else "")
+            ranks.append(
+                f"{name} has rank {rank} of {D.shape[1]}: a combination of {', '.join(names)} "
+                f"{little}"
             )
-    return tuple(found)
+    return Lacking(tuple(ranks), missed_modes(p, _SLOW, _SHOWN), is_full)
 
 
 def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
@@ -229,6 +201,10 @@ class _Found(NamedTuple):
     def speed(self) -> float:
         return float(np.max(np.abs(self.K.poles()), initial=0.0))
 
+    def settles(self, finer: _Found) -> bool:
+        """Return whether a tenth of what is added gains next to nothing."""
+        return self.gamma <= finer.gamma * (1.0 + _COST)
+
 
 def made_regular(
     problem: Prepared,
@@ -238,19 +214,17 @@ def made_regular(
 ) -> SolvedController:
     """Return the controller of a singular problem, found with a little noise and effort added."""
     found: list[_Found] = []
-    for level in FINER if lack.is_full else LEVELS:
+    for level in LEVELS:
         try:
             found.append(_with_level(Regularised(problem, level, bool(lack.modes)), solve, norm))
         except FlexplantError:
-            if found:
-                break  # rounding hides what is smaller
-            raise
-        if len(found) > 1 and found[-2].gamma <= found[-1].gamma * (1.0 + _COST):
+            if not found:
+                raise
+            break  # rounding hides what is smaller
+        if len(found) > 1 and found[-2].settles(found[-1]):
             break
-    least = min(one.gamma for one in found)
     _require_positive_infimum(problem, found, lack)
-    index = next(i for i, one in enumerate(found) if one.gamma <= least * (1.0 + _COST))
-    return _with_notes(found, index, lack, problem)
+    return _with_notes(found, lack, problem)
 
 
 def _with_level(
@@ -292,33 +266,24 @@ def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: 
     )
 
 
-def _with_notes(
-    found: Sequence[_Found], index: int, lack: Lacking, problem: Prepared
-) -> SolvedController:
-    one, finer = found[index], found[min(index + 1, len(found) - 1)]
-    K = one.K
-    cost = max(one.gamma / finer.gamma - 1.0, 0.0) if finer.gamma else 0.0
+def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> SolvedController:
+    finer = found[-1]
+    one = found[-2] if len(found) > 1 and found[-2].settles(finer) else finer
     note = (
         f"{lack.words}. Designed with noise of {one.level:.0e} on each sensor and as much "
         "effort of each actuator, relative to the plant's own channels, and verified without them"
     )
+    certificate = {ADDED: one.level}
     if finer is not one:
-        note += (
-            f"; a tenth of it gives a gamma {100 * cost:.2g} % smaller"
-            if cost > _SAME
-            else "; a tenth of it gives no smaller gamma"
-        )
+        certificate["gamma with a tenth of it"] = finer.gamma
+        cost = 100 * (one.gamma / finer.gamma - 1.0) if finer.gamma else 0.0
+        note += f"; a tenth of it gives a gamma {max(cost, 0.0):.2g} % smaller"
     notes = [note + "."]
-    if any(
-        a.gamma > b.gamma * (1.0 + _SAME) and b.speed > _GROWTH * a.speed
-        for a, b in pairwise(found[max(index - 1, 0) : index + 2])
-    ):
+    if any(not a.settles(b) and b.speed > _GROWTH * a.speed for a, b in pairwise(found[-3:])):
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "
             f"{_remedy(lack.ranks)[:-1]} to get a slower one."
         )
-    certificate = {ADDED: one.level}
-    if finer is not one:
-        certificate["gamma with a tenth of it"] = finer.gamma
+    K = one.K
     return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, certificate, tuple(notes))
