@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 import scipy.linalg as la
+from scipy.optimize import brentq
 from test_structured import law, machine, named
 
 from flexplant.errors import AssumptionError, CertificateError, ModelError
