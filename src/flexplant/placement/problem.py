@@ -193,6 +193,8 @@ class Placement(Value):
         Why the search ended before it had proven what it should; empty when it did not.
     unit : str
         Of the square root of the value, where it is a mean square of a motion.
+    unjudged : str
+        What is said of such a motion where the plant has no evaluation model.
 
     Examples
     --------
@@ -212,6 +214,7 @@ class Placement(Value):
     side: Side
     stopped: str = ""
     unit: str = ""
+    unjudged: str = ""
 
     def __repr__(self) -> str:
         ends = [steps[-1] for steps in self.history]
@@ -228,7 +231,8 @@ class Placement(Value):
             f"<Placement {' '.join(self.chosen):.120}: {in_words(self.value, self.unit)} by "
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
             f"{counted(self.evaluations, 'evaluation')}"
-            f"{', ' if self.stopped else ''}{self.stopped}>"
+            f"{', ' if self.stopped else ''}{self.stopped}"
+            f"{', ' if self.unjudged else ''}{self.unjudged}>"
         )
 
     @property

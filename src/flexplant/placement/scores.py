@@ -46,6 +46,8 @@ class Scores(Value):
         Whether they are sensors or actuators.
     unit : str
         Of the square roots of the values, where they are mean squares of a motion.
+    unjudged : str
+        What is said of such motions where the plant has no evaluation model.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -56,6 +58,7 @@ class Scores(Value):
     candidates: tuple[Port, ...]
     side: Side
     unit: str = ""
+    unjudged: str = ""
 
     def __len__(self) -> int:
         return len(self.layouts)
@@ -64,7 +67,7 @@ class Scores(Value):
         feasible = int(np.count_nonzero(np.isfinite(self.values)))
         listed = counted(len(self), "layout")
         head = f"<Scores of {listed} by {self.criterion}, {feasible} feasible>"
-        return f"{head}\n{self.table(5)}"
+        return "\n".join([head, self.table(5), *([f"  {self.unjudged}"] if self.unjudged else [])])
 
     @property
     def best(self) -> tuple[str, ...]:
@@ -239,7 +242,8 @@ def _score_layouts(
         repr(judged.criterion),
         ports,
         side,
-        judged.criterion.unit(plant),
+        unit := judged.criterion.unit(plant),
+        plant.unjudged if unit else "",
     )
 
 

@@ -252,7 +252,8 @@ def _solution(
         criterion=repr(layouts.criterion),
         ports=chosen,
         side=layouts.side,
-        unit=layouts.criterion.unit(plant),
+        unit=(unit := layouts.criterion.unit(plant)),
+        unjudged=plant.unjudged if unit else "",
         **{name: value for name, value in vars(found).items() if name != "chosen"},
     )
 
