@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from test_kalman import INSET, L, dictionaries, modes, plate_plant, ports
 
+from flexplant import testbeds
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.plant import Disturbance, Poi, Sensor, assemble_plant
@@ -98,3 +99,23 @@ def test_repr():
     text = repr(design_static(plate_plant()))
     assert text == "<StaticEstimator: y1, y2, y3, y4 -> die:hat, die:rx:hat, die:ry:hat>"
     assert Disturbance("a", at=INSET[0]).asd == 0.0
+
+
+@pytest.mark.parametrize(
+    "kind", ["gantry", "dual_stage", "steering_mirror", "flexible_joint", "hexapod", "maglev_block"]
+)
+def test_what_drives_move_at_rest_is_estimated_exactly(kind):
+    """By dense solves next to z = 1: relative encoders, flexures and soft feet alike."""
+    plant = getattr(testbeds, kind)()
+    found = design_static(plant)
+    g, s = plant.system, 1e-3
+    rows = [name.removesuffix(":hat") for name in found.system.outputs]
+    names = [next(z for z in plant.z if z == n or z.split(":")[0] == n) for n in rows]
+    where = [g.outputs.index(name) for name in (*names, *found.system.inputs)]
+    columns = [g.inputs.index(name) for name in plant.u]
+    pencil = np.expm1(s * g.dt) * np.eye(g.n_states) - (g.A - np.eye(g.n_states))
+    G = g.C[where] @ np.linalg.solve(pencil, g.B[:, columns]) + g.D[np.ix_(where, columns)]
+    z, y = G[: len(names)], G[len(names) :]
+    forces = np.linalg.pinv(z)
+    np.testing.assert_allclose(found.gain @ y @ forces, z @ forces, atol=1e-5)
+    assert np.linalg.matrix_rank(z @ forces) == len(names)

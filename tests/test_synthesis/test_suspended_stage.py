@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
@@ -24,9 +23,8 @@ from flexplant.plant import (
 )
 from flexplant.plant.rigid_body import rigid_gain
 from flexplant.simulation import simulate
-from flexplant.structure import FEModel, ModalDamping, Spring, kirchhoff_plate, solid_block
+from flexplant.structure import ModalDamping, Spring, kirchhoff_plate, solid_block
 from flexplant.synthesis import design_hinf, design_servo
-from plates import make_plate
 from stages import AXES, CORNERS, INSET, OFF_NODE, L, full, ports, reduced, sampled, some_modes
 
 MASS = L * L * 0.0272 * 2702
@@ -62,79 +60,11 @@ def newton(die):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
-def test_the_rigid_gain_is_newtons_law_free_partly_and_wholly_suspended(model):
-    line = springs(points=[(L / 2, y, 0.0) for y in (0.1, 0.5)])
+def test_the_rigid_gain_is_newtons_law(model):
     for die in ((L / 2, L / 2, 0.0), OFF_NODE):
         wanted = newton(die)
-        for structure, n_rigid in (
-            (model(), 3),
-            (suspend(model(), line), 1),
-            (suspend(model(), springs()), 0),
-        ):
-            plant = sampled(structure, ports(die=die))
-            assert plant.n_rigid == n_rigid
-            found = rigid_gain(plant, plant.rigid_motions, Z, U)
-            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", MODELS)
-def test_free_and_suspended_gains_agree_to_rounding(model):
-    """The free one's by its modes at 0 Hz, as ever; the suspended one's by geometry."""
-    plant = sampled(model())
-    g = plant.continuous.system
-    shapes = g.C[:, 0:6:2] * g.A[[0, 2, 4], [1, 3, 5]]
-    modal = shapes[g.output_index(Z)] @ g.B[1:6:2][:, g.input_index(U)]
-    for one in (plant, held(model)):
-        found = rigid_gain(one, one.rigid_motions, Z, U)
-        np.testing.assert_allclose(found, modal, rtol=1e-9, atol=1e-9 * abs(modal).max())
-
-
-def test_suspension_modes_are_told_from_those_that_bend():
-    body = held().rigid_motions
-    np.testing.assert_array_equal(body.modes, [0, 1, 2])
-    np.testing.assert_allclose(body.freq, 1.5 * np.array([1, 3**0.5, 3**0.5]), rtol=1e-4)
-    line = springs(points=[(L / 2, y, 0.0) for y in (0.1, 0.5)])
-    partly = sampled(suspend(some_modes(), line)).rigid_motions
-    assert partly.freq[0] == 0.0
-    rocking = 1.5 * np.sqrt(MASS * 0.2**2 / INERTIA)
-    np.testing.assert_allclose(np.sort(partly.freq), [0.0, 1.5, rocking], rtol=1e-4)
-    # a plate clamped along an edge bends in its first mode, however much of it moves
-    dofs = make_plate().dofs
-    inner = np.flatnonzero(dofs.xyz[:, 1] > 0)
-    plate = make_plate()
-    M, K = plate.M[inner][:, inner], plate.K[inner][:, inner]
-    clamped = FEModel(M, K, dofs=dofs.select([dofs.labels[i] for i in inner]))
-    channels = ports(
-        u=[], w=ports().w[:1], y=[], references=[], z=[Poi("die", at=clamped.dofs.labels[-3])]
-    )
-    with pytest.raises(AssumptionError, match="it is constrained"):
-        _ = assemble_plant(clamped, channels).rigid_motions
-
-
-def test_a_door_on_a_weak_spring_has_one_motion():
-    """Hinged along an edge: of three motions of a free plate one combination is left."""
-    plate = make_plate()
-    dofs, kinds = plate.dofs, np.array(plate.dofs.directions)
-    inner = np.flatnonzero((dofs.xyz[:, 1] > 0) | (kinds == "rx"))
-    M, K = plate.M[inner][:, inner], plate.K[inner][:, inner]
-    inner_model = FEModel(M, K, dofs=dofs.select([dofs.labels[i] for i in inner]))
-    die, *pushed = (dofs.nearest(place, "z") for place in ((L / 2, L / 2, 0.0), *INSET))
-    channels = ports(
-        w=[], y=[], references=[], z=[Poi("die", at=die, axes=("rx",))],
-        u=[Actuator(f"u{i}", at=label) for i, label in enumerate(pushed, 1)],
-    )  # fmt: skip
-    inertia = MASS * L**2 / 3
-    wanted = [[place[1] / inertia for place in INSET]]
-    stiffness = inertia * (2 * np.pi * 2.0) ** 2 / (2 * L**2)
-    held = [GroundSpring(dofs.nearest(place, "z"), stiffness) for place in CORNERS[2:]]
-    for model, freq in ((inner_model, 0.0), (suspend(inner_model, held), 2.0)):
-        plant = assemble_plant(model, channels)
-        assert plant.n_rigid == (freq == 0)
-        np.testing.assert_allclose(plant.rigid_motions.freq, [freq], rtol=1e-3)
-        np.testing.assert_allclose(
-            rigid_gain(plant, plant.rigid_motions, ["die:rx"], U), wanted, rtol=1e-3
-        )
+        found = rigid_gain(sampled(model(), ports(die=die)), Z, U)
+        np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
 
 
 @cache
@@ -185,15 +115,25 @@ def test_springs_of_any_stiffness_are_held_below_and_above_their_modes(bandwidth
 def test_error_measurements_and_the_static_relation_are_the_free_ones(die):
     free = sampled(some_modes(), ports(die=die))
     soft = held(die=die)
-    np.testing.assert_allclose(design_static(soft).gain, design_static(free).gain, atol=1e-9)
     # at rest the forces against the springs bend the plate a little: 1.5 Hz beside 245 Hz, squared
     bent = 8.0 * (1.5 / 245.0) ** 2
+    static = design_static(soft).gain
+    np.testing.assert_allclose(static, design_static(free).gain, atol=bent)
     np.testing.assert_allclose(reference_errors(soft).D, reference_errors(free).D, atol=bent)
+    # exactly the static solution: three forces that move the axes, by modes alone
+    own = soft.assembled.realisation.model
+    shapes = {name: own.row(place, "z") @ own.phi for name, place in zip(U, INSET, strict=True)}
+    push = np.array([shapes[name] / own.omega**2 for name in U]).T
+    z = np.array([own.row(die, axis) @ own.phi @ push for axis in AXES])
+    y = np.array([own.row(place, "z") @ own.phi @ push for place in CORNERS])
+    forces = np.linalg.pinv(z)
+    np.testing.assert_allclose(static @ y @ forces, np.eye(3), rtol=1e-6, atol=1e-6)
 
 
 def test_the_static_relation_predicts_the_same_rms_on_springs():
+    """But for what the suspension moves beside the relation at rest."""
     free, soft = design_static(sampled(some_modes())), design_static(held())
-    assert soft.rms("die") == pytest.approx(free.rms("die"), rel=5e-3)
+    assert soft.rms("die") == pytest.approx(free.rms("die"), rel=3e-2)
 
 
 @pytest.mark.slow

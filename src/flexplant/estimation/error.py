@@ -67,9 +67,7 @@ class Variances(NamedTuple):
     difference: float
 
 
-def error_variances(
-    plant: AnyPlant, observer: StateSpace, suspension: IntArray | None = None
-) -> Variances:
+def error_variances(plant: AnyPlant, observer: StateSpace) -> Variances:
     """Return the variances of ``z - hat`` at the sample instants, u at rest or known exactly.
 
     ``x[k+1] = A x[k] + w[k]``, ``y = C2 x + v``; the observer reads y. A rigid-body motion x_r
@@ -85,7 +83,7 @@ def error_variances(
             "the error of an observer needs a plant of its sampling time, "
             f"{observer.dt:g} s, got {plant.dt:g} s."
         )
-    joint, missed = _apart(_joint(plant, observer, suspension))
+    joint, missed = _apart(_joint(plant, observer))
     primal, dual = _two_ways(joint)
     size = divisor(primal)
     # both have the same poles: how far rounding moves their damping shows in neither
@@ -174,15 +172,13 @@ class _Joint(NamedTuple):
         return own, self.A[n:, n:], coupling, own.driven(self.noise[:n]), self.noise[n:]
 
 
-def _joint(plant: AnyPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
+def _joint(plant: AnyPlant, observer: StateSpace) -> _Joint:
     g, factor = plant.system, plant.noise_factor
     read = [name for name in observer.inputs if name in plant.y and name not in plant.w]
     observer = observer.select(observer.outputs, read)
     C1, C2 = g.C[g.output_index(poi_channels(plant))], g.C[g.output_index(read)]
     noise = plant.sensor_noise_factor[[plant.y.index(name) for name in read]]
     rigid, rest = moving_parts(plant)
-    if suspension is not None:
-        rest = np.setdiff1d(rest, plant.modal_states.reshape(-1, 2)[suspension])
     n, m, k = rest.size, observer.n_states, rigid.size
     A = np.zeros((n + m, n + m))
     A[:n, :n], A[n:, n:] = g.A[np.ix_(rest, rest)], observer.A

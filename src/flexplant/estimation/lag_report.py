@@ -17,9 +17,9 @@ from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import AnyPlant, standard_plant
+from ..plant import AnyPlant, Disturbance, standard_plant
 from ..plant.partitioned import require_sampled
-from ..plant.rigid_body import rigid_rows
+from ..plant.rest_expansion import moved_at_rest
 from ..store import Value, checked
 from ..tolerances import SAME
 from .error import error_variances
@@ -230,14 +230,14 @@ Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StaticEstimator(Value):
-    """The rigid-body least-squares estimate of the motions at the POIs, a matrix of gains.
+    """The least-squares estimate of the motions at the POIs near rest, a matrix of gains.
 
     Parameters
     ----------
     system : StateSpace
         From the displacement sensors to `die:hat`, ...; no states.
     plant : StandardPlant
-        Whose geometry it uses.
+        Whose motions at rest it uses.
     """
 
     system: StateSpace
@@ -256,7 +256,7 @@ class StaticEstimator(Value):
         """Return the predicted rms of the error at sample instants, with u at rest.
 
         What the disturbances bend, the modes left out among it where they are known, and the
-        sensor noise; the rigid-body motion, free or on weak springs, has no error. `channel` and
+        sensor noise; free motions have no error. `channel` and
         `on`, a plant, are as for `KalmanEstimator.rms`; `on` None is its own with the modes left
         out. AssumptionError besides when the plant is continuous (a sample of white sensor noise
         has no variance then), SolverError when an elastic mode is not damped.
@@ -266,33 +266,33 @@ class StaticEstimator(Value):
         plant = self.plant.evaluation_plant or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
-        held = plant.rigid_motions if plant.modal_blocks.size else None
-        found = error_variances(plant, self.system, None if held is None else held.modes)
+        found = error_variances(plant, self.system)
         return float(np.sqrt(found.values[row]))
 
 
 def design_static(plant: AnyPlant) -> StaticEstimator:
-    """Return the static geometric relation between the displacement sensors and the POIs.
+    """Return the static relation between the displacement sensors and the POIs.
 
-    ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
-    least-squares rigid-body motion that the sensors show, at the POI. Usual practice, and the
-    baseline for anything with a flexible model.
+    ``hat = Z Y^+ y``, Z and Y the motions of POIs and sensors that the actuators make at rest, or
+    actuators and disturbances where no actuator moves a POI. Of a free body these are its
+    rigid-body motions, and the relation is that of the geometry; of a machine whose bodies are
+    joined by drives and springs they are what its drives move. Usual practice, and the baseline for
+    anything with a flexible model.
 
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure that is free or on weak springs, continuous or sampled.
+        Continuous or sampled.
 
     Returns
     -------
     StaticEstimator
-        Exact for rigid-body motion.
+        Exact for the motions at rest. A motion that no force of the plant makes counts as none.
 
     Raises
     ------
     AssumptionError
-        When the structure has no rigid-body or suspension mode, or the displacement sensors do
-        not determine the POI's rigid-body motion.
+        When the displacement sensors do not determine a motion of a POI.
     ModelError
         When the plant is weighted.
 
@@ -305,24 +305,30 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     >>> import flexplant as fx
     >>> fx.design_static(fx.testbeds.three_masses()).gain.round(6)  # the mean of both ends
     array([[0.5, 0.5]])
+    >>> fx.design_static(fx.testbeds.hexapod()).gain.shape  # from six legs to six axes
+    (6, 6)
     """
     plant = standard_plant(checked_plant(plant))
     ports = plant.assembled.ports
-    motions = plant.rigid_motions
     orders = {s.name: s.order for s in ports.y}
     used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)
-    R_y, R_z = rigid_rows(plant, motions, used), rigid_rows(plant, motions, channels)
-    gain = R_z @ np.linalg.pinv(R_y, rcond=SAME)
-    missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
+    names = [*channels, *used]
+    motions = moved_at_rest(plant, names, plant.u)
+    if not np.all(np.any(motions[: len(channels)], axis=1)):
+        pushes = [one.name for one in ports.w if isinstance(one, Disturbance)]
+        motions = moved_at_rest(plant, names, [*plant.u, *pushes])
+    Z, Y = np.split(motions, [len(channels)])
+    gain = Z @ np.linalg.pinv(Y, rcond=SAME)
+    missed = np.linalg.norm(Z - gain @ Y, axis=1)
     # displacements of a static solution have nine digits
-    bad = missed > 1e-6 * np.linalg.norm(R_z, axis=1)
+    bad = missed > 1e-6 * np.linalg.norm(Z, axis=1)
     if np.any(bad):
         raise AssumptionError(
             f"the displacement sensors ({', '.join(used) or 'none'}) do not determine the "
-            f"rigid-body motion at {channels[int(np.argmax(bad))]!r}. Add or move sensors: three "
-            "that are not on one line see z, rx and ry."
+            f"motion of {channels[int(np.argmax(bad))]!r} at rest. Add or move sensors: of a free "
+            "plate, three that are not on one line see z, rx and ry."
         )
-    names: Any = {"inputs": used, "outputs": estimates(channels), "units": plant.units}
-    system = StateSpace([], [], [], gain, plant.dt, name="static", **names)
+    ends: Any = {"inputs": used, "outputs": estimates(channels), "units": plant.units}
+    system = StateSpace([], [], [], gain, plant.dt, name="static", **ends)
     return StaticEstimator(system, plant)

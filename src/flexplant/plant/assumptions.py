@@ -17,9 +17,8 @@ from ..lti.equations import state_scale
 from ..lti.statespace import StateSpace
 from ..lti.zeros import axis_zeros
 from ..store import Value
-from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
+from ..tolerances import ROUNDING, SAME, SPLIT, TINY, divisor
 from .partitioned import PartitionedSystem
-from .rigid_body import body_of, rigid_modes
 from .visibility import SHOWN, WEAK, ModeVisibility, aliased_modes, mode_visibility, response_at
 
 
@@ -76,19 +75,15 @@ def _undamped_kinds(plant: PartitionedSystem, poles: list[_Pole]) -> list[str]:
     words += [counted(pairs, "unstable rigid-body pair")] if pairs else []
     count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
     own = plant.realisation
-    known = rigid_modes(own, body_of(own)).freq if own.n_modes else np.zeros(0)
-    kinds: dict[str, list[float]] = {"undamped suspension mode": [], "undamped mode": []}
+    freq: list[float] = []
     for pole in poles:
         size = abs(pole.value) / (2 * np.pi)
         if own.n_modes and pole.value.imag and abs(pole.value.real) <= SAME * size:
-            weak = np.any(np.abs(known - size) <= TYPED * size)
-            kind = "undamped suspension mode" if weak else "undamped mode"
-            kinds[kind] += [size] * pole.left.shape[1]
-    for kind, freq in kinds.items():
-        if freq:
-            span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
-            words.append(f"{counted(len(freq), kind)} at {span} Hz")
-            count -= len(freq)
+            freq += [size] * pole.left.shape[1]
+    if freq:
+        span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
+        words.append(f"{counted(len(freq), 'undamped mode')} at {span} Hz")
+        count -= len(freq)
     words += [f"{counted(count, 'other pole')} without decay"] if count > 0 else []
     return words
 

@@ -116,7 +116,7 @@ def driven_axes(
     first: tuple[str, ...] = ()
     for channels in sets:
         sigma = _sigmas(plant, channels, freq, named)
-        gains = {s: _felt(plant, s, channels, plant.u) for s in np.unique(sigma)}
+        gains = {s: felt(plant, s, channels, plant.u) for s in np.unique(sigma)}
         if all(apart(G) for G in gains.values()):
             inverse = {s: np.linalg.pinv(G) for s, G in gains.items()}
             late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
@@ -193,7 +193,7 @@ def resting_frequency(plant: Partition) -> float:
     return _RESTING * usual_frequency(plant)
 
 
-def _felt(
+def felt(
     plant: Partition, sigma: float, channels: Sequence[str], actuators: Sequence[str]
 ) -> FloatArray:
     """Return the gain (r, m) of channels to actuators on the real axis, rounding set to zero."""
@@ -229,7 +229,7 @@ def opposing_part(plant: Partition, actuators: Sequence[str], forces: FloatArray
     Actuators that move none of them even alone do not push against others: they have no part.
     """
     channels = _channels(plant.assembled.ports.z)
-    G = _felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, actuators)
+    G = felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, actuators)
     moves = np.any(G, axis=0)
     found = np.zeros_like(forces)
     if not channels or not np.any(moves):

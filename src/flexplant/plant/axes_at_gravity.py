@@ -118,7 +118,7 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     pushed = [port.static_push(realisation) for port in ports.u]
     if axes is None:
         do = "; or name the axes that count, axes=[...]"
-        refuse_lost(body, realisation, [*seen, *pushed], np.inf, do)
+        refuse_lost(body, realisation, [*seen, *pushed], do)
     wanted = body.axes if axes is None else name_list(axes, "axes")
     require_known("rigid-body axis", wanted, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]

@@ -23,7 +23,7 @@ from .partitioned import Partition
 from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural
-from .rigid_body import rigid_gain, rigid_modes
+from .rigid_body import rigid_gain
 
 
 class PortRows(NamedTuple):
@@ -392,7 +392,8 @@ def warn_of_another_body(own: Partition, other: Partition) -> None:
     """Warn where forces accelerate the rigid body of an evaluation model differently."""
     if not (own.n_rigid and other.n_rigid):
         return  # held, on springs, or of foreign matrices: no mode shows the mass alone
-    one, two = _rigid_gains(own), _rigid_gains(other)
+    channels = own.assembled.ports.motions
+    one, two = (rigid_gain(plant, channels, own.u) for plant in (own, other))
     size = float(np.linalg.norm(one))
     if not size or not np.any(two):
         return  # no force moves the body
@@ -403,9 +404,3 @@ def warn_of_another_body(own: Partition, other: Partition) -> None:
             f"by {off:.0%} from the plant's, so that answers would be judged on another machine. "
             "Pass the model that the plant was made of, with more modes."
         )
-
-
-def _rigid_gains(plant: Partition) -> FloatArray:
-    """Return the acceleration (p, m) of what is seen, per force, by the modes at 0 Hz."""
-    motions = rigid_modes(plant.assembled.realisation, None)
-    return rigid_gain(plant, motions, plant.assembled.ports.motions, plant.u)

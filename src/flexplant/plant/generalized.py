@@ -20,7 +20,6 @@ from .building import at_rate
 from .evaluation_model import EvaluationModel
 from .moving import PositionMap, position_map
 from .partitioned import PartitionedSystem
-from .rigid_body import RigidModes
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 #: fields of the machine, which `replace` changes there
@@ -148,12 +147,6 @@ class GeneralizedPlant(PartitionedSystem):
         """The evaluation model of the machine with the same weights and blocks, or None."""
         whole = self.unweighted.evaluation_plant
         return None if whole is None else self.around(whole)
-
-    @property
-    def rigid_motions(self) -> RigidModes:
-        """The rigid-body motions of the machine, as `StandardPlant.rigid_motions`."""
-        found: RigidModes = self.unweighted.rigid_motions
-        return found
 
     def around(self, machine: Any) -> GeneralizedPlant:
         """Return the same weights and blocks around another machine with the same channels."""

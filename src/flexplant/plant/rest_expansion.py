@@ -11,7 +11,8 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace
 from ..tolerances import SAME, divisor
-from .axes import complex_gain
+from .axes import apart, complex_gain, felt, resting_frequency
+from .partitioned import Partition
 
 #: a function of s, real on the real axis, to an array of any shape
 OfS: TypeAlias = Callable[[complex], ComplexArray]
@@ -89,6 +90,24 @@ def solved(G: ComplexArray, wanted: ComplexArray, axes: Sequence[str]) -> Comple
     return np.asarray(
         np.linalg.solve(G, np.broadcast_to(wanted, (*G.shape[:-2], *wanted.shape[-2:])))
     )
+
+
+def moved_at_rest(plant: Partition, channels: Sequence[str], forces: Sequence[str]) -> FloatArray:
+    """Return the independent motions (p, r) of channels that forces make at rest.
+
+    Each is one unit of a channel that the forces move apart from those before it: of a free body
+    its rigid-body motions, and not what the forces bend, which is far smaller at rest.
+    """
+    G = felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, forces)
+    chosen: list[int] = []
+    for i in range(len(channels)):
+        if apart(G[[*chosen, i]]):
+            chosen.append(i)
+    if not chosen:
+        return np.zeros((len(channels), 0))
+    axes = [channels[i] for i in chosen]
+    T = np.asarray(np.linalg.pinv(G[chosen]), dtype=np.float64)
+    return followed_at_rest(plant.system, T, forces, axes, channels, plant.dt)
 
 
 def followed_at_rest(

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray
-from ..errors import AssumptionError, ModelError, attempted, require_known
+from ..arrays import FloatArray
+from ..errors import AssumptionError, ModelError, require_known
 from ..labels import DIRECTIONS
 from ..store import Value
 from ..structure import FEModel
-from ..structure.definite import signed_root
 from ..structure.rigid import SPANNED, turned_about
 from ..tolerances import SAME
 from .realisation import ModalRealisation, Structure
@@ -95,14 +92,10 @@ def _rigid_body(model: Structure) -> tuple[RigidBody | None, str]:
 
 
 def refuse_lost(
-    body: RigidBody,
-    realisation: ModalRealisation,
-    rows: Iterable[FloatArray],
-    below: float,
-    do: str,
+    body: RigidBody, realisation: ModalRealisation, rows: Iterable[FloatArray], do: str
 ) -> None:
     """Raise AssumptionError when channels have part in a rigid-body axis that a model has lost."""
-    lost = {axis: part for axis, part in body.lost.items() if part < below}
+    lost = body.lost
     if not lost:
         return
     motions = realisation.model.rigid_motions(body.centre)
@@ -160,108 +153,22 @@ def _centre(mass: FloatArray, axes: tuple[str, ...]) -> FloatArray:
     return np.asarray(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
 
 
-#: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
-#: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped
-#: beam's first mode has 0.990: that one bends
-_RIGID = 0.995
-
-
-class RigidModes(NamedTuple):
-    """The rigid-body motions that cost no force, or only that of weak springs."""
-
-    shapes: FloatArray
-    modes: IntArray
-    freq: FloatArray
-
-
-def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidModes:
-    """Return the rigid-body motions of a structure that is free, or on weak springs."""
-    # its rigid body is None when it is held, or has no geometry
-    # with R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
-    # `tr(S' M G_i M S)` of its kinetic energy in them, G_i its velocities per impulse. Motions of a
-    # structure without springs are its modes at 0 Hz; there may be none of either
-    r = realisation.n_rigid
-    place = np.arange(r) * 2
-    swing = realisation.pairs[:r, 0, 1]
-    free = RigidModes(realisation.outputs[:, place] * swing, np.arange(r), np.zeros(r))
-    if body is None or len(body.axes) <= r:
-        return free
-    root = np.linalg.cholesky(body.mass)
-    shapes = la.solve_triangular(root, body.motions.T, lower=True).T
-    load = realisation.once("load of the rigid body", lambda: realisation.model.inertia(shapes))
-    b = realisation.pairs.shape[0]
-    see = (load.T @ realisation.outputs).reshape(-1, b, 2)
-    push = (load.T @ realisation.inputs).reshape(-1, b, 2)
-    parts = np.einsum("ibk,bkl,jbl->bij", see, realisation.pairs, push)
-    share = np.trace(parts, axis1=1, axis2=2)
-    share[:r] = 1.0
-    modes = np.flatnonzero(share > _RIGID)
-    total = parts[modes].sum(axis=0)
-    values, vectors = np.linalg.eigh(0.5 * (total + total.T))
-    kept = values > _RIGID
-    if modes.size == r or np.count_nonzero(kept) != modes.size:
-        return free
-    if not np.all(kept):
-        shapes = shapes @ vectors[:, kept]
-    size = signed_root(np.linalg.det(realisation.pairs[modes]))
-    return RigidModes(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
-
-
-def body_of(realisation: ModalRealisation) -> RigidBody | None:
-    """Return the rigid body; None of a structure that is held or has no geometry."""
-    with attempted("the rigid body of the modes"):  # no such motion but modes at 0 Hz
-        return rigid_body_of(realisation)
-    return None
-
-
-def rigid_modes_of(plant: Any) -> RigidModes:
-    """Return the rigid-body motions of a plant."""
-    realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    body = body_of(realisation)
-    if body is not None:
-        rows = chain(
-            (s.static_row(realisation) for s in ports.y if s.order == 0),
-            (poi.row(realisation, axis) for poi in ports.z for axis in poi.axes),
-            (port.static_push(realisation) for port in ports.u),
-        )
-        refuse_lost(body, realisation, rows, np.sqrt(1.0 - _RIGID), "")
-    motions = rigid_modes(realisation, body)
-    if not motions.modes.size:
-        raise AssumptionError(
-            "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
-            "is for a free structure, assemble_plant(model, ports), or one on weak springs, "
-            "fx.plant.suspend(model, springs). Use design_kalman for a held one."
-        )
-    return motions
-
-
-def rigid_rows(plant: Any, motions: RigidModes, channels: Sequence[str]) -> FloatArray:
-    """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
-    realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    places = {
-        poi.channel(axis): poi.row(realisation, axis)
-        for poi in ports.z
-        for axis in poi.axes
-        if poi.channel(axis) in channels
-    }
-    places |= {s.name: s.static_row(realisation) for s in ports.y if s.name in channels}
-    require_known("motion of a POI or a sensor", channels, places)
-    return rigid_parts([places[name] for name in channels], motions.shapes)
-
-
 def rigid_parts(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
     """Return the parts (p, r) of rows over the DOFs, which may be none, in motions (n, r)."""
     return np.array(rows).reshape(len(rows), motions.shape[0]) @ motions
 
 
-def rigid_gain(
-    plant: Any, motions: RigidModes, outputs: Sequence[str], inputs: Sequence[str]
-) -> FloatArray:
-    """Return the accelerations at outputs per force at inputs, of the rigid body alone."""
-    # `rows R m^-1 R' pushes'` with R the rigid-body motions and m their mass; filters of the ports
-    # count with their static gains
+def rigid_gain(plant: Any, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
+    """Return the accelerations at outputs per force at inputs, of the modes at 0 Hz alone."""
+    # `rows R m^-1 R' pushes'` with R the free motions and m their mass; filters of the ports count
+    # with their static gains
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    r = realisation.n_rigid
+    motions = realisation.outputs[:, 2 * np.arange(r)] * realisation.pairs[:r, 0, 1]
     forces = {port.name: port for port in ports.forces}
     require_known("force", inputs, forces)
-    push = rigid_parts([forces[name].static_push(realisation) for name in inputs], motions.shapes)
-    return np.asarray(rigid_rows(plant, motions, outputs) @ push.T)
+    places = {p.channel(axis): p.row(realisation, axis) for p in ports.z for axis in p.axes}
+    places |= {s.name: s.static_row(realisation) for s in ports.y}
+    require_known("motion of a POI or a sensor", outputs, places)
+    push = rigid_parts([forces[name].static_push(realisation) for name in inputs], motions)
+    return np.asarray(rigid_parts([places[name] for name in outputs], motions) @ push.T)

@@ -22,7 +22,6 @@ from .partitioned import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .remade import check_channels, matched, own_plant, rebuilt, selected
-from .rigid_body import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
 from .uncertainty.uncertain_plants import UncertainPlant, uncertain_plant
@@ -326,15 +325,6 @@ class StandardPlant(Partition):
         more = [] if damping is None else [Dampings(damping)]
         plain = self if self.uncertainty is None else self.replace(uncertainty=None)
         return uncertain_plant(plain, [*kinds, *stated, *more])
-
-    @cached_property
-    def rigid_motions(self) -> RigidModes:
-        """The rigid-body motions that cost no force, or only that of weak springs.
-
-        ModelError when it was not assembled from a structure; AssumptionError when this is held,
-        or stiff springs bend an axis that its channels have part in.
-        """
-        return rigid_modes_of(self)
 
     @cached_property
     def machines(self) -> PlantMachines | None:
