@@ -186,9 +186,11 @@ def test_the_code_runs(tmp_path, monkeypatch, capsys):
     assert len(LONGER) == 3
     monkeypatch.chdir(tmp_path)
     write_stage(tmp_path)
-    names = {"__name__": "readme"}
+    names = {"__name__": "__main__"}
     for i, code in enumerate(BLOCKS):
         exec(compile(code, f"block {i + 1}", "exec"), names)
+        if "pipeline" in names:  # processes take it from the script that was started
+            monkeypatch.setattr("__main__.pipeline", names["pipeline"], raising=False)
         printed = capsys.readouterr().out
         if i < len(texts):
             alike(printed, texts[i])
@@ -197,11 +199,9 @@ def test_the_code_runs(tmp_path, monkeypatch, capsys):
     by_scipy = np.sqrt(np.trace(g.C @ P @ g.C.T) + np.sum(g.D**2))
     assert h2_norm(g) == pytest.approx(by_scipy, rel=1e-8)
     laptop = names["laptop"]
-    assert laptop["failed"].tolist() == ["", ""] and laptop["passed"].all()
-    # machines that are no meshed plate: a second mass and scatter of stiffness are in these too
-    np.testing.assert_allclose(next(iter(laptop.values())), [0.3, 0.6], atol=0.2)
-    np.testing.assert_allclose(laptop["modulus margin"], laptop["margin expected"], rtol=0.05)
+    assert laptop["failed"].tolist() == ["", ""] and laptop["stable"].all()
+    np.testing.assert_allclose(laptop["margin"], names["held"].modulus_margin, rtol=0.05)
+    assert np.all(laptop["MA"] < 100e-9)
     for other in ("pool", "cluster"):
         for column, values in names[other].items():
             np.testing.assert_array_equal(values, laptop[column])
-    assert sorted(laptop["report"]) == sorted(path.name for path in tmp_path.glob("reports/*"))

@@ -129,7 +129,8 @@ lower bound too, by a perturbation that reaches it.
 | ``larger=plant`` (no modes left out) | ``plant.replace(evaluation=None)`` |
 | ``larger_plant(plant, whole)`` | ``plant.evaluation_plant`` |
 | ``PoiVariance(larger=)``, ``LeftOutModes(larger)`` | the plant's evaluation model |
-| ``MachinePipeline(larger=80)`` | ``MachinePipeline(evaluation_modes=80)`` |
+| ``simulation.MachinePipeline`` | a function for `study`, as in `examples/fleet.py` |
+| ``study(timeout=)`` | gone; ``study(key=)`` names the study of a checkpoint |
 | ``weighted``, ``through`` give a StandardPlant | a `plant.GeneralizedPlant` |
 | ``plant.is_weighted`` | ``isinstance(plant, GeneralizedPlant)`` |
 | ``plant.unweighted`` of any plant | of a GeneralizedPlant; ``plant.machine`` of any |

@@ -188,8 +188,8 @@ class Checkpoint:
         if other:
             raise ModelError(
                 f"{self.path} is the checkpoint of another {kind}: what differs is "
-                f"{', '.join(other)}. Values count by content, functions of your own modules by "
-                "code, as far as they are reached. Give another file, or delete this one."
+                f"{', '.join(other)}. Values count by content. Give another file, or delete this "
+                "one."
             )
         self.header = found
         for line in lines:

@@ -103,10 +103,6 @@ def made():
     yield from (fx.simulation.Saturation(1.0, rate=10.0), fx.simulation.Quantiser(1e-9))
     yield from (fx.simulation.Hysteresis(0.1), fx.simulation.Dropout(0.01))
     yield from (fx.simulation.Jitter(1e-5), fx.simulation.Friction(1.0, 1e6, "y1"))
-    yield fx.simulation.MachinePipeline(rom, fe, unknowns, ports(), RATE, 1, [6])
-    yield fx.simulation.MachineReport(
-        {"mass": 0.5}, poles, fit, static, (static.system, servo), None, loop, response
-    )
     yield fx.study([1.0, 2.0], lambda machine: {"twice": 2 * machine, "name": "m"})
     along = fx.close_loop(sampled, static, servo, *fx.simulation.reading_along({"static": static}))
     runs = fx.simulate(along, duration=0.01, rng=1, runs=2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive
+from ..arrays import FloatArray
 from ..errors import (
     LabelError,
     ModelError,
@@ -46,7 +46,7 @@ def study(
     checkpoint: str | Path | None = None,
     rng: Any = None,
     progress: bool | None = None,
-    timeout: float | None = None,
+    key: str = "",
 ) -> StudyTable:
     """Return the results of a pipeline for each machine, as a table.
 
@@ -60,26 +60,25 @@ def study(
         What differs from row to row: virtual machines, measurements, parameters.
     pipeline : callable
         ``pipeline(machine)``, or ``pipeline(machine, generator)`` when rng is given; returns a
-        mapping {column: number, truth or text}. For a process pool it can be pickled: defined in a
-        module, or a value like `MachinePipeline`.
+        mapping {column: number, truth or text}. For a process pool it can be pickled: a function of
+        a module, or a `functools.partial` of one. `examples/fleet.py` has the usual chain.
     executor : concurrent.futures.Executor, optional
         A process pool, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; None is a
-        plain loop. When a process of a pool dies, the rest goes on in as many processes started
-        like its own (context, initializer); the machines that were out are tried once more, and
-        one whose process dies again fails.
+        plain loop. When a process of a pool dies, the machines that were out are tried once more,
+        each alone, and one whose process dies again fails; the rest goes on in a pool of processes
+        that start as its own did (context, initializer).
     checkpoint : path, optional
         A file that keeps each row as it comes. With a file that exists the study goes on where it
         was stopped, also after being killed: no machine that is in the file is computed again. It
-        belongs to the values of the machines and to the code of the pipeline, with what it reaches
-        in modules of yours: functions, classes, global values.
+        belongs to the machines, by the contents of their values, to the name of the pipeline with
+        the arguments of a partial, and to `key`; a file of others is refused.
     rng : int, SeedSequence or Generator, optional
         From it a seed is spawned for each machine.
     progress : bool, optional
         A bar: None shows one on a terminal for work of more than two seconds.
-    timeout : float [s], optional
-        A machine that takes longer fails, and its process is ended; for a `ProcessPoolExecutor`,
-        whose processes can be. Each machine then goes out alone, to processes started like those
-        of the pool.
+    key : str
+        Name of this study in its checkpoint. The code of the pipeline is not compared: give another
+        key when you change it.
 
     Returns
     -------
@@ -91,8 +90,8 @@ def study(
     ------
     ModelError
         When there are no machines, the pipeline cannot be called, it returns something else than
-        a mapping of numbers, truths and texts for the first machine, a timeout is given without a
-        process pool, or the checkpoint is of another study.
+        a mapping of numbers, truths and texts for the first machine, or the checkpoint is of
+        another study.
     FlexplantError
         When the checkpoint cannot be written, or another study writes to it now.
 
@@ -111,19 +110,17 @@ def study(
     if not callable(pipeline):
         raise ModelError(
             f"pipeline must be callable, got {short(pipeline)}. Give a function of a machine that "
-            "returns a mapping, or a MachinePipeline."
+            "returns a mapping."
         )
-    if timeout is not None:
-        positive(timeout, "timeout")
-        hint = "Only a process can be ended: pass a ProcessPoolExecutor, or leave timeout= out."
-        instance(executor, ProcessPoolExecutor, "the executor of a study with a timeout", hint)
+    instance(key, str, "key", "Give a text that names this study.")
     source = None if rng is None else seed_sequence(rng)
     header: dict[str, Any] = {
         "machines": len(items),
         "rng": None if source is None else [source.entropy, list(source.spawn_key)],
     }
     if checkpoint is not None:
-        header |= {"pipeline": fingerprint([pipeline]), "values of machines": fingerprint(items)}
+        header |= {"key": key, "pipeline": fingerprint([pipeline])}
+        header |= {"values of machines": fingerprint(items)}
     free = ("rng",) if isinstance(rng, np.random.Generator) else ()
     with (
         Checkpoint(checkpoint, "study", header, free) as log,
@@ -131,12 +128,14 @@ def study(
     ):
         seeds: list[Any] = [None] * len(items)
         if log.header["rng"] is not None:
-            entropy, key = log.header["rng"]
-            seeds = list(np.random.SeedSequence(entropy, spawn_key=tuple(key)).spawn(len(items)))
+            entropy, spawned = log.header["rng"]
+            seeds = list(
+                np.random.SeedSequence(entropy, spawn_key=tuple(spawned)).spawn(len(items))
+            )
         left = [i for i in range(len(items)) if i not in log.rows]
         calls = {i: (pipeline, items[i], seeds[i]) for i in left}
         bar.advance(len(log.rows), known=True)
-        for number, outcome in _outcomes(calls, executor, timeout):
+        for number, outcome in _outcomes(calls, executor):
             log.add(number, _kept(outcome, number))
             bar.advance()
         return tabled([log.rows[i] for i in range(len(items))])
@@ -146,10 +145,10 @@ _ADVICE = "Fewer machines or executor=ProcessPoolExecutor() help; checkpoint= ke
 
 
 def _outcomes(
-    calls: Mapping[int, tuple[Any, ...]], executor: Executor | None, timeout: float | None
+    calls: Mapping[int, tuple[Any, ...]], executor: Executor | None
 ) -> Iterator[tuple[int, Any]]:
     if executor is not None:
-        return survived(_outcome, calls, executor, timeout)
+        return survived(_outcome, calls, executor)
     return ((number, _outcome(*call)) for number, call in calls.items())
 
 
