@@ -160,6 +160,7 @@ lower bound too, by a perturbation that reaches it.
 | ``structure.Disc``, ``structure.Rectangle`` | `placement.Disc`, `placement.Rectangle` |
 | ``placement.HinfLevel`` | ``lambda plant: fx.design_hinf(plant.weighted(...)).gamma`` |
 | ``structure.Hysteretic`` | `ModalDamping` of eta / 2; a complex K is read as that |
+| ``io.read_mat_values``, a ReducedModel in .mat | ``.save``, `load`; `io.read_mat` by name |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

@@ -5,7 +5,7 @@
   solved model.
 - `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
   `estimate_frf`.
-- `read_mat`, `write_mat`: values to and from MATLAB.
+- `read_mat`, `write_mat`: systems to and from MATLAB.
 
 The first three find the format themselves; the reader of one format says more. Files that cannot
 be read are refused with what to write instead.
@@ -33,7 +33,7 @@ be read are refused with what to write instead.
 | tables | `read_dofs` | .csv, text: node, direction, x, y, z |
 | records | `read_records` | .uff, .lvm, .csv of a logger: time records; `read_spectra` |
 | responses | `read_frf_csv`, ... | .csv, .mat, .npz: frequency responses |
-| values for MATLAB | `read_mat`, `write_mat` | .mat: systems, plants, reduced models, responses |
+| values for MATLAB | `read_mat`, `write_mat` | .mat: systems and plants; responses are written |
 
 **A model of your own**, in whatever units it was written, is read, checked, solved and reduced:
 
@@ -91,7 +91,6 @@ from .frf_files import write_frf_csv as write_frf_csv
 from .mat_matrices import read_matlab as read_matlab
 from .mat_matrices import read_npz as read_npz
 from .mat_values import read_mat as read_mat
-from .mat_values import read_mat_values as read_mat_values
 from .mat_values import write_mat as write_mat
 from .matrix_files import read_harwell_boeing as read_harwell_boeing
 from .matrix_files import read_matrix_market as read_matrix_market
