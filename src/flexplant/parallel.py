@@ -187,7 +187,8 @@ def _seeds(
     return list(source.spawn(count))  # type: ignore[attr-defined]
 
 
-#: calls that are sent out at once
+#: calls that are sent out at once, to an executor that does not say how many workers it has; to
+#: another one two for each worker, so that few are tried again where a process dies
 _SENT = 64
 #: what is said of a call whose process ended twice
 DIED: Final = "its worker died, twice (out of memory, or a crash of compiled code?)"
@@ -237,12 +238,12 @@ def _pooled(
     """Yield what an executor finds; when it breaks, the calls that were out go to lost."""
     # what a scheduler of dask had when it died comes back as cancelled, or not at all: all is sent
     # once more, and waits until the scheduler is back, as long as its client does
-    waiting = deque(calls)
+    waiting, most = deque(calls), 2 * getattr(executor, "_max_workers", _SENT // 2)
     out: dict[Future[Any], int] = {}
     broken, again = False, set[int]()
     try:
         while True:
-            while waiting and not broken and len(out) < _SENT:
+            while waiting and not broken and len(out) < most:
                 number = waiting.popleft()
                 try:
                     out[executor.submit(function, *calls[number])] = number
