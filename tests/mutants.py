@@ -45,7 +45,6 @@ LINES = [
     ("estimation/filter_models.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
     ("structure/damping.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
     ("plant/realisation.py", "-0.5 * trace / np", "-1.0 * trace / np"),
-    ("updating/judgement/posterior.py", "return -0.5 * float(r @ r)", "return -float(r @ r)"),
     ("loop/measured_loop.py", "0.5 * at_zero",
      "1.0 * at_zero"),
     ("loop/budget.py", "+ np.sum(one.D[row] ** 2)",

@@ -119,7 +119,7 @@ def test_a_failed_certificate_says_what_to_report():
 #: where an exception is the answer itself (no solution at this level, no choice of this size, a
 #: candidate of no use) and nothing is dropped that a reader of a log would want to know
 ANSWERS = {
-    "hand_design.py", "hinf_riccati.py", "lower_bound.py", "loops.py", "posterior.py",
+    "hand_design.py", "hinf_riccati.py", "lower_bound.py", "loops.py",
     "search.py", "changed_model.py", "wrapping.py", "searching.py",
     "penalised.py", "twins.py",
 }  # fmt: skip

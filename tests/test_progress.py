@@ -138,9 +138,6 @@ MORE = {
     "machines": study,
     "samples": lambda: fx.simulate(loop, duration=2.0, rng=1, runs=3),
     "sets of sensors": lambda: fx.place_sensors(sampled, seen, len(seen) - 1),
-    "steps of walkers": lambda: fx.updating.sample_posterior(
-        rom, unknowns, [fx.Eigenvalues(poles)], fit
-    ),
     "tuning": lambda: fx.tune_loops(
         fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)),
     "structured": lambda: fx.synthesis.design_structured(mixed, fx.synthesis.FixedOrder(1)),

@@ -98,7 +98,6 @@ USES = {
         c.weighted, syn.TunedLaws(LAW, free=("p",)), starts=1
     ),
     "ncf": lambda c: fx.design_ncf(c.g * 1e6),
-    "shaped": lambda c: syn.shape_loop(c.plant, bandwidth=10.0),
     "loops": lambda c: fx.design_loops(c.plant, LAW),
     "robust stability": lambda c: syn.robust_stability(c.uncertain(), c.h2),
     "order": lambda c: syn.reduce_controller(c.weighted, c.h2, order=6),
@@ -126,8 +125,6 @@ USES = {
     ),
     "estimated": lambda c: (c.observer.estimate(c.run), c.observer.report()),
     "consistent": lambda c: est.consistency(c.observer, c.observer.estimate(c.run)),
-    "multirate": lambda c: est.design_multirate(c.plant, {c.y2: 2}),
-    "inputs": lambda c: est.design_input_estimator(c.plant, [c.amp], est.Augmented(drift=1.0)),
     "noise levels": lambda c: est.estimate_noise(c.plant, c.run),
     "static": lambda c: fx.design_static(c.plant),
     "sensor scores": lambda c: fx.score_sensors(c.plant, [[c.y1], [c.y2]]),

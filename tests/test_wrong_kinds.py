@@ -35,7 +35,7 @@ from flexplant.simulation import (
     learn_feedforward,
     settling_time,
 )
-from flexplant.synthesis import FixedOrder, design_structured, shape_loop
+from flexplant.synthesis import FixedOrder, design_structured
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -113,10 +113,6 @@ CALLS = [
     ("anti_windup_form", lambda x: fx.synthesis.anti_windup_form(x), NUMBERS),
     ("write_c", lambda x: fx.export.write_c(servo(), x), ()),
     ("design_kalman", lambda x: fx.design_kalman(x), ()),
-    ("check_bias", lambda x: fx.estimation.check_bias(x, ["amp1"]), ()),
-    ("check_bias inputs", lambda x: fx.estimation.check_bias(plant(), x), ()),
-    ("design_multirate", lambda x: fx.estimation.design_multirate(x, {}), ()),
-    ("design_multirate every", lambda x: fx.estimation.design_multirate(plant(), x), ()),
     ("FirstOrder rms", lambda x: fx.plant.FirstOrder(x, 1.0), ("fraction",)),
     ("FirstOrder corner", lambda x: fx.plant.FirstOrder(1.0, x), ("fraction",)),
     ("NarrowBand freq", lambda x: fx.plant.NarrowBand(1.0, x), ("fraction",)),
@@ -127,16 +123,6 @@ CALLS = [
     ("consistency estimate", lambda x: fx.estimation.consistency(kalman(), x), ()),
     ("estimate_noise", lambda x: fx.estimation.estimate_noise(x, {}), ()),
     ("estimate_noise records", lambda x: fx.estimation.estimate_noise(plant(), x), ()),
-    ("invertibility", lambda x: fx.estimation.invertibility(x, ["amp1"]), ()),
-    ("invertibility inputs", lambda x: fx.estimation.invertibility(plant(), x), ()),
-    ("input_estimator", lambda x: fx.estimation.design_input_estimator(x, ["amp1"]), ()),
-    (
-        "input_estimator method",
-        lambda x: fx.estimation.design_input_estimator(plant(), ["amp1"], x),
-        (),
-    ),
-    ("Augmented drift", lambda x: fx.estimation.Augmented(x), ("fraction",)),
-    ("Augmented corner", lambda x: fx.estimation.Augmented(1.0, x), ("fraction",)),
     ("replace evaluation", lambda x: plant().replace(evaluation=x), ("none",)),
     ("kalman rms on", lambda x: kalman().rms("die", on=x), ("none",)),
     (
@@ -185,10 +171,6 @@ CALLS = [
     ("TunedLaws", lambda x: design_structured(plant(), fx.synthesis.TunedLaws(x)), ()),
     ("TunedLaws free", lambda x: fx.synthesis.TunedLaws(fx.Pid(1.0), free=x), ("dict",)),
     ("Parametrised", lambda x: fx.synthesis.Parametrised(x, [1.0]), ()),
-    ("shape_loop", lambda x: shape_loop(x, bandwidth=50.0), NUMBERS),
-    ("shape_loop bandwidth", lambda x: shape_loop(plant(), bandwidth=x), ("fraction",)),
-    ("shape_loop model", lambda x: shape_loop(plant(), bandwidth=50.0, model=x),
-     ("none", "fraction")),
     ("ncf_margin", lambda x: fx.synthesis.ncf_margin(plant(), x), ()),
     ("design_hinf", lambda x: fx.design_hinf(x), ()),
     ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),

@@ -143,7 +143,6 @@ lower bound too, by a perturbation that reaches it.
 | ``lti.notch``, ``lti.leadlag`` | `lti.notch_filter`, `lti.lead_lag_filter` |
 | ``discretized``, ``localise``, ``Guyan``, ... | in their rooms: ``fx.reduction.Guyan`` |
 | ``estimation.Consistency`` | `estimation.ConsistencyReport` |
-| ``estimation.Invertibility`` | `estimation.InvertibilityReport` |
 | ``updating.Identifiability`` | `updating.IdentifiabilityReport` |
 | ``lti.Split``, ``workbench.Workbench`` | `lti.StableSplit`, `workbench.WorkbenchServer` |
 | ``simulation.SetPoint`` | `simulation.SetPointProfile` |
@@ -161,6 +160,9 @@ lower bound too, by a perturbation that reaches it.
 | ``placement.HinfLevel`` | ``lambda plant: fx.design_hinf(plant.weighted(...)).gamma`` |
 | ``structure.Hysteretic`` | `ModalDamping` of eta / 2; a complex K is read as that |
 | ``io.read_mat_values``, a ReducedModel in .mat | ``.save``, `load`; `io.read_mat` by name |
+| ``design_multirate``, ``design_input_estimator`` | gone: `design_kalman`, `plant.RandomWalk` |
+| ``updating.sample_posterior`` | `UpdateResult.sample`, `UpdateResult.interval` |
+| ``synthesis.shape_loop`` | `design_ncf` of a plant with weights; `tune_loops` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

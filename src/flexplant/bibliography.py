@@ -90,10 +90,6 @@
    Springer, 2004.
 .. [George1973] George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10,
    1973.
-.. [GillijnsDeMoor2007a] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
-   linear discrete-time systems, Automatica 43, 2007, 111-116.
-.. [GillijnsDeMoor2007b] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
-   linear discrete-time systems with direct feedthrough, Automatica 43, 2007, 934-937.
 .. [Giraud2005] Giraud, Langou, Rozloznik, van den Eshof, Rounding error analysis of the classical
    Gram-Schmidt orthogonalization process, Numer. Math. 101, 2005.
 .. [Glover1984] Glover, All optimal Hankel-norm approximations of linear multivariable systems and
@@ -102,8 +98,6 @@
    satisfy an H-infinity-norm bound, Syst. Control Lett. 11, 1988.
 .. [GolubPereyra2003] Golub, Pereyra, Separable nonlinear least squares: the variable projection
    method and its applications, Inverse Problems 19, 2003, R1-R26.
-.. [GoodmanWeare2010] Goodman, Weare, Ensemble samplers with affine invariance, Comm. App. Math.
-   Comp. Sci. 5, 2010.
 .. [Gregory1984] Gregory, Reduction of large flexible spacecraft models using internal balancing
    theory, J. Guid. Control Dyn. 7, 1984.
 .. [Grimes1994] Grimes, Lewis, Simon, A shifted block Lanczos algorithm for solving sparse symmetric
@@ -121,8 +115,6 @@
    functions, Identification in Engineering Systems, 1996.
 .. [Higham2008] Higham, Functions of Matrices: Theory and Computation, SIAM, 2008.
 .. [Hosking1980] Hosking, The multivariate portmanteau statistic, J. Amer. Stat. Assoc. 75, 1980.
-.. [Hoyle1991] Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE
-   CDC, 1991.
 .. [Imamovic1998] Imamovic, Validation of large structural dynamics models using modal test data,
    PhD thesis, Imperial College, 1998.
 .. [JoshiBoyd2009] Joshi, Boyd, Sensor selection via convex optimization, IEEE Trans. Signal
@@ -138,8 +130,6 @@
    Int. J. Control 41, 1985.
 .. [KennedyOHagan2001] Kennedy, O'Hagan, Bayesian calibration of computer models, J. Royal
    Statistical Society B 63, 2001.
-.. [Kitanidis1987] Kitanidis, Unbiased minimum-variance linear state estimation, Automatica 23,
-   1987.
 .. [KuczynskiWozniakowski1992] Kuczynski, Wozniakowski, Estimating the largest eigenvalue by the
    power and Lanczos algorithms with a random start, SIAM J. Matrix Anal. Appl. 13, 1992.
 .. [Kwakernaak1993] Kwakernaak, Robust control and H-infinity optimization, Automatica 29, 1993.
@@ -156,8 +146,6 @@
 .. [LawsonHanson1995] Lawson, Hanson, Solving Least Squares Problems, SIAM, 1995.
 .. [LewisOverton2013] Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Math.
    Program. 141, 2013.
-.. [Limebeer1993] Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom
-   controllers, Automatica 29, 1993.
 .. [LiuAnderson1989] Liu, Anderson, Singular perturbation approximation of balanced systems, Int. J.
    Control 50, 1989.
 .. [LjungBox1978] Ljung, Box, On a measure of lack of fit in time series models, Biometrika 65,

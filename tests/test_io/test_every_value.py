@@ -134,7 +134,6 @@ def made():
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
     yield from (static, servo, loop, point, response)
     law = fx.Pid(1e3, 1.0, 20.0, 200.0) * fx.Lead(30.0) * fx.Notch(300.0) * fx.LowPass(400.0)
-    yield synthesis.shape_loop(fx.StateSpace([[0.0]], [[1.0]], [[1.0]], [[0.0]]), bandwidth=1.0)
     yield from (synthesis.TunedLaws(law), synthesis.FixedOrder(1), synthesis.ObserverGains())
     yield from (*law.factors, law, fx.design_loops(sampled, law))
     yield from by_hand()
@@ -223,7 +222,7 @@ def of_estimators(plant, small):
     records = {name: 1e-9 * rng.standard_normal(5) for name in (*plant.y, *plant.u)}
     yield from (kalman, kalman.model, kalman.estimate(records), kalman.report())
     yield from (estimation.Predictor(), estimation.Filter(), estimation.FixedLag(2))
-    yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
+    yield estimation.Smoother()
     longer = {name: 1e-9 * rng.standard_normal(400) for name in (*small.y, *small.u)}
     observer = fx.design_kalman(small)
     one = np.ones(1)
@@ -231,10 +230,6 @@ def of_estimators(plant, small):
     yield estimation.consistency(observer, observer.estimate(longer))
     pole = np.array([-1.0 + 100.0j])
     yield estimation.MovedModes((4,), pole, 1.01 * pole, np.eye(2))
-    yield estimation.design_multirate(small, {"y1": 2})
-    unknown = [name for name in small.w if not name.endswith(":noise")][:1]
-    yield estimation.invertibility(small, unknown)
-    yield estimation.design_input_estimator(small, unknown, estimation.Augmented(1.0))
 
 
 def of_reductions(fe, modes, rom):
@@ -324,7 +319,6 @@ def of_updates(rom, unknowns, residual, fit):
     yield from (fx.updating.Discrepancy("damping", 0.3, 6.0), fit.uncertainty())
     bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]
     yield fx.update(rom, bounded, [residual], method=fx.updating.TrustRegion(), starts=2)
-    yield fx.updating.sample_posterior(rom, unknowns, [residual], fit, steps=20)
     yield fx.updating.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
     yield from (
         fx.identification.H1Estimator(),

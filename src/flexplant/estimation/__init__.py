@@ -6,7 +6,7 @@
 - `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
   moving POI); ``step(y, u)`` runs sample by sample.
 - `consistency`, `estimate_noise`: whether a record contradicts the filter, and what would not.
-- `design_static`, `design_multirate`, `design_input_estimator`: other estimators.
+- `design_static`: the estimate from the sensors of one instant.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -38,9 +38,6 @@ from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_models import FilterModel as FilterModel
 from .filter_models import check_gain as check_gain
-from .invertible_inputs import InvertibilityReport as InvertibilityReport
-from .invertible_inputs import check_bias as check_bias
-from .invertible_inputs import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
 from .lag_report import Filter as Filter
 from .lag_report import FixedLag as FixedLag
@@ -51,13 +48,7 @@ from .lag_report import StaticEstimator as StaticEstimator
 from .lag_report import design_static as design_static
 from .left_out_modes import LeftOut as LeftOut
 from .mode_changes import MovedModes as MovedModes
-from .multirate import PeriodicEstimator as PeriodicEstimator
-from .multirate import design_multirate as design_multirate
 from .noise_from_records import NoiseLevels as NoiseLevels
 from .noise_from_records import estimate_noise as estimate_noise
-from .unknown_inputs import Augmented as Augmented
-from .unknown_inputs import InputEstimator as InputEstimator
-from .unknown_inputs import Unbiased as Unbiased
-from .unknown_inputs import design_input_estimator as design_input_estimator
 
 __dir__ = _public_names(__name__)

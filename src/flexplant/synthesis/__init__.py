@@ -5,8 +5,8 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
 
 - `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
-- `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf` and
-  `shape_loop` (loop shaping); `design_structured` (fixed order, PID and notches).
+- `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf`;
+  `design_structured` (fixed order, PID and notches).
 - `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
 - `mu`, `robust_stability`, `worst_case_gain`, `design_mu`: guarantees for uncertain plants.
 
@@ -29,7 +29,7 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 | ``kalman`` of A, B, C; ``place`` | `lqe`; `place` |
 | ``hinfsyn``, ``h2syn`` | `design_hinf`, `design_h2` |
 | ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
-| ``ncfsyn``, ``loopsyn``, ``ncfmargin`` | `design_ncf`, `shape_loop`, `ncf_margin` |
+| ``ncfsyn``, ``ncfmargin`` | `design_ncf`, `ncf_margin` |
 | ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
 | ``allmargin``, ``diskmargin`` | `margins` |
 | ``mussv``, ``robstab`` | `mu`, `robust_stability` |
@@ -49,8 +49,6 @@ from .hinf.hinf_design import design_hinf as design_hinf
 from .hinf.hinf_riccati import Riccati as Riccati
 from .hinf.ncf import design_ncf as design_ncf
 from .hinf.ncf import ncf_margin as ncf_margin
-from .hinf.shaping import ShapedLoop as ShapedLoop
-from .hinf.shaping import shape_loop as shape_loop
 from .hinf.stage_design import design_stage as design_stage
 from .laws.controller_elements import FixedBlock as FixedBlock
 from .laws.controller_elements import Integrator as Integrator

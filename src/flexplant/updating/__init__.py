@@ -6,8 +6,7 @@ What the drawing has wrong is found from what was measured, with its uncertainty
   `AddedStiffness`, `MatrixParameter`, ...; residuals `Eigenvalues`, `ModeShapes`, `FrfResidual`,
   `Antiresonances`, `StaticCompliance`; chi-square says whether they explain the data.
 - `localise(model, candidates, residuals)`: where the error is, among candidates.
-- `identifiability`: what the data can say at all; `validate` with data left out;
-  `sample_posterior` where the uncertainty is no ellipsoid.
+- `identifiability`: what the data can say at all; `validate` with data left out.
 - `UpdateResult.calibrated(measured)`: the measured poles in the model; `applied_to(full)`: the
   updated full model.
 - `UpdateResult.uncertainty()`: what remains open of each mode, for controllers that tolerate it.
@@ -34,8 +33,6 @@ from .judgement.candidate_search import Localisation as Localisation
 from .judgement.candidate_search import localise as localise
 from .judgement.identifiability_tests import IdentifiabilityReport as IdentifiabilityReport
 from .judgement.identifiability_tests import identifiability as identifiability
-from .judgement.posterior import Posterior as Posterior
-from .judgement.posterior import sample_posterior as sample_posterior
 from .judgement.validation import Correlation as Correlation
 from .judgement.validation import Validation as Validation
 from .judgement.validation import correlate as correlate

@@ -23,7 +23,6 @@ from ..synthesis import (
     Law,
     LoopDesign,
     ShapedAxis,
-    ShapedLoop,
     second_order_sections,
 )
 from ..synthesis.laws.hand_design import TERMS
@@ -99,7 +98,7 @@ def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
         return (*value.factors,) if value.gain == 1.0 else (*value.factors, value.gain)
     if isinstance(value, LawElement):
         return (value,)
-    if isinstance(value, StateSpace | Controller | ShapedLoop):
+    if isinstance(value, StateSpace | Controller):
         return (FixedBlock.of(value),)
     raise ModelError(
         f"the file holds a {type(value).__name__}: a LoopDesign, a Law, or a controller of one "

@@ -14,7 +14,6 @@ from ...lti.discretisation import bilinear
 from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...store import Value, checked
 from ..controller import Controller
-from ..hinf.shaping import ShapedLoop
 from .law import BlockSection, Section, SingleElement
 
 
@@ -300,15 +299,14 @@ class FixedBlock(SingleElement):
 
         Parameters
         ----------
-        given : StateSpace, Controller or ShapedLoop
+        given : StateSpace or Controller
             A controller of a design, ``u = K y``, has the sign of the feedback in it: the element
             is ``-K``. A StateSpace is taken from error to command as it is.
         label : str, optional
             What it is; else what `given` says of itself.
         """
-        if isinstance(given, Controller | ShapedLoop):
-            method = getattr(given, "method", "shaped loop")
-            return cls(-given.system, label or method)
+        if isinstance(given, Controller):
+            return cls(-given.system, label or given.method)
         if isinstance(given, Value) and not isinstance(given, StateSpace):
             raise ModelError(
                 f"a block of a law is a system, got {short(given)}. Pass a StateSpace."

@@ -1,1 +1,1 @@
-"""The quality of an update: correlation, identifiability, localisation, validation, posterior."""
+"""The quality of an update: correlation, identifiability, localisation, validation."""
