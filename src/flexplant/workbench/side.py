@@ -17,14 +17,7 @@ from ..export import write_c
 from ..io import write_mat
 from ..lti.statespace import StateSpace
 from ..store import load
-from ..synthesis import (
-    Controller,
-    FixedBlock,
-    Law,
-    LoopDesign,
-    ShapedAxis,
-    second_order_sections,
-)
+from ..synthesis import Controller, FixedBlock, Law, LoopDesign, ShapedAxis, second_order_sections
 from ..synthesis.laws.hand_design import TERMS
 from ..synthesis.laws.law import LawElement
 from .controls import digits, parsed
