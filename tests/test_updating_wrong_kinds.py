@@ -191,8 +191,6 @@ CALLS = [
     ("split share", lambda x: fx.updating.split(data()[0], share=x), ()),
     ("split rng", lambda x: fx.updating.split(data()[0], rng=x), ("none",)),
     ("TrustRegion loss", lambda x: fx.updating.TrustRegion(loss=x), ()),
-    ("Tikhonov weight", lambda x: fx.updating.Tikhonov(weight=x), ("none", "fraction")),
-    ("Lasso weight", lambda x: fx.updating.Lasso(weight=x), ("none", "fraction")),
     ("GaussNewton truncate", lambda x: fx.updating.GaussNewton(truncate=x), ()),
     ("interval", lambda x: fit().interval(x), ()),
 ]

@@ -163,6 +163,7 @@ lower bound too, by a perturbation that reaches it.
 | ``design_multirate``, ``design_input_estimator`` | gone: `design_kalman`, `plant.RandomWalk` |
 | ``updating.sample_posterior`` | `UpdateResult.sample`, `UpdateResult.interval` |
 | ``synthesis.shape_loop`` | `design_ncf` of a plant with weights; `tune_loops` |
+| ``updating.Tikhonov``, ``updating.Lasso`` | priors of parameters; `localise` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

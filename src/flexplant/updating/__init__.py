@@ -57,8 +57,6 @@ from .residuals.point_residuals import Antiresonances as Antiresonances
 from .residuals.point_residuals import StaticCompliance as StaticCompliance
 from .residuals.residual import Residual as Residual
 from .search import GaussNewton as GaussNewton
-from .search import Lasso as Lasso
-from .search import Tikhonov as Tikhonov
 from .search import TrustRegion as TrustRegion
 from .search import UpdateMethod as UpdateMethod
 from .sensitivities import Sensitivities as Sensitivities

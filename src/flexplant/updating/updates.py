@@ -68,7 +68,7 @@ def update(
         What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, mixed freely.
     method : UpdateMethod, optional
-        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: the trust region, for poles alone
+        `GaussNewton` or `TrustRegion`. None: the trust region, for poles alone
         without bounds and priors only where Gauss-Newton leads nowhere.
     start : (q,) array [kg, N s/m, N/m], optional
         Values to begin with. None: zeros, or the means of priors, inside the bounds; then responses

@@ -16,7 +16,6 @@ from ...tolerances import TINY, divisor
 from ..family import ROUNDING, Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
-from ..search.penalised import bic
 from .goodness import chance, is_bad, noise_misfit, worst
 
 #: best subsets of each size that grow
@@ -37,6 +36,12 @@ FAITHFUL, NEGLIGIBLE = 1e-2, 1e-6
 REACH = 4.0
 
 Subset = tuple[int, ...]
+
+
+def bic(error: float, rows: int, count: int, noisy: bool) -> float:
+    """Return ``chi^2 + k ln n``, or ``n ln(e/n) + k ln n`` where the noise is not known."""
+    misfit = error if noisy else rows * float(np.log(max(error, TINY) / rows))
+    return misfit + count * float(np.log(rows))
 
 
 class SubsetFit(NamedTuple):

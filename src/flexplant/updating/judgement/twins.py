@@ -10,8 +10,7 @@ from ...arrays import FloatArray
 from ...errors import ModelError
 from ...tolerances import divisor
 from ..search import Objective
-from ..search.penalised import bic
-from .subsets import Subset, Subsets
+from .subsets import Subset, Subsets, bic
 
 #: part of the effect of a change by which an equal change elsewhere may differ in it and still be
 #: its twin: mirror images in a reduced model differ by up to some per cent

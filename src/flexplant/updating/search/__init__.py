@@ -7,5 +7,3 @@ from .objective import Objective as Objective
 from .objective import SearchEnd as SearchEnd
 from .objective import UpdateMethod as UpdateMethod
 from .objective import checked_residuals as checked_residuals
-from .penalised import Lasso as Lasso
-from .penalised import Tikhonov as Tikhonov
