@@ -164,6 +164,9 @@ lower bound too, by a perturbation that reaches it.
 | ``updating.sample_posterior`` | `UpdateResult.sample`, `UpdateResult.interval` |
 | ``synthesis.shape_loop`` | `design_ncf` of a plant with weights; `tune_loops` |
 | ``updating.Tikhonov``, ``updating.Lasso`` | priors of parameters; `localise` |
+| ``placement.KineticEnergy``, ``AutoMac``, indices | `placement.ModeInformation`, `PoiVariance` |
+| ``placement.Mirrored``, ``placement.Penalised`` | a `placement.Constraint` of yours |
+| ``plot.PolePicker``, ``plot.animate_mode`` | `plot.stabilisation`, `plot.mode_shape` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,

@@ -105,8 +105,6 @@
 .. [Guyan1965] Guyan, Reduction of stiffness and mass matrices, AIAA J. 3, 1965.
 .. [Hammarling1982] Hammarling, Numerical solution of the stable, non-negative definite Lyapunov
    equation, IMA J. Numer. Anal. 2, 1982.
-.. [Hansen1992] Hansen, Analysis of discrete ill-posed problems by means of the L-curve, SIAM Review
-   34, 1992.
 .. [Hanus1987] Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless
    transfer method, Automatica 23, 1987.
 .. [Hewer1971] Hewer, An iterative technique for the computation of the steady state gains for the
@@ -213,8 +211,6 @@
    29, 1978.
 .. [Stoorvogel1992] Stoorvogel, The H-infinity Control Problem: A State Space Approach, Prentice
    Hall, 1992.
-.. [Tibshirani1996] Tibshirani, Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B
-   58, 1996.
 .. [TombsPostlethwaite1987] Tombs, Postlethwaite, Truncated balanced realization of a stable
    non-minimal state-space system, Int. J. Control 46, 1987.
 .. [vanderSeijs2013] van der Seijs, van den Bosch, Rixen, de Klerk, An improved methodology for the

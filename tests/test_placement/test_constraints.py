@@ -17,7 +17,6 @@ from flexplant.placement import (
     Exhaustive,
     JointGroups,
     MinimumDistance,
-    Mirrored,
     OffPoi,
     PoiLqr,
     PoiVariance,
@@ -61,7 +60,6 @@ CASES = {
         JointGroups([("c0", "c11"), ("c2", "c9", "c5")]),
         lambda s: len(s & {0, 11}) != 1 and len(s & {2, 9, 5}) in (0, 3),
     ),
-    "mirrored": (Mirrored("x", 0.25), lambda s: {image(i) for i in s} == s),
     "one type at a place": (
         CountLimits(["c0", "c1", "c2"], at_most=1),
         lambda s: len(s & {0, 1, 2}) <= 1,

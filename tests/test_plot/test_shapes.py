@@ -80,50 +80,6 @@ def block_modes():
     return fx.solve_modes(block, count=8)
 
 
-@pytest.mark.slow
-def test_a_solid_moves_in_all_directions_on_both_sides(monkeypatch):
-    """Through a period a mode goes from one end of its way to the other and back."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    drawn, draw = [], Poly3DCollection.set_verts
-
-    def recorded(self, verts, *args, **options):
-        drawn.append(np.array(verts))
-        return draw(self, verts, *args, **options)
-
-    monkeypatch.setattr(Poly3DCollection, "set_verts", recorded)
-    modes = block_modes()
-    skin = surface_of(modes.dofs)
-    moving = fx.plot.animate_mode(modes, 7, frames=4, scale=0.2)
-    moving._fig.canvas.draw()
-    rest = 1e3 * skin.xyz[skin.triangles]
-    seen = []
-    for k in range(4):
-        moving._func(k)
-        seen.append(drawn[-1])
-    np.testing.assert_allclose(seen[1], seen[3], atol=1e-9)
-    np.testing.assert_allclose(seen[0] + seen[2], seen[1] + seen[3], atol=1e-9)
-    motion = skin.motion(modes.phi[:, 6])
-    largest = np.linalg.norm(motion, axis=1).max()
-    corners = np.array([seen[0].min(axis=(0, 1)), seen[0].max(axis=(0, 1))])
-    moved = 1e3 * (skin.xyz + 0.2 * 0.4 * motion / largest)[skin.triangles]
-    np.testing.assert_allclose(corners, [moved.min(axis=(0, 1)), moved.max(axis=(0, 1))], rtol=1e-9)
-    assert np.ptp(rest[..., 2]) < np.ptp(moved[..., 2])
-
-
-@pytest.mark.slow
-def test_a_moving_mode_is_saved(tmp_path):
-    from PIL import Image
-
-    path = tmp_path / "mode.gif"
-    fx.plot.animate_mode(block_modes(), 7, frames=4).save(path, writer="pillow", dpi=40)
-    with Image.open(path) as image:
-        assert image.n_frames == 4
-        one = np.asarray(image.convert("L"), dtype=float)
-        image.seek(2)
-        assert np.abs(np.asarray(image.convert("L"), dtype=float) - one).max() > 50
-
-
 def test_the_ports_of_a_solid_where_they_are():
     modes = block_modes()
     ports = fx.Ports(

@@ -122,7 +122,7 @@ def identify_modes(
     and why, and `fx.plot.identified` draws it beside the measurement.
     ``fx.Eigenvalues(fx.numbered(found, drawing))`` is what `update` takes. Poles come from a
     stabilisation diagram and a maximum likelihood fit, without choices to make; `start=` takes
-    poles picked by eye (`fx.plot.PolePicker`). Modes outside the band are accounted for; what the
+    poles picked by eye. Modes outside the band are accounted for; what the
     fit does not explain is warned of, with its frequency. How it works: `algorithms`.
 
     Parameters

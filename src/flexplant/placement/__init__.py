@@ -7,7 +7,7 @@
 - `pareto_curve`: what more devices buy.
 
 Criteria are values (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as are constraints
-(`Excluded`, `OffPoi`, `MinimumDistance`, `Mirrored`, ...) and searches (`Exchange`, `Exhaustive`,
+(`Excluded`, `OffPoi`, `MinimumDistance`, ...) and searches (`Exchange`, `Exhaustive`,
 `BranchAndBound`, which proves its answer).
 
 >>> import flexplant as fx
@@ -19,8 +19,8 @@ Criteria are values (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as 
 >>> best.chosen, round(1e9 * best.value**0.5, 1), round(1e9 * best.bound**0.5, 1)  # nm rms
 (('at 2',), 20.6, 20.6)
 
-Names elsewhere: effective independence and modal kinetic energy (FEMtools, `AutoMac`,
-`KineticEnergy` here). ``examples/placement.py`` chooses four of 48 places with a proof.
+Names elsewhere: effective independence is `ModeInformation` with `RowSelection`.
+``examples/placement.py`` chooses four of 48 places with a proof.
 """
 
 from ..rooms import public_names as _public_names
@@ -36,19 +36,14 @@ from .constraints import CountLimits as CountLimits
 from .constraints import Excluded as Excluded
 from .constraints import JointGroups as JointGroups
 from .constraints import MinimumDistance as MinimumDistance
-from .constraints import Mirrored as Mirrored
 from .constraints import OffPoi as OffPoi
 from .constraints import ZoneLimits as ZoneLimits
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
-from .mode_shapes import ActuatorIndices as ActuatorIndices
-from .mode_shapes import AutoMac as AutoMac
-from .mode_shapes import KineticEnergy as KineticEnergy
 from .mode_shapes import ModeInformation as ModeInformation
 from .mode_shapes import RowSelection as RowSelection
-from .mode_shapes import SensorIndices as SensorIndices
 from .poi_variance import PoiVariance as PoiVariance
 from .problem import Placement as Placement
 from .problem import Problem as Problem
@@ -71,7 +66,6 @@ from .wrapping import DeviceLoss as DeviceLoss
 from .wrapping import LeftOutModes as LeftOutModes
 from .wrapping import OverMachines as OverMachines
 from .wrapping import OverPositions as OverPositions
-from .wrapping import Penalised as Penalised
 from .zones import Disc as Disc
 from .zones import Rectangle as Rectangle
 

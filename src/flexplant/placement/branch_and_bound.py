@@ -196,7 +196,7 @@ class Screened(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> method = fx.placement.Screened(fx.placement.AutoMac(), starts=1)
+    >>> method = fx.placement.Screened(fx.placement.ModeInformation(), starts=1)
     >>> fx.place_sensors(plant, ["y1", "y2"], 1, method=method, rng=0).chosen
     ('y1',)
     """

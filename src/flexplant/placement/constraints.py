@@ -15,7 +15,7 @@ from ..arrays import FloatArray, number, positive, whole
 from ..errors import LabelError, ModelError, short, some_names
 from ..store import Value, checked
 from ..tolerances import TINY
-from ..words import mapping, members, name_list, one_of
+from ..words import mapping, members, name_list
 from .candidates import Places
 from .convex import Branch, chosen_rows
 from .zones import Disc, Zone
@@ -214,44 +214,6 @@ class JointGroups(Constraint):
             at = places.index(group, "candidate of a group")
             pairs += [(at[0], other) for other in at[1:]]
         return LinearRows.equal(pairs, places.total)
-
-
-@dataclass(frozen=True, eq=False)
-class Mirrored(Constraint):
-    """Each chosen candidate with its mirror image: layouts are symmetric about a plane.
-
-    Candidates without an image among the others are excluded, those on the plane are their own.
-
-    Parameters
-    ----------
-    axis : {"x", "y", "z"}
-        Normal of the plane.
-    at : float [m]
-        Where the plane is.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> middle = fx.placement.Mirrored("x", at=1.0)
-    >>> fx.place_sensors(plant, ["y1", "y2"], 2, constraints=middle).chosen
-    ('y1', 'y2')
-    """
-
-    axis: str = field(metadata=checked(one_of, choices="xyz"))
-    at: float = field(metadata=checked(number))
-
-    def rows(self, places: Places) -> LinearRows:
-        """Return x_i - x_j = 0 for images, x_i <= 0 without one."""
-        places.require_points()
-        k = "xyz".index(self.axis)
-        flip = np.where(np.arange(3) == k, -1.0, 1.0)
-        images = [points * flip + (1.0 - flip) * self.at for points in places.points]
-        near = np.array([[_largest_distance(p, q) for q in images] for p in places.points])
-        found = near.argmin(axis=1)
-        lone = near.min(axis=1) > places.same
-        pairs = [(i, int(j)) for i, j in enumerate(found) if i < j and not lone[i]]
-        return LinearRows.equal(pairs, places.total).and_(LinearRows.closed(lone))
 
 
 def _largest_distance(points: FloatArray, others: FloatArray) -> float:

@@ -9,19 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray
 from ..errors import InfeasibleError, ModelError
 from ..plant import SensorPort, StandardPlant
-from ..reduction import EffectiveIndependence, ReducedModel
+from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
 from ..store import checked
-from ..structure import FEModel
 from ..tolerances import divisor
-from ..words import flag, instance, one_of
+from ..words import flag, instance
 from ..work import Work
 from .candidates import Port
-from .criterion import Criterion, Scorer, by_size
-from .gramian import LogDetOfSum, SummedWorth, noise_sizes
+from .criterion import Criterion, Scorer
+from .gramian import LogDetOfSum, noise_sizes
 from .problem import Problem, Search, SearchResult
 
 
@@ -75,175 +74,6 @@ class ByShapes(Criterion):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the criterion of choices among candidates."""
         return self.of(plant, shapes_of(plant, candidates))
-
-
-@dataclass(frozen=True, eq=False)
-class LargestMac(Scorer):
-    """The largest off-diagonal MAC of shapes (N, m) at the chosen rows."""
-
-    phi: FloatArray
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return it for choices of one size at once."""
-        return by_size(sets, self._largest)
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return 0: no shapes are less alike than orthogonal ones."""
-        return 0.0
-
-    def _largest(self, rows: IntArray) -> FloatArray:
-        part = self.phi[rows]
-        cross = np.einsum("mki,mkj->mij", part, part)
-        sizes = np.einsum("mii->mi", cross)
-        scale = sizes[:, :, None] * sizes[:, None, :]
-        # a mode that none of the sensors sees is like every other
-        mac = np.where(scale > 0, cross**2 / divisor(scale), 1.0)
-        i = np.arange(mac.shape[1])
-        mac[:, i, i] = 0.0
-        return np.asarray(mac.max(axis=(1, 2)))
-
-
-@dataclass(frozen=True, eq=False)
-class AutoMac(ByShapes):
-    """Largest off-diagonal entry of the MAC between the elastic mode shapes at the sensors.
-
-    ``(phi_i' phi_j)^2 / (phi_i' phi_i phi_j' phi_j)``, 0 where all shapes differ, 1 where two look
-    alike. It does not count how large the motions are that the sensors see, and of a POI it says
-    next to nothing, as `ModeInformation`.
-
-    References
-    ----------
-    [Allemang2003]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> round(fx.placement.AutoMac()(fx.testbeds.three_masses()), 6)
-    0.0
-    """
-
-    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> LargestMac:
-        """Return the largest entry of choices."""
-        return LargestMac(shapes.phi[:, shapes.elastic])
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class KineticEnergy(ByShapes):
-    """Minus the part of the elastic modes' kinetic energy at the sensors.
-
-    ``sum_i sum_k (r_i phi_k) (r_i M phi_k)``, 1 for each mode over all DOFs: places that move much,
-    and are heavy. Each place counts by itself, so that neighbours that see the same are both
-    chosen. Of a POI it says next to nothing, as `ModeInformation`.
-
-    Parameters
-    ----------
-    model : FEModel, optional
-        Of the mass matrix; not needed where the plant was assembled from matrices or a reduced
-        model.
-
-    References
-    ----------
-    [Kammer1991]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> masses = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> round(fx.placement.KineticEnergy(masses)(fx.testbeds.three_masses()), 6)  # of two modes
-    -1.333333
-    """
-
-    model: Any = field(
-        default=None, metadata=checked(instance, kind=FEModel | ReducedModel, hint="Pass one.")
-    )
-
-    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> SummedWorth:
-        """Return the energy of choices."""
-        model = plant.assembled.realisation.model if self.model is None else self.model
-        if not isinstance(model, FEModel | ReducedModel):
-            raise ModelError(
-                "the plant was assembled from modes, which have no mass matrix. Pass "
-                "placement.KineticEnergy(model), the FEModel that they are of."
-            )
-        if model.M.shape[0] != shapes.full.shape[0]:
-            raise ModelError(
-                f"the model has {model.M.shape[0]} DOFs, the plant's {shapes.full.shape[0]}: pass "
-                "the one that the plant's modes are of."
-            )
-        momentum = shapes.rows @ (model.M @ shapes.full[:, shapes.elastic])
-        return SummedWorth(np.sum(shapes.phi[:, shapes.elastic] * momentum, axis=1))
-
-
-@dataclass(frozen=True, eq=False)
-class SensorIndices(ByShapes):
-    """Minus the sum of squared placement indices of the sensors, by modal norms.
-
-    ``sum_i sum_k (alpha_k phi_ik / asd_i)^2`` over the elastic modes, which are mass-normalised;
-    alpha_k is the norm of mode k from the disturbances to the POIs, ``g = |phi_wk| |phi_zk|``::
-
-        H2:  g / (2 sqrt(zeta) omega^(3/2)),   Hinf:  g / (2 zeta omega^2),   Hankel: half of it
-
-    over that of the largest. Each device counts by itself: two at one place count twice. Of a POI
-    it says next to nothing, as `ModeInformation`.
-
-    Parameters
-    ----------
-    norm : {"h2", "hinf", "hankel"}
-        By which modes are weighted.
-
-    References
-    ----------
-    [Gawronski2004]_, ch. 5 and 7.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> round(fx.placement.SensorIndices()(fx.testbeds.three_masses()), 9)
-    -3.3333e-05
-    """
-
-    norm: str = field(default="h2", metadata=checked(one_of, choices=("h2", "hinf", "hankel")))
-
-    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> SummedWorth:
-        """Return the indices of choices."""
-        kept = shapes.elastic
-        # in sqrt(Hz) / pm, so that the indices are numbers of usual size
-        unit = 1e-12 / shapes.asd if self.sides == "y" else shapes.asd
-        seen = shapes.phi[:, kept] * unit[:, None]
-        return SummedWorth(np.sum((seen * self.weights(plant)) ** 2, axis=1))
-
-    def weights(self, plant: StandardPlant) -> FloatArray:
-        """Return alpha (m,) of the elastic modes."""
-        ports, real = plant.assembled.ports, plant.assembled.realisation
-        pushes = [port for port in ports.forces if port.asd > 0]
-        pushed = shapes_of(plant, pushes)
-        kept = pushed.elastic
-        omega, zeta = pushed.omega[kept], pushed.zeta[kept]
-        asd = np.array([port.asd for port in pushes])
-        force = np.sqrt(np.sum((pushed.phi[:, kept] * asd[:, None]) ** 2, axis=0))
-        rows = [real.row(poi.at, axis) for poi in ports.z for axis in poi.axes]
-        motion = np.sqrt(np.sum((np.array(rows) @ pushed.full[:, kept]) ** 2, axis=0))
-        damped = {"h2": 2.0 * np.sqrt(zeta) * omega**1.5, "hinf": 2.0 * zeta * omega**2}
-        size = force * motion / damped.get(self.norm, damped["hinf"])
-        return np.asarray(size / np.max(size))
-
-
-@dataclass(frozen=True, eq=False)
-class ActuatorIndices(SensorIndices):
-    """Minus the sum of squared placement indices of the actuators, as `SensorIndices` has them.
-
-    Parameters
-    ----------
-    norm : as for `SensorIndices`
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> round(fx.placement.ActuatorIndices()(fx.testbeds.three_masses()), 3)
-    -0.167
-    """
-
-    sides: ClassVar[str] = "u"
 
 
 @dataclass(frozen=True, eq=False)

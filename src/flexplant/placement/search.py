@@ -69,7 +69,7 @@ def place_sensors(
     required : sequence of str
         Candidates that any choice includes.
     constraints : sequence of Constraint, optional
-        What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
+        What every choice satisfies: Excluded, OffPoi, ZoneLimits, MinimumDistance,
         Among, Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
     method : Search, optional
         Exchange, BranchAndBound, Exhaustive or ByRows. Every subset where there are at most 1500,

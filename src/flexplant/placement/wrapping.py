@@ -12,16 +12,16 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive
+from ..arrays import FloatArray
 from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted, short
 from ..plant import StandardPlant
 from ..plant.scheduling import values_over
 from ..store import checked
 from ..tolerances import TINY
-from ..words import function, one_of
+from ..words import one_of
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .convex import Below, Branch, Convex, Tangent, least_sum
-from .criterion import Criterion, Scorer, Wrapping, as_criterion
+from .criterion import Criterion, Scorer, Wrapping
 from .mode_shapes import PlacedShapes, shapes_of
 from .problem import RigidPart
 
@@ -130,52 +130,6 @@ class PenalisedScores(Scorer):
         base = self.base.bound(count, required)
         least = max(self.penalty.bound(count, required), 0.0)
         return float(_penalised_sum(base, least, self.weight)) if base >= 0 else base
-
-
-@dataclass(frozen=True, eq=False)
-class Penalised(Wrapping):
-    """``J + weight |J| penalty``: a criterion that grows by a part of itself.
-
-    Parameters
-    ----------
-    criterion : Criterion or callable
-        J, from plant to float.
-    penalty : Criterion or callable
-        From plant to float, 0 or more, such as `LeftOutModes`.
-    weight : float
-        Of the penalty.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> cautious = fx.placement.Penalised(fx.PoiVariance(), penalty=lambda plant: 0.1)
-    >>> fx.place_sensors(plant, ["y1", "y2"], 1, cautious).chosen
-    ('y1',)
-    """
-
-    penalty: Any = None
-    weight: float = field(default=1.0, metadata=checked(positive))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        function(self.penalty, "a penalty", "Name one.")
-
-    def __call__(self, plant: StandardPlant) -> float:
-        """Return it on a plant."""
-        return float(_penalised_sum(self.criterion(plant), self.penalty(plant), self.weight))
-
-    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Check both."""
-        super().check(plant, candidates)
-        as_criterion(self.penalty, sides_of(candidates)).check(plant, candidates)
-
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the scores of choices by those of both."""
-        base, more = self.inner, as_criterion(self.penalty)
-        return PenalisedScores(
-            base.scorer(plant, candidates), more.scorer(plant, candidates), self.weight
-        )
 
 
 def _penalised_sum(value: Any, penalty: Any, weight: float) -> Any:

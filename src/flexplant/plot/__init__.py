@@ -3,7 +3,7 @@
 - `bode`, `frf`, `singular_values`, `nyquist`, `sensitivity`: responses and loops.
 - `response`, `exposures`, `budget`, `spectra`: runs and errors by source.
 - `update`, `parameters`, `residual`, `stabilisation`, `identified`: measurements and updates.
-- `layout`, `mode_shape`, `animate_mode`, `sensor_map`, `placed`: the machine and its devices.
+- `layout`, `mode_shape`, `sensor_map`, `placed`: the machine and its devices.
 - `report(path, ...)`: a whole design as one HTML file, with pictures to zoom, modes that move,
   certificates, seeds and versions.
 
@@ -52,7 +52,6 @@ from .estimation import estimate as estimate
 from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
 from .html_report import report as report
-from .identification import PolePicker as PolePicker
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
 from .loops import nyquist as nyquist
@@ -66,7 +65,6 @@ from .placement import sensor_map as sensor_map
 from .root_loci import root_locus as root_locus
 from .run_pictures import response as response
 from .run_pictures import step as step
-from .shapes import animate_mode as animate_mode
 from .shapes import layout as layout
 from .shapes import mode_shape as mode_shape
 from .updating import eigenvalues as eigenvalues

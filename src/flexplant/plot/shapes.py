@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -15,7 +14,7 @@ from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import ModelError, counted
 from ..labels import DofSet
 from ..modes import Modes
@@ -86,57 +85,6 @@ def mode_shape(
     '3d'
     """
     return _Moving(modes, number, scale, color, ax).at(phase)
-
-
-def animate_mode(
-    modes: Modes,
-    number: int,
-    *,
-    scale: float = 0.15,
-    frames: int = 24,
-    seconds: float = 1.5,
-    color: str | None = None,
-    ax: Any = None,
-) -> FuncAnimation:
-    """Return a mode in motion: ``.save("mode.gif")``, or ``.to_jshtml()`` for a page or notebook.
-
-    Parameters
-    ----------
-    modes, number, scale, color, ax : as for `mode_shape`
-    frames : int
-        Pictures in one period.
-    seconds : float [s]
-        The time that a period is shown for.
-
-    Returns
-    -------
-    matplotlib.animation.FuncAnimation
-        Keep it as long as it shall move; its `._fig` is the figure.
-
-    Raises
-    ------
-    ModelError
-        As for `mode_shape`.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0], stiffnesses=[1e4]))
-    >>> moving = fx.plot.animate_mode(modes, 2)  # doctest: +SKIP
-    >>> moving.save("mode_2.gif", writer="pillow")  # doctest: +SKIP
-    """
-    count = whole(frames, "frames", minimum=2)
-    moving = _Moving(modes, number, scale, color, ax)
-    figure = moving.ax.figure
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # once is enough: it would take most of the time of a frame
-    return FuncAnimation(
-        figure,
-        lambda k: moving.at(2.0 * np.pi * k / count).collections,
-        frames=count,
-        interval=1e3 * positive(seconds, "seconds") / count,
-        blit=False,
-    )
 
 
 class _Moving:

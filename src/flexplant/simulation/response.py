@@ -201,23 +201,6 @@ class Response(Value, Mapping[str, FloatArray]):
         average, deviation = self._moments(channel, window)
         return float(np.abs(average[..., late]).max()), float(deviation[..., late].max())
 
-    def to_sep005(self) -> list[dict[str, object]]:
-        """Return the channels of a single run as SDyPy's time series (SEP 5)."""
-        if self.data.ndim != 2:
-            raise ModelError(
-                f"SEP 5 holds single series, this response has {self.data.shape[0]} runs: take one "
-                "with response.replace(data=response.data[0])."
-            )
-        return [
-            {
-                "name": name,
-                "data": np.array(self[name]),
-                "fs": 1.0 / self.dt,
-                "unit_str": self.units.get(name, ""),
-            }
-            for name in self.names
-        ]
-
     def _from(self, channel: str, start: float) -> FloatArray:
         return self[channel][..., self._late(start)]
 
