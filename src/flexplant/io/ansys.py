@@ -13,6 +13,7 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure import FEMatrices
+from ..tolerances import SAME
 from .fe_modes import MODE_READERS, FileShapes
 from .files import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
 from .foreign_parsers import in_child
@@ -20,7 +21,7 @@ from .tables import read_nodes_table
 from .triplets import assembled, missing_extra
 
 #: a local coordinate system turned less than this [deg] is none
-_STRAIGHT = 1e-9
+_STRAIGHT = SAME
 
 
 def read_ansys(

@@ -375,19 +375,18 @@ def _letters(record: bytes, size: int) -> str:
 #: approach (real eigenvalues) and table (eigenvectors, real numbers, mode by mode)
 _APPROACH, _TABLE = 2, 7
 _IDENT = 146  # words of the record before the numbers
-#: cards of nodes and of coordinate systems in GEOM1 by the three words that a record begins with,
-#: and the bytes of their real numbers; None: of the words of the file
+#: cards of nodes and of coordinate systems in GEOM1, by the first of the three words that a record
+#: begins with, whose second is a hundredth of the first; and the third
+_NUMBERED = {4501: "GRID", 2101: "CORD2R", 2001: "CORD2C", 2201: "CORD2S"}
+_THIRD = {"GRID": 1, "CORD2R": 8, "CORD2C": 9, "CORD2S": 10}
+#: what the third word has more where real numbers have 8 bytes
+_DOUBLE = {kind: 1_120_000 if kind == "GRID" else 2_220_000 for kind in _THIRD}
+#: cards by the three words, and the bytes of their real numbers; None: of the words of the file
 _CARDS = {
-    (4501, 45, 1): ("GRID", None),
-    (2101, 21, 8): ("CORD2R", None),
-    (2001, 20, 9): ("CORD2C", None),
-    (2201, 22, 10): ("CORD2S", None),
-    (4501, 45, 1120001): ("GRID", 8),
-    (2101, 21, 2220008): ("CORD2R", 8),
-    (2001, 20, 2220009): ("CORD2C", 8),
-    (2201, 22, 2220010): ("CORD2S", 8),
+    (first, first // 100, _THIRD[kind] + more): (kind, size)
+    for first, kind in _NUMBERED.items()
+    for more, size in ((0, None), (_DOUBLE[kind], 8))
 }
-_NUMBERED = {key[0]: kind for key, (kind, _) in _CARDS.items()}
 
 
 def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:

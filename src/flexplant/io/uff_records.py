@@ -16,7 +16,7 @@ from ..lti.frequency import ORDERS
 from ..structure.unit_systems import GRAVITY, POUND
 from .files import damaged, file_path, parsing, refused, unread
 from .triplets import extra_module
-from .unit_labels import plain_label, unit_of
+from .unit_labels import plain_label, prefixed, unit_of
 
 
 def dataset_types(path: str | Path) -> list[int]:
@@ -233,7 +233,10 @@ def coherence_of(
 
 #: specific data types of dataset 58
 KINDS = {8: "displacement", 11: "velocity", 12: "acceleration"}
-_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "lbf": POUND * GRAVITY, "nm": 1.0, "n*m": 1.0}
+_FORCES = {
+    label.lower(): size
+    for label, size in (prefixed("N", "km") | prefixed("Nm", "") | prefixed("N*m", "")).items()
+} | {"lbf": POUND * GRAVITY}
 
 
 def record_scale(

@@ -6,24 +6,30 @@ import re
 
 from ..structure.unit_systems import GRAVITY, LENGTHS, POUND
 
-_LENGTHS = {**LENGTHS, "nm": 1e-9}
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}
-#: with capitals: mN is a millinewton, MN a meganewton; nm a length, Nm a moment
+#: prefixes of SI: with capitals, since mN is a millinewton and MN a meganewton
+PREFIXES = {"": 1.0, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
+
+
+def prefixed(unit: str, prefixes: str) -> dict[str, float]:
+    """Return the sizes of a unit with and without some prefixes, by label."""
+    return {f"{prefix}{unit}": PREFIXES[prefix] for prefix in ("", *prefixes)}
+
+
+_LENGTHS = {**LENGTHS, **prefixed("m", "n")}
+_ANGLES = prefixed("rad", "mu")
+#: nm is a length, Nm a moment
 _OTHERS = {
-    "N": (1.0, "N"),
-    "kN": (1e3, "N"),
-    "mN": (1e-3, "N"),
-    "MN": (1e6, "N"),
-    "lbf": (POUND * GRAVITY, "N"),
-    "Nm": (1.0, "N m"),
-    "N*m": (1.0, "N m"),
-    "V": (1.0, "V"),
-    "mV": (1e-3, "V"),
-    "A": (1.0, "A"),
-    "mA": (1e-3, "A"),
-    "g": (GRAVITY, "m/s^2"),
+    label: (size, unit)
+    for unit, sizes in {
+        "N": prefixed("N", "kmM") | {"lbf": POUND * GRAVITY},
+        "N m": prefixed("Nm", "") | prefixed("N*m", ""),
+        "V": prefixed("V", "m"),
+        "A": prefixed("A", "m"),
+        "m/s^2": {"g": GRAVITY},
+    }.items()
+    for label, size in sizes.items()
 }
-_TIMES = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}
+_TIMES = prefixed("s", "mu") | prefixed("sec", "") | prefixed("seconds", "")
 _SECONDS = re.compile(r"\(?s(?:ec)?((?:\^|\*\*)?2)?\)?")
 _ORDERS = ("", "/s", "/s^2")
 

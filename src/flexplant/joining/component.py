@@ -18,7 +18,7 @@ from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel
-from ..tolerances import SAME
+from ..tolerances import ROUNDING, SAME
 from ..words import instance
 
 #: either kind of model that can be joined
@@ -294,9 +294,9 @@ class JoinedShape(Interpolation):
 
 
 #: entries of a rotation below this are zero: cos(pi/2) is 6e-17
-_ZERO = 1e-14
+_ZERO = ROUNDING
 #: how far a rotation matrix may be from orthogonal
-_ORTHOGONAL = 1e-9
+_ORTHOGONAL = SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from ..words import flag, instance, mapping
 from .frf_joints import (
     FrfLink,
@@ -105,7 +105,7 @@ _CONDITION = 1e8
 #: and beyond which there is none
 _SINGULAR = 1e14
 #: largest gap in a joint of the answer, relative
-_GAP = 1e-9
+_GAP = SAME
 #: before the names of components that are taken out
 _KNOWN = "known "
 

@@ -15,11 +15,12 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
+from ..tolerances import SAME
 from ..words import instance
 from .joint import Joint, JointEnd, Patch, joint_axes
 
 #: a joint that adds less than this part to the others repeats them
-_RANK = 1e-9
+_RANK = SAME
 #: part of the motion of a patch beside its mean, at the median frequency, that is warned of
 _BENDS = 0.1
 

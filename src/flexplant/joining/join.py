@@ -23,7 +23,7 @@ from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value, frozen
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, rigid_body_basis
-from ..tolerances import SAME, TINY, divisor
+from ..tolerances import NULL, SAME, TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
@@ -432,7 +432,7 @@ def _force(K: Any, motions: FloatArray) -> float:
 #: patches of more displacements are not examined: each is a load of the component
 _MOST = 1000
 #: singular values of the compliance of a patch below this part of the largest are none
-_RANK = 1e-11
+_RANK = NULL
 
 
 def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str, float]:

@@ -16,12 +16,12 @@ from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
-from ..tolerances import TYPED
+from ..tolerances import SAME, TYPED
 from .component import Component, Model, Pose, components_of
 from .joint import Joint, JointEnd, joint_axes, joint_list
 
 #: relative: what a joint feels of a motion of the whole machine below this is rounding
-BALANCED = 1e-9
+BALANCED = SAME
 #: part of a joint's row that static shapes of a reduced component may miss
 _STATIC = 1e-3
 

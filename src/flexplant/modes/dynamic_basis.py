@@ -17,7 +17,7 @@ from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
-from ..tolerances import TINY, divisor
+from ..tolerances import NULL, SAME, SPLIT, TINY, divisor
 from .modes import Modes
 from .solve import damper_forces
 from .statics import StiffnessFactor, dissection_of, held_factor, static_response
@@ -25,9 +25,9 @@ from .statics import StiffnessFactor, dissection_of, held_factor, static_respons
 #: loads above which the second static response of each is left out
 _MANY = 30
 #: relative: damping between coordinates below this is rounding
-_COUPLED = 1e-11
+_COUPLED = NULL
 #: relative: a rate of decay below this leaves a resonance without a finite response
-_UNDAMPED = 1e-9
+_UNDAMPED = SAME
 #: frequencies that are solved at once, and entries of their matrices
 _CHUNK, _ENTRIES = 256, 4_000_000
 #: relative change of a direct solution by its last refinement, wanted and at most
@@ -335,9 +335,9 @@ def _dense_complex(matrix: Any) -> ComplexArray:
 #: a channel with a peak below this fraction of the responses of its places to their own forces is
 #: silent: it consists of the rounding of modes of other directions (up to 1e-11 was found for beams
 #: of 360 DOFs, in proportion to the condition of K), far below any response that is of use
-SILENT = 1e-9
+SILENT = SAME
 #: relative: next to a resonance, still within its peak
-_BESIDE = 1e-6
+_BESIDE = SPLIT
 #: error let pass relative to the response at a frequency, at antiresonances too
 _THERE = 1e-2
 #: of the peak: what an antiresonance has at least, undamped ones too

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import ROUNDING, SAME, TINY, divisor
 
 #: shapes below this part of the largest one of their span are none: rounding
-_NONE = 1e-9
+_NONE = SAME
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3
 #: MAC from which on two modes are the same one

@@ -24,6 +24,7 @@ from ..labels import DofSet, Place
 from ..store import Value, checked
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
+from ..tolerances import SAME
 from ..words import instance
 from .matching import pair_modes
 from .normal_forms import pole_pairs
@@ -207,7 +208,7 @@ def _poles_near(
 #: relative: a frequency that rounding of K may change by more is one to know of
 _SOFT = 1e-4
 #: relative: what complex shapes span less than this is rounding
-_TRUNCATED = 1e-9
+_TRUNCATED = SAME
 
 
 def _nothing() -> FloatArray:

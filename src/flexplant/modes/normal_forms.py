@@ -19,7 +19,7 @@ from ..tolerances import SAME, divisor
 from .matching import runs
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
-PROPORTIONAL = 1e-9
+PROPORTIONAL = SAME
 #: damping rate of a rigid-body motion, relative to the first elastic frequency, that is let pass
 RIGID_DRAG = 1e-4
 

@@ -324,7 +324,7 @@ def _coupled_modes(
 
 
 #: M-orthonormality that every result must have
-_ORTHONORMAL = 1e-12
+_ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
 _RESIDUAL = (1e-8, 1e-12)
 #: the part of the largest entry of a shape that counts for the rounding of each

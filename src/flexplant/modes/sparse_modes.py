@@ -19,6 +19,7 @@ from ..sparse.other_factors import Cholmod, Pardiso
 from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid, check_stiffness
 from ..structure.model import FEModel
+from ..tolerances import NULL
 from .statics import (
     CountingFactor,
     StiffnessFactor,
@@ -41,7 +42,7 @@ _EACH_DOF, _EACH_ENTRY = 5e4, 40.0
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
-_RESIDUAL = 1e-11
+_RESIDUAL = NULL
 #: residuals below this many roundings of K phi are not reduced by more steps
 _ROUNDINGS = 10.0
 #: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at: of many

@@ -20,7 +20,7 @@ from ..sparse.other_factors import Cholmod, CholmodCholesky, Pardiso, PardisoCho
 from ..sparse.symmetric import dense, diagonal, rounding_of, same_pattern
 from ..structure import FEModel
 from ..structure.definite import signed, unstable_stiffness
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import ROUNDING, SAME, TINY, divisor
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular
@@ -206,7 +206,7 @@ def _shift_matrix(K: Any, M: Any, square: float) -> Any:
 
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE = SAME
 
 
 def places(at: Place | Iterable[Place], name: str = "a place") -> tuple[Place, ...]:

@@ -276,16 +276,18 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY = (
 BLACK, GREY, LIGHT = "black", "0.55", "0.8"
 
 Style = dict[str, Any]
+#: width of a line [points]
+_WIDTH = 1.4
 
 #: what is drawn in every picture, and how. What lies below others is wide
 STYLES: Mapping[str, Style] = {
     "measured": {"color": BLACK, "linestyle": "-", "linewidth": 0.9, "zorder": 1.8},
     "truth": {"color": GREEN, "linestyle": "-", "linewidth": 4.0, "alpha": 0.35, "zorder": 1.5},
-    "model": {"color": BLUE, "linestyle": "-", "linewidth": 1.4},
-    "nominal": {"color": GREY, "linestyle": (0, (5, 1.5)), "linewidth": 1.4},
-    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": 1.6},
-    "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": 1.6},
-    "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": 1.3},
+    "model": {"color": BLUE, "linestyle": "-", "linewidth": _WIDTH},
+    "nominal": {"color": GREY, "linestyle": (0, (5, 1.5)), "linewidth": _WIDTH},
+    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": _WIDTH},
+    "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": _WIDTH},
+    "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": _WIDTH},
 }
 #: other words for the same things
 _WORDS = {
@@ -297,12 +299,12 @@ _WORDS = {
 }  # fmt: skip
 #: lines that are none of these, in their order
 CYCLE: Sequence[Style] = (
-    {"color": BLUE, "linestyle": "-", "linewidth": 1.4},
-    {"color": ORANGE, "linestyle": "-", "linewidth": 1.4},
-    {"color": GREEN, "linestyle": "--", "linewidth": 1.4},
-    {"color": RED, "linestyle": "-.", "linewidth": 1.4},
-    {"color": PURPLE, "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": 1.6},
-    {"color": SKY, "linestyle": ":", "linewidth": 1.8},
+    {"color": BLUE, "linestyle": "-", "linewidth": _WIDTH},
+    {"color": ORANGE, "linestyle": "-", "linewidth": _WIDTH},
+    {"color": GREEN, "linestyle": "--", "linewidth": _WIDTH},
+    {"color": RED, "linestyle": "-.", "linewidth": _WIDTH},
+    {"color": PURPLE, "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": _WIDTH},
+    {"color": SKY, "linestyle": ":", "linewidth": _WIDTH},
 )
 #: where ports are, in views of a structure
 PORTS: Mapping[str, Style] = {
@@ -365,7 +367,7 @@ def mark_devices(
                 beside.add(spot)
             if various and arrow:
                 turned = np.array(one.along)[:2] * _ARROW * extent
-                look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"], "linewidth": 1.4}
+                look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"], "linewidth": _WIDTH}
                 ax.annotate(
                     "", tuple(point[:2] + turned), tuple(point[:2]), arrowprops=look, zorder=3.9
                 )
@@ -416,7 +418,7 @@ def styles(
         style = dict(STYLES[role] if role else cycle[others % len(cycle)])
         if role is None and shades is not None:
             shade = to_hex(shades[others - taken])
-            style = {"color": shade, "linestyle": "-", "linewidth": 1.4}
+            style = {"color": shade, "linestyle": "-", "linewidth": _WIDTH}
         others += role is None
         if colors and label in colors:
             style["color"] = colors[label]

@@ -15,7 +15,7 @@ from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import SolverError, attempted, counted
 from ..parallel import one_thread, tick
 from ..seeds import Rng
-from ..tolerances import ROUNDING
+from ..tolerances import NULL, ROUNDING, SPLIT
 from .factor import DENSE_LIMIT, MultifrontalFactor, eliminated, negative_pivots, symmetric_lu
 from .ordering import Dissection, dissect
 from .symmetric import (
@@ -36,7 +36,7 @@ BLOCK = 12
 #: residual of a Ritz pair of the inverse, relative to its value, at which it counts as found
 FOUND = 1e-8
 #: residual at which the value, in error by its square, is known to rounding
-VALUE = 1e-6
+VALUE = SPLIT
 #: what a bar calls the blocks that extend the basis
 STEPS = "modes, steps of Lanczos"
 #: steps between two restarts, with a large block
@@ -47,9 +47,9 @@ _LOST = 1e-3
 #: what one orthogonalisation may take away, relative, for rounding to leave nothing of it
 _SMALL = 1e-4
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
-_STALE = 1e-11
+_STALE = NULL
 #: relative error of a Ritz pair below which its shape needs no tolerance of its own
-_SURE = 1e-12
+_SURE = ROUNDING
 #: values below this part of the largest one, times FOUND, are not found beside it
 _ROUNDING = 1e-14
 #: residuals of this part of the largest value are rounding: no step reduces them

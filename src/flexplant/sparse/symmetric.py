@@ -11,12 +11,12 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError
-from ..tolerances import SAME, divisor
+from ..tolerances import SAME, SPLIT, divisor
 
 #: stored zeros are left out for products where fewer entries than this part are none
 _FULL = 0.8
 #: eigenvalues closer together than this are found to 1e-9 of themselves in one go
-SPREAD = 1e-6
+SPREAD = SPLIT
 #: a group of soft modes ends below this part of the largest eigenvalue, at the widest gap
 _END = 1e-3
 #: rows that are worked on at a time

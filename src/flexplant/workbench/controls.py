@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import FlexplantError, ModelError
+from ..io.unit_labels import prefixed
 from ..synthesis import FixedBlock, Integrator, Lag, Lead, LowPass, Notch, Pid, ShapedAxis
 from ..synthesis.laws.law import SingleElement
 from ..tolerances import SAME
@@ -17,8 +18,8 @@ from .verdict import COMPACT, ELEMENT, OFF
 
 #: factors of what may follow a number
 _UNITS = {
-    "": 1.0, "hz": 1.0, "khz": 1e3, "mhz": 1e-3, "%": 0.01, "s": 1.0, "ms": 1e-3, "us": 1e-6,
-    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "deg": 1.0, "rad/s": 0.5 / np.pi,
+    **prefixed("", ""), **prefixed("hz", "km"), **prefixed("s", "mu"), **prefixed("m", "mun"),
+    **prefixed("deg", ""), "%": 0.01, "rad/s": 0.5 / np.pi,
 }  # fmt: skip
 #: units of a frequency, and of a number without a unit
 _KINDS = {"Hz": {"", "hz", "khz", "mhz", "rad/s"}, "": {"", "%", "db"}}
