@@ -93,13 +93,11 @@ def fleet(count: int, seed: int = 20261) -> list[fx.testbeds.WaferStage]:
 
 
 # %% The pipeline of each machine: measure, update, design, verify on the machine
-UNKNOWN = [
-    fx.AddedMass(Z8, bounds=(0.0, 2.0)),
-    fx.MatrixParameter("stiffness", dK=plate.K, bounds=(-0.1, 0.1)),
-]
-SPECIFICATION = fx.Specification(ma=MA, modulus_margin=MARGIN, start=0.3)
-MOVE = fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
+STIFFNESS = fx.MatrixParameter("stiffness", dK=plate.K, bounds=(-0.1, 0.1))
+UNKNOWN = [fx.AddedMass(Z8, bounds=(0.0, 2.0)), STIFFNESS]
 DURATION, STEADY = 0.6, 0.3  # s, of a run and where its move is over
+SPECIFICATION = fx.Specification(ma=MA, modulus_margin=MARGIN, start=STEADY)
+MOVE = fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
 
 
 def pipeline(machine: Any, rng: np.random.Generator, blocks: Any = None) -> dict[str, Any]:
@@ -122,10 +120,12 @@ def pipeline(machine: Any, rng: np.random.Generator, blocks: Any = None) -> dict
     return {
         **{one.name: value for one, value in zip(UNKNOWN, fit.values.tolist(), strict=True)},
         "margin expected": left_out.modulus_margin,
-        **{"modulus margin": loop.modulus_margin, "stable": loop.is_stable},
+        "modulus margin": loop.modulus_margin,
+        "stable": loop.is_stable,
         "bandwidth": fx.loop.bandwidth(loop),
         "error rms": float(np.max(run.rms("die:error", start=STEADY))),
-        **{"MA": verdict["MA"], "passed": verdict.passed},
+        "MA": verdict["MA"],
+        "passed": verdict.passed,
     }
 
 
