@@ -10,8 +10,7 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, ShapeError
-from flexplant.io import models
-from flexplant.io.files import Format
+from flexplant.io import Format, models
 from shared_data import data_file, needs
 
 FE = data_file("fe")

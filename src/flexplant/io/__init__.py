@@ -84,6 +84,8 @@ from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys
 from .exodus import read_exodus_modes as read_exodus_modes
 from .fe_modes import read_modes as read_modes
+from .files import Format as Format
+from .files import add_format as add_format
 from .frf_files import read_frf_csv as read_frf_csv
 from .frf_files import read_frf_mat as read_frf_mat
 from .frf_files import read_frf_npz as read_frf_npz

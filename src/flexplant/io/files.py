@@ -260,13 +260,39 @@ USUAL = "usual"
 HEAD = 20000
 
 
+def _by_suffix_alone(head: bytes) -> bool:
+    """Return False: the first bytes of a file do not tell its format."""
+    return False
+
+
 @dataclass(frozen=True)
 class Format:
-    """Files that hold matrices, and their reader."""
+    """Files that hold matrices, and their reader; `add_format` makes it known.
+
+    Parameters
+    ----------
+    suffixes : sequence of str
+        Ends of the names of such files, in lower case: ".mtx".
+    read : function
+        ``read(path, **options)`` returns the `FEMatrices` of a file.
+    begins : function, optional
+        Whether the first bytes of a file show the format, for files of any name.
+    mesh : sequence of str
+        Ends of the names of files that hold only the nodes.
+    mesh_option : str
+        The option of `read` that takes such a file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> form = fx.io.Format((".rows",), lambda path: fx.structure.FEMatrices([[1.0]]))
+    >>> form.options
+    ()
+    """
 
     suffixes: tuple[str, ...]
     read: Callable[..., FEMatrices]
-    begins: Callable[[bytes], bool] = lambda head: False
+    begins: Callable[[bytes], bool] = _by_suffix_alone
     mesh: tuple[str, ...] = ()
     mesh_option: str = ""
 
@@ -295,6 +321,34 @@ class Elsewhere:
 #: what each reader's module registers: its files, and those without matrices beside them
 FORMATS: list[Format] = []
 ELSEWHERE: list[Elsewhere] = []
+
+
+def add_format(form: Format) -> None:
+    """Make a format of your own known to `read_matrices` and `read_model`.
+
+    Parameters
+    ----------
+    form : Format
+
+    Raises
+    ------
+    ModelError
+        When a format with one of its suffixes is known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> form = fx.io.Format((".mtx",), lambda path: fx.structure.FEMatrices([[1.0]]))
+    >>> fx.io.add_format(form)
+    Traceback (most recent call last):
+    flexplant.errors.ModelError: files that end in .mtx have a reader. Choose another suffix.
+    """
+    taken = {suffix for known in FORMATS for suffix in known.suffixes}.intersection(form.suffixes)
+    if taken:
+        raise ModelError(
+            f"files that end in {', '.join(sorted(taken))} have a reader. Choose another suffix."
+        )
+    FORMATS.append(form)
 
 
 def is_text(head: bytes) -> bool:

@@ -286,7 +286,31 @@ def static_response(model: Any, loads: FloatArray) -> FloatArray:
 
     ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes. Of
     a large model by its factor; else held at the r DOFs that distinguish rigid-body motions best,
-    which in balance carry no force. A model is anything with M, K and rigid_body.
+    which in balance carry no force.
+
+    Parameters
+    ----------
+    model : FEModel
+        Anything with M, K and rigid_body.
+    loads : (n, m) array
+        Forces on the DOFs [N, N m], a column for each case.
+
+    Returns
+    -------
+    (n, m) array [m, rad]
+
+    Raises
+    ------
+    ModelError
+        When K has a motion without energy that is not a rigid-body motion.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
+    >>> fx.modes.static_response(model, np.array([[1.0], [-1.0]])).ravel().round(9).tolist()
+    [1.25e-06, -1.25e-06]
     """
     if is_large(model):
         return stiffness_factor(model).static(loads)

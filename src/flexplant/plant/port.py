@@ -165,8 +165,14 @@ class SensorPort(Value):
 
     @property
     def unit(self) -> str | None:
-        """Unit of the channel; None where it has none."""
-        return None
+        """Unit of the channel: that of the motion at its place, None for a sum of both kinds.
+
+        A kind that measures something else has a field `unit` instead; one that overrides `see`
+        has no unit unless it states one.
+        """
+        if type(self).see is not SensorPort.see:
+            return None
+        return motion_unit(self.at, getattr(self, "direction", "z"), self.order)
 
     @property
     def order(self) -> int:

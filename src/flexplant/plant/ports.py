@@ -74,11 +74,6 @@ class Sensor(SensorPort):
     absolute: bool | None = None
     moves: Any = None
 
-    @property
-    def unit(self) -> str | None:
-        """Unit of the motion, m or rad, per s, per s^2; None for a sum of both."""
-        return motion_unit(self.at, self.direction, self.order)
-
     def row(self, realisation: ModalRealisation) -> FloatArray:
         """Return the row (n,) over the model's DOFs of its displacement."""
         return realisation.row(self.at, self.direction)

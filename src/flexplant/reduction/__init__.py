@@ -44,6 +44,7 @@ from .judging import ReductionQuality as ReductionQuality
 from .krylov import Krylov as Krylov
 from .methods import DesiredDofs as DesiredDofs
 from .methods import ReductionMethod as ReductionMethod
+from .methods import projected_model as projected_model
 from .methods import reduce as reduce
 from .ranking import ErrorBound as ErrorBound
 from .ranking import ModeRanking as ModeRanking

@@ -117,7 +117,48 @@ def projected_model(
     singular: str = "",
     static_at: Sequence[str] = (),
 ) -> ReducedModel:
-    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``."""
+    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
+
+    A reduction of your own computes T and returns this; see `ReductionMethod`.
+
+    Parameters
+    ----------
+    model : FEModel
+    T : (n, k) array
+        Columns that span the motions that are kept, the rigid-body motions among them.
+    dofs : DofSet
+        The DOFs of the coordinates, k of them; empty where they are not physical.
+    method : str
+        Name of the method, for messages and reprs.
+    coordinates : sequence of str
+        Names of coordinates that are not physical.
+    damping : Damping, optional
+        Replaces the D of the model.
+    condition, condition_of : float, str
+        Condition number of what the method inverted, and what that was.
+    bound : ErrorBound, optional
+    singular : str
+        Advice for the error where the columns depend on each other.
+    static_at : sequence of str
+        Labels whose static response T holds exactly.
+
+    Returns
+    -------
+    ReducedModel
+
+    Raises
+    ------
+    ModelError
+        When the columns of T depend on each other, or do not hold the rigid-body motions.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduction.projected_model(model, np.eye(3), dofs=model.dofs, method="none").M.diagonal()
+    array([1., 1., 1.])
+    """
     M, K = inner(model.M, T), inner(model.K, T)
     scaled, scale = unit_diagonal(M)
     values = la.eigvalsh(dense(scaled))

@@ -88,6 +88,8 @@ from .robustness.mu_bounds import MuBounds as MuBounds
 from .robustness.mu_bounds import mu as mu
 from .robustness.uncertainty_blocks import FullBlock as FullBlock
 from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
+from .structured.judges import Judge as Judge
+from .structured.measured_objective import MeasuredObjective as MeasuredObjective
 from .structured.structured_design import design_structured as design_structured
 from .structured.structures import FixedOrder as FixedOrder
 from .structured.structures import ObserverGains as ObserverGains

@@ -55,6 +55,7 @@ from .residuals.modal_residuals import ModeShapes as ModeShapes
 from .residuals.modal_residuals import ShapeCorrelation as ShapeCorrelation
 from .residuals.point_residuals import Antiresonances as Antiresonances
 from .residuals.point_residuals import StaticCompliance as StaticCompliance
+from .residuals.residual import Bound as Bound
 from .residuals.residual import Residual as Residual
 from .search import GaussNewton as GaussNewton
 from .search import TrustRegion as TrustRegion

@@ -12,16 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import FloatArray, between, positive
-from ...errors import SolverError, require_known
+from ...errors import SolverError
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
 from ...tolerances import TINY
-from ...words import name_list
 from ..preparation import less_feedthrough
 from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
+from ..structured.measured_objective import MeasuredObjective
 from .lmi_programs import (
     TOLERANCES,
     Matrices,
@@ -41,22 +41,7 @@ _APART = 1.005
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _ChannelNorm(Value):
-    """Some w, some z, and a bound on what happens between."""
-
-    w: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
-    z: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
-    below: float | None = field(default=None, metadata=checked(positive))
-
-    def chosen(self, plant: AnyPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of w and z, all where none were given."""
-        for side in "wz":
-            require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
-        return self.w or plant.w, self.z or plant.z
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class H2(_ChannelNorm):
+class H2(MeasuredObjective):
     """The H2 norm from w to z: the rms of z for white w of unit intensity.
 
     Parameters
@@ -87,7 +72,7 @@ class H2(_ChannelNorm):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Hinf(_ChannelNorm):
+class Hinf(MeasuredObjective):
     """The H-infinity norm from w to z: the largest gain over all frequencies.
 
     Parameters
@@ -111,7 +96,7 @@ class Hinf(_ChannelNorm):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PeakGain(_ChannelNorm):
+class PeakGain(MeasuredObjective):
     """The largest amplitude of z for w of amplitude one: peak to peak.
 
     The LMI bounds the length of z for w of length one (the star norm); what is verified is the

@@ -228,7 +228,7 @@ def _squares(rows: ComplexArray | FloatArray, weights: FloatArray, size: float) 
 
 
 #: step of the controller, in parameters of size 1, by which a gradient's derivative is found
-_STEP = 1e-5
+STEP = 1e-5
 #: time constants of the slowest pole after which an impulse response is over: e^-25 is rounding
 _OVER = 25.0
 #: points of the times at which its sign is taken: a period of the fastest pole that rings, each
@@ -241,7 +241,12 @@ _CLOSE = 1e-7
 
 
 class Judge(Protocol):
-    """A number that a stable loop has, in logarithms, with its gradient: what is minimised."""
+    """A number that a stable loop has, in logarithms, with its gradient: what is minimised.
+
+    The controllers that it is given are in the user's units. The problem that `problem_on`
+    prepares is scaled: one unit of its time is ``1 / p.speed`` seconds, so that a judge that works
+    on its matrices turns its number back into the user's units itself, as `H2Judge` does.
+    """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
         """Return the number, infinite when the loop is not stable, and its place."""
@@ -255,7 +260,8 @@ class Judge(Protocol):
 class LoopObjective(Protocol):
     """What `design_structured` minimises; `Hinf`, `H2` and `PeakGain` are such values.
 
-    A number of the loop from some w to some z, in multiples of `below` where that is given.
+    A number of the loop from some w to some z, in multiples of `below` where that is given. One of
+    your own derives from `MeasuredObjective`.
     """
 
     @property
@@ -302,7 +308,7 @@ class GainJudge(ScaledLoop):
         )
 
 
-class _SmoothJudge(ScaledLoop, ABC):
+class SmoothJudge(ScaledLoop, ABC):
     """A number with one gradient, whose derivative is found by differences."""
 
     @abstractmethod
@@ -331,13 +337,13 @@ class _SmoothJudge(ScaledLoop, ABC):
         """Return the second derivatives, for parameters that the controller is linear in."""
         up, down = (
             np.array([self._logarithm(K.moved(step * move), by)[1] for move in by])
-            for step in (_STEP, -_STEP)
+            for step in (STEP, -STEP)
         )
-        H = (up - down) / (2.0 * _STEP)
+        H = (up - down) / (2.0 * STEP)
         return np.asarray(0.5 * (H + H.T))
 
 
-class H2Judge(_SmoothJudge):
+class H2Judge(SmoothJudge):
     """The H2 norm by both Gramians.
 
     ``d trace(C P C') = 2 trace(Q P dA' + Q B dB' + C P dC')``. In the image of a sampled loop,
@@ -364,7 +370,7 @@ class H2Judge(_SmoothJudge):
         return scale * norm, scale * loop.slope(by_A, by_B, by_C, by_D)
 
 
-class PeakJudge(_SmoothJudge):
+class PeakJudge(SmoothJudge):
     """The integral (sampled: the sum) of an absolute impulse response, one w to one z.
 
     ``int s(t) h(t) dt`` with the sign s of h is ``C S(A) B``, S a function of the poles; its

@@ -26,7 +26,7 @@ from ..controller import (
     with_left_out,
 )
 from ..hinf.moved_design import PlantRange
-from ..lmi.objectives import H2, Hinf
+from ..lmi.objectives import H2, Hinf, PeakGain
 from ..preparation import Prepared, posed, prepared, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
@@ -190,8 +190,7 @@ def design_structured(
     if not abs(norms[worst] - claim) <= _AGREEMENT * claim:
         raise CertificateError(
             f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
-            f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
-            "the weights closer together."
+            f"{claim:.6g} by the search: {_blame(objectives)}."
         )
     loop = closed[worst]
     reached = reached_norms(plants[worst], loop, responder(loop)) if plain else {}
@@ -219,6 +218,20 @@ def design_structured(
         tried=search.tried,
     )
     return with_left_out(answer, plants[0])
+
+
+def _blame(objectives: Sequence[LoopObjective]) -> str:
+    """Return why the search and the loop give two numbers."""
+    foreign = [one for one in objectives if not isinstance(one, Hinf | H2 | PeakGain)]
+    if foreign:
+        return (
+            f"`measured` of {foreign[0]!r} and what its `judges` minimise are not one number. "
+            "Judges work in scaled time (see synthesis.Judge): derive from "
+            "synthesis.MeasuredObjective, which needs `measured` alone"
+        )
+    return (
+        "the loop is too badly conditioned to trust. Bring the sizes of the weights closer together"
+    )
 
 
 def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[AnyPlant]:

@@ -54,7 +54,11 @@ class Kind(NamedTuple):
 
 
 class Bound(ABC):
-    """Residuals of unit covariance (where the noise is known), and their exact gradients."""
+    """A residual tied to a family of models: its values, and their exact gradients.
+
+    The base class of what `Residual.bound` returns. Values have unit covariance where the noise of
+    the measurement is known.
+    """
 
     #: numbers of the modes that are followed for it
     numbers: tuple[int, ...] = ()

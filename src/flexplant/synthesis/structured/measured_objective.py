@@ -1,0 +1,100 @@
+"""Objectives of your own: a number of the closed loop, minimised by its differences."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...arrays import FloatArray, positive
+from ...errors import require_known
+from ...lti.discretisation import tustin
+from ...lti.interconnection import lft
+from ...lti.statespace import StateSpace
+from ...plant import AnyPlant
+from ...store import Value, checked
+from ...tolerances import TINY
+from ...words import name_list
+from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredObjective(Value):
+    """The base class of objectives of your own: a positive number of the closed loop.
+
+    A new objective gives `measured`, a smooth function of the loop from w to z in seconds and the
+    user's units. Its derivatives by the controller's parameters are found by differences.
+
+    Parameters
+    ----------
+    w, z : sequences of str, optional
+        Channels; all when not given.
+    below : float, optional
+        The number is counted in multiples of this bound.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class SlowestPole(fx.synthesis.MeasuredObjective):
+    ...     def measured(self, closed):
+    ...         return 1.0 / -closed.poles().real.max()
+    >>> plant = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=0.1, KS=0.1)
+    >>> law = fx.synthesis.FixedOrder(0)
+    >>> found = fx.synthesis.design_structured(
+    ...     plant, law, objective=SlowestPole(), starts=1, evaluations=50
+    ... )
+    >>> bool(found.gamma < 0.1)  # the largest time constant [s]
+    True
+    """
+
+    w: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
+    z: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
+    below: float | None = field(default=None, metadata=checked(positive))
+
+    def chosen(self, plant: AnyPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names of w and z, all where none were given."""
+        for side in "wz":
+            require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
+        return self.w or plant.w, self.z or plant.z
+
+    @abstractmethod
+    def measured(self, closed: StateSpace) -> float:
+        """Return the number of a closed loop from w to z."""
+
+    def judges(self, plant: AnyPlant, order: int) -> Sequence[Judge]:
+        """Return what finds the number for controllers of an order."""
+        return [MeasuredJudge(plant, self, order)]
+
+
+class MeasuredJudge(SmoothJudge):
+    """A number of the loop in the user's units, its gradient by differences of the controller."""
+
+    def __init__(self, plant: AnyPlant, objective: MeasuredObjective, order: int) -> None:
+        w, z = objective.chosen(plant)
+        super().__init__(problem_on(plant, w, z), order)
+        self.objective, self.dt = objective, plant.dt
+        self.sides = (plant.y, plant.u)
+        self.system = plant.system.select([*z, *plant.y], [*w, *plant.u])
+
+    def value(self, K: Matrices) -> tuple[float, None]:
+        """Return the number."""
+        if self.stable(K) is None:
+            return np.inf, None
+        law = StateSpace(*K, inputs=self.sides[0], outputs=self.sides[1])
+        closed = lft(self.system, tustin(law, 1.0 / self.dt) if self.dt else law)
+        return float(self.objective.measured(closed)), None
+
+    def _logarithm(self, K: Matrices, by: FloatArray) -> tuple[float, FloatArray]:
+        value = self.value(K)[0]
+        ends = [[self.value(K.moved(s * STEP * move))[0] for s in (1.0, -1.0)] for move in by]
+        up, down = np.log(np.maximum(np.array(ends).reshape(-1, 2), TINY)).T
+        slopes = (up - down) / (2.0 * STEP)
+        return float(np.log(max(value, TINY))), np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def found(self, loop: Closed) -> tuple[float, FloatArray]:
+        """Return nothing: `value` and `_logarithm` close the loop in the user's units."""
+        raise NotImplementedError
