@@ -53,7 +53,8 @@ class RobustStability(Value):
         mu: every machine with Deltas smaller than ``1 / upper`` is stable; below 1, all machines
         of the uncertainty are. Values below 0.05 are not resolved.
     lower : float
-        A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found.
+        A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found, or none was
+        sought because all machines of the uncertainty are stable.
     freq : float [Hz]
         Where mu is largest; NaN where it is not resolved.
     values : mapping {str: float}
@@ -134,7 +135,7 @@ def robust_stability(
     quick : bool
         Where all Deltas are frequencies, first a bound with one channel a mode, the change of a
         sampled mode to first order, on a grid through the resonances: a fraction of a second for
-        ten modes. Where it is below 1 it is the answer, without a lower bound; else the whole
+        ten modes. Where it is below 1 it is the answer; else the whole
         search follows.
     machines : int
         How many are drawn, each Delta at an end of its interval.
@@ -180,7 +181,9 @@ def robust_stability(
     with Progress(None, INTERVALS, progress=progress):
         found = Cover(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2).run()
     upper = float(np.sqrt(found.level))
-    values, machine, lower = _worst_machine(loop, _worst(loop, found, upper, chance))
+    # below 1 the upper bound is the answer: the worst machine lies outside of the uncertainty
+    worst = None if upper < 1.0 else _worst(loop, found, upper, chance)
+    values, machine, lower = _worst_machine(loop, worst)
     names = [name for name, _ in loop.channels.deltas]
     # systems of many states are covered by sampling between the frequencies instead
     beside = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
