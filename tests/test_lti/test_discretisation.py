@@ -236,14 +236,16 @@ def test_heavy_overdamping_neither_overflows_nor_loses_the_slow_pole(omega, rate
         (1e4, 1e-4, "delay=1 at 10000 Hz"),
     ],
 )
-def test_a_period_for_a_rate_and_seconds_for_samples_are_refused(rate, delay, said):
+def test_a_period_for_a_rate_and_seconds_for_samples_are_warned_of(rate, delay, said):
     mode = StateSpace([[0, 1], [-(3e3**2), -60]], [[0], [1]], [[1, 0]], [[0]])
-    with pytest.raises(ModelError, match=said):
+    with pytest.warns(FlexplantWarning, match=said):
         discretized(mode, rate, delay=delay)
     with pytest.warns(FlexplantWarning, match=r"477\.5 Hz and above, lie above half"):
         discretized(mode, 500.0)
     slow = StateSpace([[-3e3]], [[3e3]], [[1]], [[0]])  # a filter: sampled at any rate
     assert discretized(slow, 10.0).dt == 0.1
+    with pytest.raises(ModelError, match="at most 1000 samples"):
+        discretized(slow, 10.0, delay=1001)
 
 
 def test_the_bilinear_maps_do_not_depend_on_the_units_of_the_states():

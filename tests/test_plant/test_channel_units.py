@@ -157,13 +157,13 @@ def test_a_derivative_changes_the_unit():
         (1e4, 1e-4, r"delay=0.0001 is in samples.*delay=1 at 10000 Hz"),
     ],
 )
-def test_rates_and_delays_in_another_unit_are_refused(rate, delay, said):
-    """At once: sampling with a period of 10 000 s took 20 s and all memory."""
+def test_rates_and_delays_in_another_unit_are_warned_of(rate, delay, said):
+    """Sampling with a period of 10 000 s takes no longer than any other."""
     plant = fx.assemble_plant(some_modes(), ports())
-    with pytest.raises(ModelError, match=said):
+    with pytest.warns(FlexplantWarning, match=said):
         plant.discretized(rate, delay=delay)
     elsewhere = fx.StandardPlant.from_statespace(plant.system)
-    with pytest.raises(ModelError, match=said):
+    with pytest.warns(FlexplantWarning, match=said):
         elsewhere.discretized(rate, delay=delay)
 
 
@@ -176,13 +176,10 @@ def test_modes_partly_above_half_the_rate_are_normal_and_all_are_warned_of():
         plant.discretized(400.0)
 
 
-def test_latencies_and_delays_in_the_unit_of_the_other_are_refused():
+def test_delays_of_more_than_1000_samples_are_refused():
     """Latencies of ports are in seconds, the delay of a sampled loop is in samples."""
-    first = ports().u[0]
-    with pytest.raises(ModelError, match=r"'u1' is 1 s.*latency=1 / rate.*delay=1\)"):
-        first.replace(latency=1)
     late = ports().replace(u=[a.replace(latency=0.5) for a in ports().u])
-    with pytest.raises(ModelError, match=r"is 0.5 s, 5000 samples at 10000 Hz.*latency=5e-05"):
+    with pytest.raises(ModelError, match=r"'u1' is 5000 samples, 0.5 s at 10000 Hz.*seconds"):
         fx.assemble_plant(some_modes(), late).discretized(1e4)
-    with pytest.raises(ModelError, match=r"means 0.15 s.*1500 us are meant, it is delay=15 at"):
+    with pytest.raises(ModelError, match=r"delay is 1500 samples, 0.15 s"):
         fx.assemble_plant(some_modes(), ports()).discretized(1e4, delay=1500)

@@ -47,13 +47,14 @@ def discretized(
     Raises
     ------
     ModelError
-        When `sys` is sampled already, rate or delay is not positive, or plausible in another unit
-        only: the slowest mode lies far above half the rate, or a delay is next to nothing.
+        When `sys` is sampled already, the rate is not positive, or a delay is negative or longer
+        than 1000 samples.
 
     Warns
     -----
     FlexplantWarning
-        When all modes lie above half the rate.
+        When all modes lie above half the rate, or a delay is shorter than 0.01 samples: the unit
+        is probably another one.
 
     References
     ----------
@@ -482,59 +483,45 @@ def accumulated_noise(
     return G
 
 
-#: times half the rate: where even the lowest mode lies above this, the rate is in another unit
-_OTHER_UNIT = 10.0
-#: samples: a delay between 0 and this changes nothing that can be measured
+#: delay in samples below which it is probably given in seconds: it changes no result
 _NO_DELAY = 0.01
-#: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
+#: longest delay in samples, of a loop or a port: each sample is a state of each channel
 _LONGEST = 1000.0
 #: damping ratio up to which a pole is a mode, not a filter
 _LIGHT = 0.3
 
 
 def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
-    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate."""
+    """Check a sampling rate [Hz] and a delay [samples]; warn where the unit is probably another."""
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
     if 0 < delay < _NO_DELAY:
-        raise ModelError(
-            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s and changes "
-            f"nothing. If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
+        warn(
+            f"delay={delay:g} is in samples, {delay / rate:.3g} s, and changes next to nothing. "
+            f"If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
         )
-    if delay > _LONGEST:
-        raise ModelError(
-            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s: no loop runs "
-            f"that late. If {delay:g} us are meant, it is delay={1e-6 * delay * rate:.4g} at "
-            f"{rate:g} Hz."
+    _check_length("delay", delay, rate)
+    if modes.size and modes.min() > 0.5 * rate:
+        lowest = float(modes.min())
+        other = f"{rate:g} kHz is rate={1e3 * rate:g}" if rate >= 1 else ""
+        other = other or f"{rate:g} s as a sampling period is rate={1 / rate:g}"
+        warn(
+            f"all {modes.size} elastic modes, {lowest:.4g} Hz and above, lie above half the "
+            f"sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The rate "
+            f"is in Hz and the model in SI units; {other}."
         )
-    if not modes.size or modes.min() <= 0.5 * rate:
-        return
-    said = (
-        f"all {modes.size} elastic modes, {modes.min():.4g} Hz and above, lie above "
-        f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
-        "rate is in Hz"
-    )
-    if modes.min() > 0.5 * _OTHER_UNIT * rate:
-        raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
-    said = f"{said}, the model in SI units: are both?"
-    warn(said)
-
-
-def _meant(rate: float, lowest: float) -> str:
-    """Return which other unit would bring the lowest mode below half the rate."""
-    if rate < 1 and 2 * lowest <= 1 / rate:
-        return f"; {rate:g} s as a sampling period is rate={1 / rate:g}"
-    if 2 * lowest <= 1e3 * rate:
-        return f"; {rate:g} kHz is rate={1e3 * rate:g}"
-    return ""
 
 
 def check_latency(name: str, latency: float, rate: float) -> None:
     """Raise ModelError when the latency [s] of a port is more than 1000 samples."""
-    if latency * rate > _LONGEST:
+    _check_length(f"the latency of {name!r}", latency * rate, rate)
+
+
+def _check_length(what: str, samples: float, rate: float) -> None:
+    if samples > _LONGEST:
         raise ModelError(
-            f"the latency of {name!r} is {latency:g} s, {latency * rate:.4g} samples at {rate:g} "
-            f"Hz: latencies are in seconds. If {latency:g} samples are meant, it is "
-            f"latency={latency / rate:.4g}."
+            f"{what} is {samples:.4g} samples, {samples / rate:.3g} s at {rate:g} Hz; at most "
+            f"{_LONGEST:g} samples are possible, each of which is a state. Delays of loops are in "
+            "samples, latencies of ports in seconds."
         )
 
 

@@ -229,8 +229,6 @@ def turning(at: Place, direction: str) -> bool | None:
     return kinds.pop() if len(kinds) == 1 else None
 
 
-#: [s] a latency from here on is taken for a number of samples
-_SAMPLES = 1.0
 #: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises
 #: of sensors and disturbances of actuators
 DERIVED = ("hat", "ref", "error", "effort", "noise", "disturbance")
@@ -245,7 +243,7 @@ def checked_port(port: Any) -> dict[str, Any]:
         "asd": lambda name, asd: positive(asd, f"asd of {name!r}", zero=True),
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
         "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
-        "latency": checked_latency,
+        "latency": lambda name, late: positive(late, f"latency of {name!r}", zero=True),
         "held": lambda name, held: flag(held, f"held of {name!r}"),
         "absolute": checked_choice,
     }
@@ -279,18 +277,6 @@ def checked_name(name: Any) -> str:
             f"{name.replace(':', '_')!r}, say."
         )
     return name
-
-
-def checked_latency(name: str, latency: Any) -> float:
-    """Return the latency [s] of a port, or raise ModelError: a second is a number of samples."""
-    late = positive(latency, f"latency of {name!r}", zero=True)
-    if late >= _SAMPLES:
-        raise ModelError(
-            f"the latency of {name!r} is {late:g} s, in seconds: no loop runs that late. If "
-            f"samples are meant, divide by the rate, latency={late:g} / rate, or pass them to "
-            f"plant.discretized(rate, delay={late:g})."
-        )
-    return late
 
 
 def checked_choice(name: str, absolute: Any) -> bool | None:

@@ -98,14 +98,14 @@ class StandardPlant(Partition):
         Raises
         ------
         ModelError
-            When the plant is sampled already, or rate or delay is not positive; when
-            they are plausible in another unit only: the lowest elastic mode lies above five times
-            the rate, a delay is below 0.01 samples, or that of a port above 1000 samples.
+            When the plant is sampled already, the rate is not positive, or a delay is negative or
+            longer than 1000 samples.
 
         Warns
         -----
         FlexplantWarning
-            When all elastic modes lie above half the rate.
+            When all elastic modes lie above half the rate, or a delay is shorter than 0.01
+            samples: the unit is probably another one.
         """
         return self._known(sampled(self, rate, delay))
 
