@@ -312,3 +312,10 @@ def test_a_weighted_plant_shows_its_machine(tmp_path):
     heavy = plant.weighted(fx.stage_weights(plant, 20.0))
     page = fx.plot.report(tmp_path / "heavy.html", {"heavy": heavy}).read_text(encoding="utf-8")
     assert "Standard assumptions" in page and "u actuator" in page
+
+
+@pytest.mark.parametrize("kind", ["hexapod", "dual_stage"])
+def test_a_driven_machine_is_drawn(kind, tmp_path):
+    """Devices above and below each other, with relative drives: every picture is there."""
+    page = fx.plot.report(tmp_path / "page.html", {"p": getattr(fx.testbeds, kind)()})
+    assert page.read_text(encoding="utf-8").count("<svg") >= 2

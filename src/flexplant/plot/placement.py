@@ -228,7 +228,9 @@ def placed(
         _view(ax, dofs.xyz, top, shape, kinds, zones)
         ax.set_title(title)
         return ax
-    above = {k: [one for one in v if one not in below[k]] for k, v in kinds.items()}
+    above = {
+        k: [one for one in v if not _is_below(one, middle, dofs.xyz)] for k, v in kinds.items()
+    }
     upper, lower = panel_axes(None, 2, columns=1, figsize=(6.4, 9.0), sharex=False)
     for panel, end, shown in ((upper, height.max(), above), (lower, height.min(), below)):
         _view(panel, dofs.xyz, rows[height == end], shape, shown, zones, various=differ(kinds))

@@ -226,7 +226,7 @@ def open_page(
     model : StandardPlant or StateSpace, optional
         Of a measured plant: drawn beside it, for its error and the modes left out.
     before, after, rate, delay, hold, rigid, unstable, references
-        As for `design_loops`; of an assembled plant, or of the model, the rigid-body axes.
+        As for `design_loops`; by default those of the plant or model: the axes that it drives.
     channel : str, optional
         The z whose rms is predicted; the first error of the plant when not given.
     move : SetPointProfile, optional

@@ -200,7 +200,7 @@ class LoopDesign(Value):
         unstable: int = 0,
         references: Mapping[str, str] | None = None,
     ) -> LoopDesign:
-        """Return a design on a plant, whose rigid-body axes are taken unless they are given.
+        """Return a design on a plant, whose driven axes are taken unless axes are given.
 
         Parameters
         ----------
