@@ -203,8 +203,11 @@ def placed(
     model: Any = own.realisation.model
     dofs = model.dofs
     rows = np.flatnonzero(np.array(dofs.directions) == "z")
-    if rows.size < 3:
-        raise ModelError("a picture from above needs at least three DOFs in z: the model has less.")
+    if rows.size < 3 or not np.ptp(dofs.xyz[rows, :2], axis=0).any():
+        raise ModelError(
+            "a picture from above needs at least three DOFs in z at different places: the model "
+            "has fewer."
+        )
     shape, title = None, ""
     if mode is not None:
         shapes = shapes_of(plant, ())
