@@ -56,13 +56,13 @@ def write_c(
         alone differ (feedforward, decoupling, gains after the states), linear between places; of
         a ScheduledLoop all matrices are, its position the last input.
     path : path
-        Of the source; the header stands beside it.
+        Path of the source; the header is next to it.
     name : str, optional
         Prefix of the functions; the file's own when not given.
     limits : float, (low, high) or mapping {actuator: one of these}, optional
         What actuators apply at most, in the units of u; commands are limited to it.
     anti_windup : float [s], optional
-        In a ClosedLoop, as for `simulate`. Of a controller by itself that does not read what is
+        In a ClosedLoop, as for `simulate`. For a controller alone that does not read what is
         applied, as `recovery` for `anti_windup_form`; limits without it need Hanus' form.
     schedule : str, optional
         The input whose value is the place, of a mapping.
@@ -82,7 +82,7 @@ def write_c(
     CertificateError
         When the blocks differ from the controller, by rounding to single precision for instance.
     LabelError
-        When the name is no C identifier, or an actuator or the input of a schedule is unknown.
+        When the name is not a C identifier, or an actuator or the input of a schedule is unknown.
     ModelError
         When the controller is continuous, the path no `.c` file, or controllers of a schedule
         differ in more than their outputs.

@@ -350,7 +350,7 @@ def write_fmu(
     version : str
         "3.0" or "2.0".
     limits, anti_windup, schedule
-        Of a controller, as for `write_c`.
+        Limits of a controller, as for `write_c`.
 
     Returns
     -------
@@ -361,7 +361,7 @@ def write_fmu(
     Raises
     ------
     LabelError
-        When the file's name is no C identifier, or a channel's no variable of a unit.
+        When the file's name is not a C identifier, or a channel's name not one of a variable.
     ModelError
         When the system is continuous, the path ends in anything but .fmu, or the version is
         unknown.

@@ -54,7 +54,7 @@ def read_abaqus(
     Parameters
     ----------
     stiffness, mass, damping : str or Path
-        Of step 1: `job_STIF1.mtx`, `job_MASS1.mtx` and (viscous damping) `job_DMPV1.mtx`.
+        Files of step 1: `job_STIF1.mtx`, `job_MASS1.mtx` and (viscous damping) `job_DMPV1.mtx`.
     inp : str or Path, optional
         The input file, for the coordinates in its `*NODE` blocks.
     dofs : DofSet, optional
@@ -71,7 +71,7 @@ def read_abaqus(
         When a line has another form; it is named.
     ModelError
         When there are internal nodes (Lagrange multipliers of contact, couplings or hybrid
-        elements), degrees of freedom that are no displacement, or nodes in transformed systems.
+        elements), degrees of freedom that are not displacements, or nodes in transformed systems.
     LabelError
         When a node has no coordinates in `inp`.
 

@@ -20,7 +20,7 @@ from .foreign_parsers import in_child
 from .tables import read_nodes_table
 from .triplets import assembled, missing_extra
 
-#: a local coordinate system turned less than this [deg] is none
+#: a local coordinate system turned less than this [deg] counts as the global one
 _STRAIGHT = SAME
 
 
@@ -36,7 +36,7 @@ def read_ansys(
     are dropped and named in `constrained`. It does not hold coordinates, nor which nodes have a
     local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
 
-    Refused are lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are no displacement or
+    Refused are lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are not a displacement or
     rotation, and a file without M. A damping matrix in the file is not read, which `notes` say:
     give damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about
     the new x, then about the new y.
@@ -60,9 +60,9 @@ def read_ansys(
     Raises
     ------
     FlexplantError
-        When the package is missing, or the file is no .full file.
+        When the package is missing, or the file is not a .full file.
     ModelError
-        When a matrix is missing or lumped, DOFs are no displacements, or a partly held node has a
+        When a matrix is missing or lumped, DOFs are not displacements, or a partly held node has a
         local coordinate system.
     LabelError
         When a node has no coordinates.

@@ -59,9 +59,9 @@ def read_exodus_modes(
     Raises
     ------
     FlexplantError
-        When it is no Exodus file, cut off, or without shapes; when h5py is needed and not there.
+        When it is not an Exodus file, is cut off or has no shapes; when h5py is needed and missing.
     ModelError
-        When modes are near zero and `rigid_below` does not say what they are, or the shapes are
+        When modes are near zero and `rigid_below` is not given, or the shapes are
         not mass-normalised with `M`.
 
     Notes

@@ -180,8 +180,8 @@ def read_modes(
     rigid_below : float [Hz], optional
         Modes below this are rigid-body modes, and set to exactly 0.
     units : (length, mass, time), optional
-        Of the file: ("mm", "t", "s") for instance; the modes are in SI. None: as a universal file
-        says (dataset 164), or SI.
+        Units of the file: ("mm", "t", "s") for instance; the modes are in SI. None: as a universal
+        file says (dataset 164), or SI.
     matrices : FEMatrices or FEModel, optional
         In SI, with the same nodes: the shapes are checked to be mass-normalised with its M.
 
@@ -199,7 +199,7 @@ def read_modes(
     FlexplantError
         When the format is not known, holds no modes, or the file is damaged.
     ModelError
-        When damping is not said, modes are near zero and `rigid_below` does not say what they are,
+        When damping is not said, modes are near zero and `rigid_below` is not given,
         several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
     LabelError
         When a node has no place or its coordinate system is not there.

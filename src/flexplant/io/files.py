@@ -20,13 +20,13 @@ from ..words import several
 
 #: characters of a number that a program printed, at least; shorter ones may be typed by hand
 _PRINTED = 12
-#: numbers of fewer digits may be exact; longer ones were rounded to so many digits
+#: numbers of fewer digits may be exact; longer ones were rounded to that number of digits
 _ROUNDED = 6
 #: digits that a sign and one more digit of the exponent take from a number in a fixed field
 _FIELD = 2
 #: part of the numbers that have all digits: fewer end in several zeros by chance
 _ALIKE = 0.6
-#: a number of so many digits was printed in double precision, however short the others are
+#: a number with this number of digits was printed in double precision, however short the others are
 _DOUBLE = 15
 #: an exponent without its letter: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
@@ -43,11 +43,11 @@ def decimal(text: str) -> float:
 
 
 def fixed_numbers(text: bytes, width: int) -> FloatArray | None:
-    """Return the numbers in fields of `width` characters, None when one is no number."""
+    """Return the numbers in fields of `width` characters, None when one is not a number."""
     fields = np.frombuffer(text, np.uint8).reshape(-1, width)
     shown = np.zeros((fields.shape[0], width + 1), dtype=bool)
     shown[:, 1:] = fields != ord(" ")
-    # one number in each: a blank within a field beside an empty field would shift all that follow
+    # one number in each: a blank within a field next to an empty field would shift all that follow
     if np.any(np.count_nonzero(shown[:, 1:] & ~shown[:, :-1], axis=1) != 1):
         return None
     return spaced_numbers(_separated(fields).tobytes(), len(fields))
@@ -61,7 +61,7 @@ def _separated(fields: Any) -> Any:
 
 def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
     """Return the numbers of a text that separates them with spaces or line ends."""
-    # None when one is no number, or there are not `count`
+    # None when one is not a number, or there are not `count`
     clean = text.translate(_LETTERS)
     seen = np.frombuffer(clean, np.uint8)
     signs = np.flatnonzero((seen[1:] == ord("+")) | (seen[1:] == ord("-")))
@@ -188,12 +188,12 @@ def refused(path: object, what: str, do: str) -> FlexplantError:
 
 
 def unread(path: object, what: str, do: str) -> ModelError:
-    """Return the error of a file that holds what is no M, D, K or shape of a structure."""
+    """Return the error of a file that does not hold M, D, K or shapes of a structure."""
     return ModelError(f"{str(path)!r} {what}. {do}")
 
 
 def no_motion(path: object, kinds: object) -> ModelError:
-    """Return the error of a file with DOFs that are no displacement or rotation."""
+    """Return the error of a file with DOFs that are not displacements or rotations."""
     what = (
         f"has DOFs that are no displacement or rotation ({kinds}): temperature, pressure, voltage"
     )
@@ -298,7 +298,7 @@ class Format:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """What the reader takes beside the file, `nodes` for a mesh."""
+        """Options of the reader in addition to the file, `nodes` for a mesh."""
         taken = tuple(inspect.signature(self.read).parameters)[1:]
         return tuple("nodes" if name == self.mesh_option else name for name in taken)
 
@@ -318,7 +318,7 @@ class Elsewhere:
     begins: Callable[[bytes], bool] = lambda head: True
 
 
-#: what each reader's module registers: its files, and those without matrices beside them
+#: what each reader's module registers: its files, and those of the same program without matrices
 FORMATS: list[Format] = []
 ELSEWHERE: list[Elsewhere] = []
 

@@ -15,7 +15,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-#: bytes that any file may need beside a multiple of its size
+#: bytes that any file may need in addition to a multiple of its size
 _SPARE = 2**26
 #: whether this process is there for the parsers alone, so that its memory and time may be bounded
 ALONE = False
@@ -173,7 +173,7 @@ _WAITING: dict[tuple[int, str], subprocess.Popen[bytes]] = {}
 def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, Any]:
     """Return ("value", value) of a function of this module, or the name and the text of its error.
 
-    A damaged file may make a parser crash, take all memory or never end: in a process of its own,
+    A damaged file may make a parser crash, take all memory or never end: in a separate process,
     with bounds, that is an error like any other. Where there is no Python to start (a frozen or
     embedded program), the function is run here.
     """

@@ -106,7 +106,7 @@ def read_frf_csv(path: str | Path) -> Frf:
     Raises
     ------
     FlexplantError
-        When the header or a line has another form, or a cell is no number; the line is named.
+        When the header or a line has another form, or a cell is not a number; the line is named.
     ModelError
         When frequencies do not increase.
 
@@ -221,7 +221,7 @@ def read_frf_npz(
     Raises
     ------
     FlexplantError
-        When it is no .npz file, or the arrays are not there.
+        When it is not an .npz file, or the arrays are not there.
     ShapeError
         When sizes do not match, or which axis is frequency is not clear.
     ModelError

@@ -17,7 +17,7 @@ from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
 from .foreign_parsers import in_child
 from .triplets import assembled, chosen, extra_module
 
-#: a byte of a compressed file holds no more bytes than this
+#: largest number of bytes that a byte of a compressed file holds
 _DEFLATED = 1100
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -45,9 +45,9 @@ def read_matlab(
     Raises
     ------
     FlexplantError
-        When it is no MATLAB file, or h5py is missing.
+        When it is not a MATLAB file, or h5py is missing.
     ModelError
-        When a variable is missing, or entries are no finite real numbers.
+        When a variable is missing, or entries are not finite real numbers.
 
     Examples
     --------

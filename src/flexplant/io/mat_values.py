@@ -29,8 +29,8 @@ def write_mat(
 
     The variables of a system are `A, B, C, D, dt` (0 is continuous) and cell arrays of names
     `inputs`, `outputs`, `states`; a plant has also `w, u, z, y` and the densities `asd` of w (0
-    where there is none); responses are `freq` [Hz] and `data` (n_out, n_in, n_freq). Each of
-    several values is a structure with these fields::
+    where a channel has no density); responses are `freq` [Hz] and `data` (n_out, n_in, n_freq).
+    Each of several values is a structure with these fields::
 
         S = load('design.mat');
         P = ss(S.plant.A, S.plant.B, S.plant.C, S.plant.D, S.plant.dt, ...

@@ -67,7 +67,7 @@ def read_matrix_market(
     Raises
     ------
     FlexplantError
-        When a file is no Matrix Market file, is cut short, or a line holds what is no number; the
+        When a file is not a Matrix Market file, is cut short, or a line holds something else; the
         line is named.
     ModelError
         When a matrix is complex, skew-symmetric or a pattern without numbers.

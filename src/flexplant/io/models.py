@@ -147,7 +147,7 @@ def read_model(
         Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
         .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
     units : (length, mass, time)
-        Of the file: ("mm", "t", "s") for instance; the model is in SI.
+        Units of the file: ("mm", "t", "s") for instance; the model is in SI.
     massless : "refuse" or "condense"
         What to do with DOFs and motions without mass; condensing them is exact.
     free : bool

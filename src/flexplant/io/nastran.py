@@ -415,7 +415,7 @@ def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
     )
 
 
-#: words of the record before the numbers that say what they are, and what these are
+#: codes of the kind of results in the record before the numbers, and the kinds
 _APPROACHES = {
     1: "static displacements",
     5: "frequency responses",
@@ -487,7 +487,7 @@ def _masses(found: list[Block], numbers: IntArray, eigenvalues: FloatArray) -> F
 
 
 def _geometry_nodes(found: list[Block], path: str) -> Nodes | None:
-    """Return the nodes of the tables GEOM1, None where there are none."""
+    """Return the nodes of the tables GEOM1, None without these tables."""
     grids: dict[int, list[Any]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
     records = [(block, record) for block in found for record in block.records]

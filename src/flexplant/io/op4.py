@@ -388,7 +388,7 @@ class _Reader:
 
 #: entries that are kept dense however few of them the file holds
 _SMALL = 2**20
-#: a dense matrix may take so many times the numbers in the file
+#: largest ratio of the entries of a dense matrix to the numbers in the file
 _TIMES = 16
 
 

@@ -63,7 +63,7 @@ def read_dofs(
     nodes : str or Path, optional
         A table `node, x, y, z`, with or without a first line of names.
     directions : sequence of str, optional
-        Of every node, in the order of the rows: ("x", "y", "z").
+        Directions of every node, in the order of the rows: ("x", "y", "z").
     length : str or float
         The unit of the coordinates, "mm" for instance, or its size in metres.
 

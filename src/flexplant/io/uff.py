@@ -49,7 +49,7 @@ def read_frf_uff(
 ) -> Frf:
     """Return the frequency response functions of a universal file.
 
-    Of dataset 58, text or binary: every record gives one pair; a direction -3 is z with the sign
+    Dataset 58, text or binary: every record gives one pair; a direction -3 is z with the sign
     turned. In a file without these, of dataset 2414: responses of all nodes of a model to its load
     sets, "load 1", as large as these are.
 
@@ -63,7 +63,7 @@ def read_frf_uff(
     path : str or Path
         A .uff, .unv or .uf file. Needs pyuff: pip install 'flexplant[uff]'.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the outputs shall be. Records that say what they are are converted, those that do not
+        What the outputs shall be. Records that name their quantity are converted, those that do not
         are taken as this. When not given, all must be of one kind.
     scale : float, optional
         Factor that brings the numbers to SI (m, m/s or m/s^2 per N), where the file's units are

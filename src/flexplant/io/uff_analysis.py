@@ -184,7 +184,7 @@ def responses_of_model(
     scale: float | None,
     nodes: UffNodes,
 ) -> Frf | None:
-    """Return the frequency responses of dataset 2414, None when there are none."""
+    """Return the frequency responses of dataset 2414, None without these datasets."""
     parts = [
         part
         for part in read_analysis(path)

@@ -25,7 +25,7 @@ def dataset_types(path: str | Path) -> list[int]:
 
 
 def _opened(path: str | Path) -> Any:
-    """Return the file as pyuff opens it; refuse what is no universal file, or cut off."""
+    """Return the file as pyuff opens it; refuse other files, and those cut off."""
     with file_path(path).open("rb") as file:
         start = file.read(200)
     pyuff = extra_module("pyuff", "uff", "reading universal files")

@@ -56,7 +56,7 @@ def read_uff_records(path: Path) -> RecordedChannels:
 def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, Spectrum]:
     """Return the power spectral densities of a universal file, in SI, by channel.
 
-    Of dataset 58, function type 9; cross spectra are passed over.
+    Dataset 58, function type 9; cross spectra are passed over.
 
     Parameters
     ----------

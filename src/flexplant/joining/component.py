@@ -50,7 +50,7 @@ class Component(NamedTuple):
 
     @property
     def is_damped(self) -> bool:
-        """Whether it has damping of its own."""
+        """Whether its own matrices have damping."""
         D: Any = self.model.D
         return D is not None and bool(abs(D).max() > 0)
 
@@ -129,7 +129,7 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
     changes: dict[str, Any] = {"T": T, "full_dofs": full, "truncated": None}
     try:
         own, turn = turned_dofs(model.dofs, pose)
-    except ModelError:  # oblique: what they are stays, their names do not
+    except ModelError:  # oblique: the motions stay, their names do not
         names = [f"own {name}" for name in model.coordinates]
         return model.replace(dofs=full.select(()), coordinates=names, **changes)
     wide = np.eye(k)
@@ -155,9 +155,9 @@ class PlacedShape(Interpolation):
     Parameters
     ----------
     own, pose : Interpolation, Pose
-        Of the component where it was made, and where it stands.
+        Interpolation of the component where it was made, and the pose where it stands.
     C : (n, n) sparse array
-        Its DOFs in the directions of the machine by those of its own, ``q = C q_own``.
+        Its DOFs in the directions of the machine from those in its own directions, ``q = C q_own``.
 
     Examples
     --------
@@ -216,7 +216,7 @@ class JoinedShape(Interpolation):
     Parameters
     ----------
     names : sequence of str
-        Of the components.
+        Names of the components.
     parts : sequence of DofSet
         Their DOFs with their shapes, where they are placed.
     expansion : (n_all, n) sparse array, optional
@@ -313,7 +313,7 @@ class Pose(Value):
     Raises
     ------
     ShapeError, ModelError
-        When R is no rotation: not orthogonal, or a mirror image; or a turn is beyond 2 pi.
+        When R is not a rotation: not orthogonal, or a mirror image; or a turn is beyond 2 pi.
 
     Examples
     --------

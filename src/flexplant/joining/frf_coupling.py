@@ -102,7 +102,7 @@ def warn_of_errors(
 
 #: condition of the interface beyond which errors of a measurement hide the answer
 _CONDITION = 1e8
-#: and beyond which there is none
+#: condition of the interface beyond which there is no answer
 _SINGULAR = 1e14
 #: largest gap in a joint of the answer, relative
 _GAP = SAME
@@ -160,9 +160,9 @@ def uncoupled(
     Parameters
     ----------
     machine : Frf
-        Of the whole, with channels named "stage/41:z", as those of `joined` are. At the joints of
-        what is taken out, channels that are both outputs and inputs: its own, or, of a rigid
-        joint, those of the other end.
+        Responses of the whole, with channels named "stage/41:z", as those of `joined` are. At the
+        joints of what is taken out, channels that are both outputs and inputs: its own, or those
+        of the other end of a rigid joint.
     known : mapping {str: Frf}
         The components that are taken out, on the same frequencies.
     joints : Joint or sequence of Joint
@@ -313,7 +313,7 @@ def _coupled_response(
     # of unlike units: displacements and rotations
     if more is None:
         above = below = np.sqrt(np.abs(np.einsum("fii->fi", stretch)))
-    else:  # a channel that the joints hardly move is rounding: what it does itself is its size
+    else:  # a channel that the joints hardly move is rounding, relative to its own motion
         own = np.abs(B_out) @ np.abs(lines) @ np.abs(B_in.T)
         most_of = np.sqrt(own.max(axis=(1, 2)))[:, None]
         above, below = own.max(axis=2) / most_of, own.max(axis=1) / most_of

@@ -19,9 +19,10 @@ from ..tolerances import SAME
 from ..words import instance
 from .joint import Joint, JointEnd, Patch, joint_axes
 
-#: a joint that adds less than this part to the others repeats them
+#: a joint that adds less than this fraction to the others repeats them
 _RANK = SAME
-#: part of the motion of a patch beside its mean, at the median frequency, that is warned of
+#: fraction of the motion of a patch that differs from its mean, at the median frequency, from which
+#: a warning is given
 _BENDS = 0.1
 
 

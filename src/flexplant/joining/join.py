@@ -81,9 +81,9 @@ def joined(
         Where components stand; None: where they were made. Labels and coordinates are those of the
         machine after that.
     name : str, optional
-        Of an FEModel, for display.
+        Name of an FEModel, for display.
     dofs : mapping {str: DofSet}, optional
-        Of measured responses: where the nodes of components are, in the coordinates of the
+        For measured responses: where the nodes of components are, in the coordinates of the
         machine, for joints with lever arms and of patches. The mean motion of a `Patch` is that of
         its outputs, and its force acts on its inputs, which may be other channels (virtual point
         transformation).
@@ -101,8 +101,9 @@ def joined(
     Raises
     ------
     ModelError
-        When a rigid joint would hold the machine against the ground, a component is none, a spring
-        is so stiff that the digits of its components are lost, or full matrices would be too large.
+        When a rigid joint would hold the machine against the ground, a component is no model, a
+        spring is so stiff that the digits of its components are lost, or full matrices would be
+        too large.
     CertificateError
         When the machine fails its checks.
 
@@ -156,7 +157,7 @@ def joined(
 
 #: largest gap, imbalance and error of the inertia, relative
 _LIMIT = 1e-7
-#: a rigid-body motion that a reduced component misses by less is one of its own
+#: a rigid-body motion that a reduced component misses by less is one that it has
 _MADE = 1e-8
 #: the part of the largest entry of a motion that counts for the rounding of each
 _ENTRY = 1e-3
@@ -178,7 +179,7 @@ class JoinedMachine:
         self.matrices = self._matrices()
 
     def _check_stiffness(self) -> None:
-        """Refuse springs beside which the digits of K are lost."""
+        """Refuse springs so stiff that the digits of K are lost."""
         if not self.soft:
             return
         own = np.concatenate([np.abs(part.model.K.diagonal()) for part in self.parts])
@@ -238,7 +239,7 @@ class JoinedMachine:
 
     @cached_property
     def all_dofs(self) -> DofSet:
-        """All DOFs of all components; a machine in a machine brings the names of its own."""
+        """All DOFs of all components; a machine in a machine brings its own names."""
         names: list[str] = []
         owners = []
         for name, dofs in ((part.name, part.dofs) for part in self.parts):
@@ -431,7 +432,7 @@ def _force(K: Any, motions: FloatArray) -> float:
 
 #: patches of more displacements are not examined: each is a load of the component
 _MOST = 1000
-#: singular values of the compliance of a patch below this part of the largest are none
+#: singular values of the compliance of a patch below this, relative to the largest, count as zero
 _RANK = NULL
 
 
@@ -492,7 +493,7 @@ class JoiningReport(Value):
         of the whole machine stretches it. Springs may have one (they are warned of), rigid joints
         have none.
     mass : float [kg]
-        Of the machine; NaN without displacements.
+        Mass of the machine; NaN without displacements.
     inertia_error : float
         Largest difference between the machine's inertia against the six rigid-body motions and the
         sum of its components', relative.

@@ -39,9 +39,9 @@ class Joint(Value):
         Which of x, y, z, rx, ry, rz are joined, in the directions of the machine. None: that of a
         DOF, or those that both ends have where these are the same.
     stiffness : float or one for each axis [N/m, N m/rad], optional
-        Of springs; negative ones attract, as magnets do.
+        Stiffness of springs; negative ones attract, as magnets do.
     rate : float or one for each axis [N s/m, N m s/rad], optional
-        Of dampers.
+        Damping of dampers.
     point : (3,) array [m], optional
         Where the joint acts: both ends reach there with lever arms, by their rotations. None: at
         the first end. DOFs have no lever arm; a node without rotations turns with its neighbours,
@@ -148,7 +148,7 @@ def _end_text(end: Any) -> str:
     return repr(end) if isinstance(end, Patch) else str(end)
 
 
-#: a singular value of the motions of a patch below this part of the largest is none
+#: singular values of the motions of a patch below this, relative to the largest, count as zero
 _RANK = 1e-8
 
 
@@ -174,7 +174,7 @@ class Patch(Value):
         The point whose motion is meant, in the coordinates of the machine; None: the mean of the
         nodes.
     weights : (m,) array, optional
-        Of the nodes, in the order of `nodes`: the area that each stands for, say. None: equal.
+        Weights of the nodes, in the order of `nodes`: such as the area of each. None: equal.
 
     Examples
     --------
@@ -274,7 +274,7 @@ def mean_motions(
     return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
 
 
-#: up to this part, a node without rotations turns as the nodes next to it do
+#: up to this fraction of the size, a node without rotations turns as the nodes next to it do
 _SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
 
@@ -377,7 +377,7 @@ class JointEnd:
         return found
 
     def _turn_of_neighbours(self, turn: str) -> FloatArray | None:
-        """Return the mean rotation (n,) of the nodes next to this end, None where there is none."""
+        """Return the mean rotation (n,) of the nodes next to this end, None without such nodes."""
         # coordinates with few digits leave gaps between nodes that are meant to be one
         dofs = self._dofs
         first = np.unique(dofs.node_index, return_index=True)[1]

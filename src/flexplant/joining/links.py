@@ -240,9 +240,9 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
 
 
-#: a diagonal entry of R below this part of the first one is none: the joint repeats others
+#: diagonal entries of R below this, relative to the first, count as zero: a joint repeats others
 _RANK = 1e-8
-#: below this part, it nearly is
+#: below this, relative to the first one, it nearly repeats them
 _DOUBTFUL = 1e-5
 #: how much later components come first among those that follow; far above rounding
 _LATER, _WITHIN = 1e-2, 1e-4

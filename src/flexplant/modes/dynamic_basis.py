@@ -84,7 +84,7 @@ class DynamicBasis:
 
     @property
     def n_shapes(self) -> int:
-        """Number of shapes beside the modes."""
+        """Number of shapes in addition to the modes."""
         return int(self.V.shape[1]) - self.n_modes
 
     @property
@@ -267,7 +267,7 @@ class DynamicBasis:
 def _couples(C: FloatArray) -> bool:
     """Return whether a matrix of losses couples coordinates."""
     own = np.diag(C)
-    # beside zeros of the diagonal
+    # next to zeros of the diagonal
     size = np.sqrt(np.abs(np.outer(own, own))) + 1e-3 * np.abs(C).max(initial=0)
     return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
 

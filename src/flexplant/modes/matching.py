@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..tolerances import ROUNDING, SAME, TINY, divisor
 
-#: shapes below this part of the largest one of their span are none: rounding
+#: shapes below this, relative to the largest one of their span, are rounding and count as zero
 _NONE = SAME
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3
@@ -82,7 +82,7 @@ def pair_modes(
     """Return the one-to-one assignment of largest MAC, decided by frequency where shapes are alike.
 
     Minimises the sum of ``1 - MAC + 0.1 |ln(f_j / f_i)|`` over the pairs. Modes of a cluster share
-    the part of the other mode that lies in their span; a pair with less than half is none.
+    the part of the other mode that lies in their span; a pair with less than half is left out.
     """
     size, other_size = np.real(np.diag(gram)), np.real(np.diag(other_gram))
     alike = np.abs(cross) ** 2 / np.outer(size, other_size)

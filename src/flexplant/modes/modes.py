@@ -44,7 +44,7 @@ class MeshError(Value):
     modes : (m,) array
         Numbers of elastic modes from 1, rigid-body modes included.
     freq : (m,) array [Hz]
-        Of the coarse mesh.
+        Frequencies of the coarse mesh.
     limit : (m,) array [Hz]
         That both meshes point to, ``f_fine + (f_fine - f_coarse) / (r^p - 1)``.
     ratio : float
@@ -147,7 +147,7 @@ def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]
     Raises
     ------
     ModelError, LabelError
-        When they are no numbered measured poles, or a mode is not among those known.
+        When they are not numbered measured poles, or a mode is not among those known.
     """
     poles, numbers = getattr(measured, "poles", None), getattr(measured, "modes", None)
     if poles is None or numbers is None:
@@ -199,7 +199,7 @@ def _poles_near(
     """Return the poles of ``p'' + (rate + coupling) p' + square p = 0`` next to those wanted."""
     C, scale = damp.copy(), np.sqrt(np.maximum(square, 0.0))
     np.fill_diagonal(C, rate)
-    # balanced: speeds beside frequency times position, which rigid-body modes do not need
+    # balanced: speeds and frequency times position, which rigid-body modes do not need
     A = np.block([[np.zeros_like(C), np.diag(scale)], [-np.diag(scale), -C]])
     found = np.linalg.eigvals(A)
     return np.asarray(found[np.argmin(np.abs(found[:, None] - wanted), axis=0)])
@@ -482,7 +482,7 @@ class Modes(Placed, Value):
         Parameters
         ----------
         finer : Modes
-            Of the same structure with smaller elements: half as large, say.
+            Modes of the same structure with smaller elements: half as large, say.
         order : float
             2 for plates and for bricks of eight nodes.
 
@@ -505,7 +505,7 @@ class Modes(Placed, Value):
         Parameters
         ----------
         coarser : Modes
-            Of the same structure with larger elements: 1.5 or 2 times as large, say.
+            Modes of the same structure with larger elements: 1.5 or 2 times as large, say.
         order : float
             2 for plates and for bricks of eight nodes.
 

@@ -92,7 +92,7 @@ class NormalForm(Value):
         return np.asarray(rate / divisor(omega))
 
     def overdamped_below(self, rate: float) -> str:
-        """Return a note of the real poles up to a rate [1/s], "" when there are none."""
+        """Return a note of the real poles up to a rate [1/s], "" without such poles."""
         slow = self.overdamped[np.abs(self.overdamped) <= rate]
         if not slow.size:
             return ""
@@ -214,7 +214,7 @@ class RealForm(NamedTuple):
 
     @property
     def is_proportional(self) -> bool:
-        """Whether D damps each elastic mode by itself; rigid-body motions are left out."""
+        """Whether D damps each elastic mode separately; rigid-body motions are left out."""
         C = self.C[self.n_rigid :, self.n_rigid :]
         rate = np.diag(C)
         coupling = float(np.abs(C - np.diag(rate)).max(initial=0.0))
@@ -293,7 +293,7 @@ def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, Compl
     return first.astype(np.complex128), second.astype(np.complex128)
 
 
-#: eigenvalues closer than this (relative) have no eigenvectors of their own
+#: eigenvalues closer than this (relative) have no separate eigenvectors
 _CLUSTER = 1e-7
 #: what modes may leave, relative
 _RESIDUAL = 1e-10
@@ -380,7 +380,7 @@ def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
 
 def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray, ComplexArray]:
     """Return all poles (2k,) and eigenvectors (2k, 2k) of the states ``(|Omega| p, p')``."""
-    # all entries are rates; low ones beside strong damping are large eigenvalues of the inverse
+    # all entries are rates; low ones next to strong damping are large eigenvalues of the inverse
     none, size = np.zeros((omega.size, omega.size)), np.abs(omega)
     if low and np.all(omega > 0):
         soft = C / np.outer(omega, omega)
@@ -395,7 +395,7 @@ def _relative_residual(
 ) -> FloatArray:
     """Return the relative residual (k,) that modes leave."""
     rest = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
-    # what damping beside them is rounded to counts as well
+    # the rounding of stronger damping counts as well
     rate = np.abs(omega).max(initial=0.0) + _ROUNDED * np.abs(C).max(initial=0.0)
     size = np.linalg.norm(mix, axis=0) * np.abs(poles) * rate
     return np.asarray(np.linalg.norm(rest, axis=0) / size)

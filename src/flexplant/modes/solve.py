@@ -79,7 +79,7 @@ def solve_modes(
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
         modes is kept, by residual attachment vectors.
     compliance_damping : Damping or float, optional
-        Of the attachment vectors; None: damped like the modes.
+        Damping of the attachment vectors; None: damped like the modes.
     factor : Pardiso or Cholmod, optional
         Solver of a large sparse model in place of the library's own.
     progress : bool, optional
@@ -90,7 +90,7 @@ def solve_modes(
     Modes
         Complex where the model's own D is not proportional. Checked: residuals,
         M-orthonormality, and that no mode was left out. Each undamped frequency is right to 1e-8
-        of itself or to its own `rounding`, whichever is larger: soft suspensions beside stiff
+        of itself or to its own `rounding`, whichever is larger: soft suspensions next to stiff
         elements, fine meshes and stiff grounding springs included. Springs of negative stiffness
         give unstable modes, with negative frequencies (see `Modes`).
 
@@ -364,7 +364,7 @@ def check_modes(
 
 
 def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[FloatArray, ...]:
-    """Return what `check_modes` judges, from products of their own."""
+    """Return what `check_modes` judges, from separate products."""
     M, K = by_rows(model.M), by_rows(model.K)
     size_of_K, stiff = Absolute(K), diagonal(model.K)
     # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more
@@ -400,7 +400,7 @@ def rigid_residual(model: FEModel) -> float:
     return float(np.max(np.linalg.norm(K @ R, axis=0) / divisor(whole)))
 
 
-#: steps after which no more is expected
+#: steps after which no further progress is expected
 _STEPS = 30
 #: part of a correction, beyond the basis, below which it is rounding
 _NEW = 1e-7

@@ -32,7 +32,7 @@ from .statics import (
 
 #: modes beyond the last wanted one among which a gap is searched
 _EXTRA = 4
-#: omega^2 closer than this (relative), or than so many of their roundings, belong together
+#: omega^2 closer than this (relative), or than this number of their roundings, belong together
 _GAP, _GAP_ROUNDINGS = SAME, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
@@ -92,7 +92,7 @@ def counted_modes(
         except SolverError:
             if not factor.single:
                 raise
-            # soft modes beside stiff ones need double precision
+            # soft modes next to stiff ones need double precision
             factor, new = None, stiffness_factor
             factor = new(model, method)
             found = _search(model, factor, locked, missing, search)
@@ -148,7 +148,7 @@ def _certificate(shift: float, counted: int, found: int) -> Certificate:
 def _merge_modes(
     model: FEModel, known: FloatArray, squares: FloatArray, phi: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return omega^2 and shapes of modes known before and of those found beside them."""
+    """Return omega^2 and shapes of modes known before and of those found in addition."""
     if not known.shape[1]:
         return squares, phi
     return rayleigh_ritz(model.K, model.M, np.hstack([known, phi]))
@@ -161,7 +161,7 @@ def _search(
     want: int,
     rng: Rng,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return omega^2 and shapes (n, want) beside the locked ones, residuals down to rounding."""
+    """Return omega^2 and shapes (n, want) next to the locked ones, residuals down to rounding."""
     # soft modes first: they are locked, and a new search finds those that their rounding hides
     held, block = model.body_motions, BLOCK
     start = None if locked.shape[1] >= held.shape[1] else held
@@ -291,8 +291,8 @@ _NEAR = 1e-8
 _IMPROVED = 24
 #: steps before giving up, beyond one for each mode
 _STEPS = 40
-#: after so many steps modes must not be lower than this part of -sigma (where it is below zero),
-#: to converge fast
+#: after this number of steps modes must not be lower than this fraction of -sigma (where it is
+#: below zero), to converge fast
 _EARLY, _FAR = 12, 0.1
 
 

@@ -20,7 +20,7 @@ from ..work import Work
 from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
 from .problem import ADVICE, Problem, Search, SearchResult, layouts_of
 
-#: from so many trials on a lower bound shows first which of them could be better
+#: from this number of trials on a lower bound shows first which of them could be better
 _MANY = 24
 #: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
 _GAIN = 1e-12
@@ -168,9 +168,9 @@ def _flat(units: Sequence[tuple[int, ...]]) -> list[int]:
     return [i for unit in units for i in unit]
 
 
-#: scores of a start beside candidates times count, on average (bounds leave most out)
+#: scores of a start relative to candidates times count, on average (bounds leave most out)
 _SCORES = 0.45
-#: up to so many choices are all scored by the fast criterion
+#: up to this number of choices all are scored by the fast criterion
 _ALL = 20_000
 
 
@@ -190,7 +190,7 @@ class Screened(Search):
     keep : int
         How many choices are scored by the criterion that counts.
     starts : int
-        Of the exchanges.
+        Number of starts of the exchanges.
 
     Examples
     --------
@@ -236,7 +236,7 @@ class Screened(Search):
 
 #: branches that are opened in one round, on an executor or not: results do not depend on it
 _ROUND = 8
-#: a branch of at most so many choices is screened, and ended when so few are left to be scored
+#: number of choices up to which a branch is screened, and number left from which all are scored
 _SCREENED, _SCORED = 600, 40
 _PART = "It is a part of the value, below 1: try 0.05."
 
@@ -252,7 +252,7 @@ class BranchAndBound(Search):
     Parameters
     ----------
     gap : float
-        It ends when no choice can be better by more than this part of the value (a variance: of
+        It ends when no choice can be better by more than this fraction of the value (a variance: of
         its root about half as much); 0 for the optimum.
     branches : int
         It ends after opening so many, with the gap that was reached and a warning; 0 leaves the

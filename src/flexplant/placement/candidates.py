@@ -48,7 +48,7 @@ def sampled_plant(given: Any) -> StandardPlant:
 
 
 def with_side(plant: StandardPlant, side: str, chosen: Sequence[Port]) -> StandardPlant:
-    """Return the plant with these sensors (actuators, or both) instead of its own."""
+    """Return the plant with these sensors (actuators, or both) in place of those it has."""
     plant = standard_plant(plant)
     parts = {s: tuple(port for port in chosen if side_of(port) == s) for s in side}
     return plant.with_ports(plant.ports.replace(**parts))

@@ -338,7 +338,7 @@ class Separation(Scorer):
 
 
 def of_sensors(p: Separation) -> Quadratic:
-    """Return the cost as a function of the sensors beside all actuators of the problem."""
+    """Return the cost as a function of the sensors, with all actuators of the problem."""
     S, V = p.control(tuple(range(len(p.actuators))))
     constant = float(np.sum(S * p.W) + np.sum(V * p.ahead(np.zeros_like(p.A))))
     looks = square_root(V).T @ np.linalg.matrix_power(p.A, p.delay)
@@ -346,7 +346,7 @@ def of_sensors(p: Separation) -> Quadratic:
 
 
 def of_actuators(p: Separation) -> Quadratic:
-    """Return the cost as a function of the actuators beside all sensors of the problem."""
+    """Return the cost as a function of the actuators, with all sensors of the problem."""
     # `tr(S N) + tr(H P_d)` with the innovations' covariance `N = A^d (A P A' + W - P) A'^d`
     P = p.covariance(tuple(range(len(p.sensors))))
     power = np.linalg.matrix_power(p.A, p.delay)

@@ -1,4 +1,4 @@
-"""Constraints by name (all or none, so many, a budget) and on where devices may be, as rows."""
+"""Constraints by name (all or none, a number, a budget) and on where devices may be, as rows."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class LinearRows:
         return [s for s, holds in zip(sets, self.hold(sets), strict=True) if holds]
 
     def added(self, base: Sequence[int]) -> npt.NDArray[np.bool_]:
-        """Return which candidates (N,) exceed no upper limit beside `base` that it does not."""
+        """Return which candidates (N,) exceed no upper limit that `base` keeps."""
         used = self.A[:, list(base)].sum(axis=1)
         over = (used[:, None] + self.A > (self.upper + self._slack)[:, None]) & (self.A > 0)
         return np.asarray(~np.any(over & (used <= self.upper + self._slack)[:, None], axis=0))

@@ -322,7 +322,8 @@ def safe(bound: FloatArray) -> FloatArray:
 
 #: largest residual of the Riccati equation, relative, that is taken without another solver
 RESIDUAL = 1e-10
-#: variance beside the largest that counts as none, and the part of a gradient that must agree
+#: variance relative to the largest that counts as zero, and the fraction of a gradient that must
+#: agree
 _NOTHING, _CONFIRMED = 1e-13, 1e-10
 
 

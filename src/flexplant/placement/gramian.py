@@ -24,7 +24,7 @@ MEASURES = ("trace", "log det", "least")
 _STEPS, _CLOSE = 300, 1e-3
 #: what rounding may have added to a log det [nats]
 _ROUNDING = 1e-8
-#: sums of so many numbers are made at once: they stay in the cache
+#: number of numbers in sums that are made at once: they stay in the cache
 _AT_ONCE = 200_000
 
 

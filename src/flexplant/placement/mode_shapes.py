@@ -37,7 +37,7 @@ class PlacedShapes:
 
     @property
     def elastic(self) -> slice:
-        """The modes that are no rigid-body modes."""
+        """The elastic modes."""
         return slice(int(np.count_nonzero(self.omega == 0)), None)
 
 

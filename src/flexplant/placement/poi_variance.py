@@ -169,7 +169,7 @@ class PoiVariance(Criterion):
     measurement, at sample instants: the square of `design_kalman(plant).rms(...)`. Of the plant's
     own modes more sensors never make it larger, a score is one Riccati equation, and searches have
     a bound. With modes left out it is the error on the plant with these modes: each choice is a
-    filter of its own, without a bound.
+    separate filter, without a bound.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ class PoiVariance(Criterion):
         Axes of each of them; its first when not given. A rotation is turned into a
         displacement by a factor [m], such as half the width of the die.
     measure : {"sum", "max"}
-        Of the terms.
+        Whether the sum or the largest of the terms counts.
     lag : Predictor, Filter or FixedLag, optional
         When the estimate is wanted: before the measurement, with it (when not given), or some
         samples later. Of predictor and lag the plant's own modes alone are counted.

@@ -43,7 +43,7 @@ class Layouts:
     scorer: Scorer
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return the scores (n,) of choices, infinite where there is none."""
+        """Return the scores (n,) of choices, infinite where a choice has no score."""
         ordered = [sorted(chosen) for chosen in sets]
         scored = np.flatnonzero(self.rigid.all_missing(ordered) == 0).tolist()
         values = np.full(len(ordered), np.inf)
@@ -172,7 +172,7 @@ class Placement(Value):
     chosen : tuple of str
         Names, in the order of the candidates.
     value : float
-        Of the criterion.
+        Value of the criterion.
     bound : float
         No choice of as many candidates is better than this: the value itself when the optimum is
         proven (by every subset, or by branch and bound); else by convex relaxation, for mean
@@ -192,7 +192,7 @@ class Placement(Value):
     stopped : str
         Why the search ended before it had proven what it should; empty when it did not.
     unit : str
-        Of the square root of the value, where it is a mean square of a motion.
+        Unit of the square root of the value, where it is a mean square of a motion.
     unjudged : str
         What is said of such a motion where the plant has no evaluation model.
 
@@ -249,7 +249,7 @@ class Placement(Value):
     def gap(self) -> float:
         """The part of the value by which any choice could be better; infinite without a bound.
 
-        Of a mean square: an rms could be better by about half of it.
+        Gap of a mean square: an rms could be better by about half of it.
         """
         if not np.isfinite(self.bound):
             return np.inf

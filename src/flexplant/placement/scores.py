@@ -45,7 +45,7 @@ class Scores(Value):
     side : {"y", "u"}
         Whether they are sensors or actuators.
     unit : str
-        Of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square roots of the values, where they are mean squares of a motion.
     unjudged : str
         What is said of such motions where the plant has no evaluation model.
     """
@@ -115,7 +115,7 @@ def score_sensors(
     criterion : PoiVariance or callable, optional
         From a plant to a float, smaller is better; `PoiVariance()` when not given.
     candidates : sequence of Sensor
-        What names may stand for, besides the plant's own sensors.
+        Candidates that names may stand for, in addition to the plant's own sensors.
     constraints : sequence of Constraint, optional
         As for `place_sensors`: a layout that breaks one is infeasible. Sensors may lie on a POI
         here unless OffPoi() is among them: layouts that are named are scored.
@@ -263,7 +263,7 @@ class DeviceWorth(Value):
     without : (n,) array
         Without each one; infinite where the others do not suffice.
     unit : str
-        Of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square roots of the values, where they are mean squares of a motion.
 
     Examples
     --------
@@ -311,7 +311,7 @@ def device_worth(
     placement : Placement
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
-        As for the placement.
+        Criterion; that of the placement when not given.
     executor, progress : as for `place_sensors`
 
     Raises
@@ -324,7 +324,7 @@ def device_worth(
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
     >>> worth = fx.placement.device_worth(plant, fx.place_sensors(plant, ["y1", "y2"], 2))
-    >>> bool(worth.without[0] > worth.without[1])  # y1, beside the disturbance, is worth more
+    >>> bool(worth.without[0] > worth.without[1])  # y1, next to the disturbance, is worth more
     True
     """
     plant = sampled_plant(plant)
@@ -355,7 +355,7 @@ class SensorMap(Value):
     excluded : sequence of Rectangle or Disc
         Zones in which nothing was tried.
     unit : str
-        Of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square roots of the values, where they are mean squares of a motion.
     """
 
     points: FloatArray

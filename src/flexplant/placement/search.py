@@ -177,7 +177,7 @@ def place_both(
     """Return the best choice of sensors and actuators together, for one cost of the closed loop.
 
     Exchanges of either kind go on until none helps: a pair that is best for each other may differ
-    from the best sensors beside given actuators.
+    from the best sensors for given actuators.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def problem_of(
     required: Sequence[str],
     constraints: Sequence[Constraint],
 ) -> Problem:
-    """Return the problem of choosing so many candidates of each side, with everything checked."""
+    """Return the checked problem of choosing a number of candidates of each side."""
     plant = sampled_plant(plant)
     listed = {side: _candidate_ports(plant, side, given) for side, (given, _) in wanted.items()}
     ports = tuple(port for part in listed.values() for port in part)

@@ -63,7 +63,7 @@ class LeftOutModes(Criterion):
     Parameters
     ----------
     of : {"sensors", "actuators"}
-        Of which devices, when it is called on a plant.
+        Kind of the devices, when it is called on a plant.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class LeftOutModes(Criterion):
     LeftOutModes()
     """
 
-    scale: ClassVar[float] = 1e-6  # micrometres beside metres
+    scale: ClassVar[float] = 1e-6  # micrometres relative to metres
     of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
 
     def __call__(self, plant: StandardPlant) -> float:

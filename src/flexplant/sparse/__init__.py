@@ -2,7 +2,7 @@
 
 Large models are solved by a multifrontal factor in NumPy, without a compiler: nested dissection
 orders the unknowns, dense fronts do the work. It is used by `fx.solve_modes` and by frequency
-responses of structures, and needs no call of its own. What can be chosen is another solver:
+responses of structures, and needs no separate call. Another solver can be chosen:
 
 >>> import flexplant as fx
 >>> plate = fx.kirchhoff_plate(

@@ -457,7 +457,7 @@ _STRIP = 256
 class ComplexSymmetricFactor:
     """``A = L D L^T`` (not conjugated) of a sparse complex symmetric matrix, by fronts.
 
-    Each pivot block D is factored with row exchanges of its own; pivots are not moved between
+    Each pivot block D is factored with its own row exchanges; pivots are not moved between
     fronts. That is stable for the dynamic stiffness ``K + i omega D - omega^2 M`` of a damped
     structure; the residual of a solution shows it.
     """

@@ -48,11 +48,11 @@ _LOST = 1e-3
 _SMALL = 1e-4
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
 _STALE = NULL
-#: relative error of a Ritz pair below which its shape needs no tolerance of its own
+#: relative error of a Ritz pair below which its shape needs no separate tolerance
 _SURE = ROUNDING
-#: values below this part of the largest one, times FOUND, are not found beside it
+#: values below this, relative to the largest one times FOUND, are not found together with it
 _ROUNDING = 1e-14
-#: residuals of this part of the largest value are rounding: no step reduces them
+#: residuals of this size, relative to the largest value, are rounding: no step reduces them
 REACHED = 1e-15
 #: values this close (relative) are of one repeated mode
 SAME = 1e-8
@@ -119,8 +119,8 @@ class BlockLanczos:
         # found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
         # Fewer than `count` are returned where the others are so much smaller than the largest that
         # its rounding hides them, or where a value has as many copies as the block has vectors,
-        # which see no more of them: with those returned locked, another search, of a larger block,
-        # finds the rest
+        # which do not see them any longer: with those returned locked, another search, of a larger
+        # block, finds the rest
         n = self._V.shape[1]
         count = min(count, n - self._r)
         check_at = self.steps
@@ -163,7 +163,7 @@ class BlockLanczos:
                 # the memory of the others is needed; a copy would need more first
                 self._V.resize((self._r + keep, n), refcheck=False)
                 return theta[:wanted], self._V[self._r :][:wanted].T.copy()
-            # a step brings no more than a block of new ones, usually half of it
+            # a step brings at most a block of new ones, usually half of it
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
         raise SolverError(
             f"Lanczos did not converge for {counted(count, 'mode')} in {self.steps} steps: M and K "
@@ -245,7 +245,7 @@ class BlockLanczos:
                 along += part @ over
                 before = float(np.sqrt(np.abs(np.sum(W * loaded, axis=0)).min()))
                 taken = np.abs(part).max(initial=0.0)
-                # where next to nothing is taken away, M W stays what it is
+                # where next to nothing is taken away, M W does not change
                 if taken > _STALE * before:
                     loaded = self._M @ W
                 if taken <= _SMALL * before:
@@ -272,7 +272,7 @@ class BlockLanczos:
 def iterated(
     solve: Callable[[FloatArray], FloatArray], M: Matrix, locked: FloatArray, phi: FloatArray
 ) -> None:
-    """Move shapes on by one inverse iteration beside the locked ones, in place."""
+    """Move shapes on by one inverse iteration next to the locked ones, in place."""
     # what is left in them of high modes, most of their residual, is gone then
     deflated = np.asarray(M @ locked)
     for at in column_groups(phi.shape[1], _SOLVED):
@@ -479,7 +479,7 @@ def _most_negative(
 def _inverse_iteration(
     K: Any, M: Any, shift: float, count: int, order: Dissection | None, known: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return `count` eigenvalues of smallest lambda + shift, M-orthonormal shapes, beside known."""
+    """Return `count` eigenvalues of smallest lambda + shift, with their shapes, next to known."""
     n, r = known.shape
     if count <= 0:
         return np.zeros(0), np.zeros((n, 0))
@@ -504,7 +504,7 @@ def _inverse_iteration(
         return rayleigh_ritz(K, M, beyond(M, known, _both_ways(K, M, shift, count + r, factor)))
     values, shapes = np.zeros(0), np.zeros((n, 0))
     while shapes.shape[1] < count:
-        # what rounding of the largest hides is found beside it
+        # what the rounding of the largest hides is found next to it
         locked, want = np.hstack([known, shapes]), count - shapes.shape[1]
         more = BlockLanczos(factor.solve, M, locked, want=want).lowest(want, VALUE)[1]
         if not more.shape[1]:

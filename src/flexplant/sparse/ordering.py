@@ -26,7 +26,7 @@ _COSTLY = 350.0
 _AVERAGES = 20
 #: part of the nodes on either side of the middle in which the smallest separator is looked for
 _BAND = 0.05
-#: a side with less than this part of the DOFs: cut in the middle instead
+#: a side with less than this fraction of the DOFs: cut in the middle instead
 _LEAST_SIDE = 0.15
 #: capacity of what no cut goes through: above any flow, below the limit of 32-bit integers
 _UNCUT = 2**30

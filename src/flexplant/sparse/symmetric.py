@@ -13,11 +13,11 @@ from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError
 from ..tolerances import SAME, SPLIT, divisor
 
-#: stored zeros are left out for products where fewer entries than this part are none
+#: stored zeros are left out for products where fewer than this fraction of the entries are not zero
 _FULL = 0.8
 #: eigenvalues closer together than this are found to 1e-9 of themselves in one go
 SPREAD = SPLIT
-#: a group of soft modes ends below this part of the largest eigenvalue, at the widest gap
+#: a group of soft modes ends below this fraction of the largest eigenvalue, at the widest gap
 _END = 1e-3
 #: rows that are worked on at a time
 _ROWS = 65536
@@ -108,7 +108,7 @@ def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
 def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 (k,), ascending, and M-orthonormal shapes (n, k) in the span of X."""
     # LAPACK's error is a rounding of the largest eigenvalue. The soft modes, separated from the
-    # stiff ones to first order, are therefore solved for again by themselves, group by group, as
+    # stiff ones to first order, are therefore solved for again separately, group by group, as
     # often as the spread of the eigenvalues needs it. X is overwritten
     K, M = by_rows(K), by_rows(M)
     squares, mix = _eigh(K, M, X)

@@ -172,7 +172,7 @@ class HeldShape(Interpolation):
     Parameters
     ----------
     free : Interpolation
-        Of the structure with all its DOFs.
+        Interpolation of the structure with all its DOFs.
     rows_left : (n,) array of int
         Which of those are left, in order.
 

@@ -21,7 +21,7 @@ from .rigid import FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, 
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
-#: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
+#: modes requested from the solver: six rigid-body motions and some elastic ones; a few are shown
 _MODES, _FEW = 10, 4
 #: DOFs without stiffness that are counted as motions without energy, at most
 _LOOSE = 64
@@ -243,7 +243,7 @@ def _try_lowest_modes(
     rounding: float,
     motions: ZeroEnergy | None,
 ) -> tuple[Lowest | None, bool, str]:
-    """Return the lowest modes, whether M made them, and why there are none."""
+    """Return the lowest modes, whether M made them, and why none was found."""
     # DOFs without stiffness (`loose`) are motions without energy as they are; the others are judged
     # without them, since shapes that M couples to them have no energy but rounding
     if not there.size or not K.nnz:

@@ -175,9 +175,9 @@ def _omega_bound(M: Matrix, K: Matrix) -> float:
 
 
 def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:
-    """Return at how many DOFs a matrix makes no force of its own when all of one axis move alike.
+    """Return at how many DOFs a matrix makes no force when all of one axis move alike.
 
-    Of a stiffness these are the DOFs away from supports; a mass has a force at every one.
+    For a stiffness these are the DOFs away from supports; a mass has a force at every one.
     """
     count = 0
     for axis in "xyz":
@@ -242,11 +242,11 @@ def refuse_unstable(model: Any, what: str) -> None:
         )
 
 
-#: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity
+#: eigenvalues above this fraction of the largest one are right to 1e-9 when M is made the identity
 _DIRECT = 1e-6
 #: the shift of the inverse problem, in roundings of K: K + s M is well away from singular
 _SHIFT = 1e3
-#: steps of inverse iteration, until the eigenvalues change by no more than this
+#: steps of inverse iteration, until the eigenvalues change by at most this
 _STEPS, _SETTLED = 5, 1e-10
 
 
@@ -420,7 +420,7 @@ def signed(phi: FloatArray) -> FloatArray:
 _WRITTEN = range(5, 15)
 
 
-#: so many different entries, at least and at most, say with how many digits they were written
+#: number of different entries, at least and at most, that show how many digits were written
 _SAMPLE = (20, 400)
 
 

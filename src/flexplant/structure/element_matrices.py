@@ -167,7 +167,7 @@ def _mirror_upper(upper: FloatArray) -> FloatArray:
     return np.asarray(upper + np.triu(upper, 1).T, dtype=np.float64)
 
 
-#: so many numbers at once: more of them no longer fit the cache
+#: number of numbers at once: more of them no longer fit the cache
 _CHUNK = 100_000
 
 
@@ -259,7 +259,7 @@ class Grid:
         wide = np.int32 if max(entries, self.n_dof) < 2**31 else np.int64
         neighbour = (self.nodes[:, None] + steps)[there]
         first = (f * self.rank[neighbour]).astype(wide)
-        # the DOFs of all neighbours of a node, once for each of its own columns
+        # the DOFs of all neighbours of a node, once for each column of the node
         block = (first[:, None] + np.arange(f, dtype=wide)).ravel()
         indices = _repeated_blocks(block, f * per_node, f)
         pointer = np.zeros(self.n_dof + 1, dtype=wide)

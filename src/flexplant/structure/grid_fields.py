@@ -17,7 +17,7 @@ from .element_matrices import Grid
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]
 
-#: elements along one axis: more of them are no model for a machine of today
+#: largest number of elements along one axis: more do not make a model of a machine
 MOST = 10**6
 
 
@@ -159,7 +159,7 @@ def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> A
 def dofs_of(
     grid: Grid, lengths: Sequence[float], directions: tuple[str, ...], shape: Interpolation
 ) -> DofSet:
-    """Return the DOFs of a grid that begins at the origin; nodes keep their number beside holes."""
+    """Return the DOFs of a grid that begins at the origin; nodes keep their numbers."""
     xyz = np.zeros((grid.nodes.size, 3))
     xyz[:, : len(lengths)] = grid.coordinates(lengths)
     return node_dofs(grid.nodes + 1, directions, xyz, shape)

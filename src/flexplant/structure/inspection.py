@@ -48,13 +48,13 @@ class ModelCheck(Value):
     n_zero : int
         Motions without energy found in K alone.
     mechanisms : tuple of tuple of str
-        For each zero-energy motion that is no rigid-body motion, the DOFs that move most.
+        For each zero-energy motion that is not a rigid-body motion, the DOFs that move most.
     massless, stiffless : tuple of str
         DOFs without mass, without stiffness.
     n_pieces : int
         Parts of the structure that are not joined.
     first_freq : float [Hz]
-        Of the first elastic mode; NaN when it is not known.
+        Frequency of the first elastic mode; NaN when it is not known.
     source : str or None
         What was checked.
 
@@ -373,7 +373,7 @@ def _row_lines(found: Facts) -> Iterator[Line]:
             "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
         )
     if found.stiffless.size:
-        # a mass by itself is a rigid body: only what is none fails
+        # a mass alone is a rigid body: only other motions fail
         whole = found.motions is not None and not found.mechanisms.size
         yield (
             "note" if whole and not found.massless.size else "fail",
@@ -482,7 +482,7 @@ def _mass_lines(found: Facts) -> Iterator[Line]:
     if np.isfinite(center).any():
         turning = np.nanmax(np.diag(found.body.inertia), initial=0.0)
         least = TYPED * np.sqrt(turning / np.abs(mass[known][0]))
-        near = np.where(np.abs(center) < least, 0.0, center)  # a sum that cancels is no place
+        near = np.where(np.abs(center) < least, 0.0, center)  # a sum that cancels is not a place
         at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in near)
         yield ("ok", "centre of gravity", f"({at}) m", "")
     turns = np.diag(found.body.inertia)

@@ -41,7 +41,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     item : FEModel, Modes or DofSet
         With nodes that are not all in one place.
     margin : float [m]
-        How far outside the hull of the nodes a point may lie: a surface beside a mid-plane, say.
+        How far outside the hull of the nodes a point may lie: a surface next to a mid-plane, say.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     Raises
     ------
     ModelError
-        When it is none of these, a joined machine, or margin is negative.
+        When it is something else, a joined machine, or margin is negative.
 
     Notes
     -----
@@ -94,7 +94,7 @@ class ScatteredShape(Interpolation):
     xyz : (n, 3) array [m]
         Coordinates of each DOF's node.
     directions : sequence of n str
-        Of each DOF.
+        Direction of each DOF.
     margin : float [m]
         How far outside their hull points are still taken.
 

@@ -62,7 +62,7 @@ class FEMatrices(Value):
     ShapeError
         When a matrix is not square or the sizes differ.
     ModelError
-        When entries are no finite real numbers.
+        When entries are not finite real numbers.
 
     Examples
     --------
@@ -150,7 +150,7 @@ class FEMatrices(Value):
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The DOFs without any mass: labels, or rows (from 1) where there are no names."""
+        """The DOFs without any mass: labels, or rows (from 1) without names."""
         if self.M is None:
             return ()
         return self.names(np.flatnonzero(empty_rows(self.M)))
@@ -301,7 +301,7 @@ class FEMatrices(Value):
         ----------
         count : int
             Number of frequencies, those at zero included; 60 at most, and fewer where the matrices
-            have no more.
+            have fewer.
 
         Raises
         ------

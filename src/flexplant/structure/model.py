@@ -57,10 +57,10 @@ class FEModel(Placed, Value):
         Loads ``M_fs r_s`` that the acceleration of held DOFs s makes by their mass coupling, for
         the six rigid-body motions of the ground about the origin; kept by `fixed`.
     joint_motions : (n, m) array, optional
-        Of a joined machine: M-orthonormal motions of its components as rigid bodies that its rigid
+        M-orthonormal motions of the components of a joined machine as rigid bodies that its rigid
         joints allow (a slide, a hinge), in place of those that follow from the coordinates.
     joining : Value, optional
-        Of a joined machine: how it was joined, with its checks; None once M or K is changed.
+        Joints of a joined machine: how it was joined, with its checks; None once M or K is changed.
 
     Raises
     ------

@@ -163,7 +163,7 @@ def _join_parts(label: IntArray, one: Any, other: Any) -> IntArray:
     return np.asarray(csgraph.connected_components(graph.tocsr(), directed=False)[1][label])
 
 
-#: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
+#: ||K r|| below this, relative to || |K| |r| ||, is rounding: the motion r costs no energy
 FREE = 1e-10
 #: the same for motions that coordinates of few digits keep from being free: worth a closer look
 _NEARLY = 1e-2
@@ -204,7 +204,7 @@ def turned_about(direction: str, about: FloatArray) -> FloatArray:
 def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
     """Return how far a place moves (6,) with each of the six rigid-body motions about the origin.
 
-    By its coordinates, not by shapes: a place beside a held DOF moves with the ground too.
+    By its coordinates, not by shapes: a place next to a held DOF moves with the ground too.
     """
     if isinstance(at, Mapping):
         parts = [weight * place_motion(dofs, place, direction) for place, weight in at.items()]
@@ -272,7 +272,7 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray)
     # they are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
     # come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
     # structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
-    # digits, rotations are the null vectors of K next to theirs. Each body is judged by itself,
+    # digits, rotations are the null vectors of K next to theirs. Each body is judged separately,
     # with the rounding that its coordinates `xyz` (n, 3) have
     parts = _bodies_of(motions)
     if len(parts) < 2:
@@ -367,7 +367,7 @@ def _null_vectors(
     """Return a basis and the null vectors of K next to nearly free motions, if there are such."""
     # by inverse iteration, `(K + s M) x' = s M x`: what the last digits of coordinates add are
     # elastic modes, which shrink by s / (lambda + s) each time, and motions without energy stay. A
-    # motion that something holds, however softly, keeps its energy and is none
+    # motion that something holds, however softly, keeps its energy and is not rigid
     start = orthonormalised(M, np.hstack([basis, nearly]), dependent="drop")
     spread = float(np.einsum("ij,ij->j", np.abs(start), size_of_K @ np.abs(start)).max())
     shift = 30 * rounding * spread

@@ -165,7 +165,7 @@ class BeamShape(GridShape):
     Parameters
     ----------
     length : float [m]
-        Of the beam.
+        Length of the beam.
     elements : int
         Their number.
     softness : float or (elements,) array, optional [m^2]

@@ -136,15 +136,15 @@ def beam(
     Parameters
     ----------
     length : float [m]
-        Of the beam.
+        Length of the beam.
     elements : int
         Their number.
     density, youngs_modulus : float, (elements,) array or function of x [kg/m^3], [Pa]
-        Of the material.
+        Density and Young's modulus of the material.
     area, inertia : float, (elements,) array or function of x [m^2], [m^4]
-        Of the cross section, and its second moment of area.
+        Area of the cross section, and its second moment of area.
     poisson_ratio : float, (elements,) array or function of x, optional [-]
-        Of the material, for the shear modulus G = E / 2 (1 + nu). None: Euler-Bernoulli.
+        Poisson's ratio, for the shear modulus G = E / 2 (1 + nu). None: Euler-Bernoulli.
     shear_factor : float
         k of the shear stiffness k G A; 5/6 of a rectangular section.
     ends : (str, str)

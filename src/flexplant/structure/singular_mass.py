@@ -20,7 +20,7 @@ from ..tolerances import NULL, ROUNDING
 def null_motions(M: Any, digits: int | None) -> FloatArray:
     """Return the motions (n, q) without inertia, block by block of M; (n, 0) when M is definite."""
     # M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
-    # text leave, are none
+    # text leave, count as zero
     n = M.shape[0]
     tolerance = NULL if digits is None else max(NULL, 10.0 ** (1 - digits))
     if is_positive_definite(M, -tolerance):
@@ -151,7 +151,7 @@ def inertial(
     return Inertial(K, M, D, rows, notes)
 
 
-#: so many columns of K_ss^-1 K_sm at once: more of them no longer fit the cache
+#: number of columns of K_ss^-1 K_sm at once: more of them no longer fit the cache
 _COLUMNS = 256
 #: that many DOFs next to massless ones fill a block that no longer fits the memory comfortably
 _TOO_MANY = 10_000

@@ -26,7 +26,7 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
     Parameters
     ----------
     model : FEModel
-        Of at most 3000 DOFs.
+        A model of at most 3000 DOFs.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
     Raises
     ------
     LabelError, ModelError
-        When there is no such slide; as for `slides`.
+        When the slide does not exist; as for `slides`.
 
     Examples
     --------

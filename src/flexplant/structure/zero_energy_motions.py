@@ -18,7 +18,7 @@ from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal, orthonormalised
 from ..tolerances import SAME, divisor
 from .rigid import ASIDE, bodies, farness, force_free, free_motions, rigid_motions
 
-#: DOFs of a mechanism that move at least this part of the most moving one
+#: DOFs of a mechanism that move at least this fraction of the most moving one
 _MOVES = 0.05
 
 
@@ -122,7 +122,7 @@ def _independent(motions: FloatArray) -> FloatArray:
 
 
 def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
-    """Return the rigid-body motions of the geometry that cost no more energy than rounding."""
+    """Return the rigid-body motions of the geometry whose energy is rounding."""
     rounding = ZERO if digits is None else max(ZERO, 10.0**-digits)
     return zero_energy(K, dofs, located=True, rounding=rounding, M=M).rigid
 

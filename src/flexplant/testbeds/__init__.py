@@ -19,7 +19,7 @@ array([244.7, 355.3, 455.1])
 >>> fx.testbeds.three_masses().u
 ('u1',)
 
-A machine of one's own has the same two methods, ``loop(ports, *blocks)`` and ``poles(modes)`` or
+A machine that you write has the same two methods, ``loop(ports, *blocks)`` and ``poles(modes)`` or
 ``measure_frf(ports)``, and goes into `fx.study` like these.
 """
 

@@ -1,4 +1,4 @@
-"""Eight driven machines, small: what motion engineers control besides a free body."""
+"""Eight driven machines, small: what motion engineers control in addition to a free body."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     Two linear motors push the ends of a bridge (60 kg, guides 1 m apart) along y, a third pushes
     the carriage (18 kg) along x on it; all push against the frame (900 kg on feet that let it sway
     at 11 and 13 Hz). The tool, 5 kg on a column of the carriage, sways at 62 and 80 Hz. Encoders
-    measure what the motors move. The tool's x and y beside the frame are followed, the bridge's
-    skew is held.
+    measure what the motors move. The tool's x and y relative to the frame are followed, the
+    bridge's skew is held.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
     Along x: the long stroke (60 kg) is pushed against the base (3000 kg at 4 Hz), the short stroke
     (15 kg, with a mirror block of 4 kg at 700 Hz) against the long stroke, which does not touch it.
     The lens (70 kg at 95 Hz) hangs in a metrology frame (500 kg, isolated at 1.2 Hz from the base).
-    An interferometer measures the mirror block beside the lens, a second sensor the gap between
-    both strokes; the die beside the lens and the gap are followed.
+    An interferometer measures the mirror block relative to the lens, a second sensor the gap
+    between both strokes; the die relative to the lens and the gap are followed.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
     Behind the gear the motor has 1.4 kg m^2 and turns the root of the link (1.1 kg m^2) by a gear
     of 2.6e4 N m/rad; the link's tip (2.2 kg m^2) follows at a bending stiffness of 9e3 N m/rad. The
     motor pushes against a pedestal (9 kg m^2 at 24 Hz). Encoders measure motor and root in the
-    pedestal; the tip beside it is followed.
+    pedestal; the tip relative to it is followed.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a vibration isolation table with geophones; nothing is followed.
 
     A honeycomb table (1.5 m by 1 m, 300 kg) floats on four air mounts at 2.1 Hz above a shaking
-    floor; it bends from 175 Hz on. Four actuators push against the floor beside the mounts, four
+    floor; it bends from 175 Hz on. Four actuators push against the floor next to the mounts, four
     geophones, corrected below their corner, measure absolute velocity above them. The point of
     interest is the absolute motion of the table's centre.
 
@@ -317,7 +317,7 @@ def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
     Six legs, each a stack of 1.5e7 N/m with an actuator that strains it, carry a platform (22 kg)
     with a load (8 kg at 140 Hz and more). They stand on a base (120 kg) that sways on its mounts
     at 16 to 35 Hz. Sensors in the legs measure their length; all six motions of the platform
-    beside the base are followed.
+    relative to the base are followed.
 
     Parameters
     ----------
@@ -379,8 +379,8 @@ def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 
     Motor and screw (2.4e-3 kg m^2, lead 10 mm) move a table (140 kg) by an axial stiffness of
     1.3e8 N/m; a workpiece (35 kg) stands on it at 48 Hz. The nut pushes against a machine bed
-    (1100 kg at 14 Hz). The motor's angle and the table beside the bed are measured; the workpiece
-    beside the bed is followed.
+    (1100 kg at 14 Hz). The motor's angle and the table relative to the bed are measured; the
+    workpiece relative to the bed is followed.
 
     Parameters
     ----------
@@ -491,9 +491,9 @@ def _plant(
     return assemble_plant(modes, ports).discretized(rate, delay=delay)
 
 
-def _between(moving: str, beside: str) -> dict[str, float]:
+def _between(moving: str, fixed: str) -> dict[str, float]:
     """Return the motion of one DOF relative to another."""
-    return {moving: 1.0, beside: -1.0}
+    return {moving: 1.0, fixed: -1.0}
 
 
 def _square(freq: float) -> float:
@@ -513,7 +513,7 @@ def _carried(axis: str) -> dict[str, float]:
 
 
 def _leg(number: int) -> dict[str, float]:
-    """Return the motion that lengthens a leg: platform (radius 0.15 m) beside base (0.25 m)."""
+    """Return the motion that lengthens a leg: platform (0.15 m) relative to base (0.25 m)."""
     third, side = divmod(number, 2)
     sign = 2 * side - 1
     up = np.deg2rad(120.0 * third + 50.0 * sign)

@@ -47,11 +47,11 @@ class WaferStage(Value):
     truth : FEModel
         What it really is: for tests and for judging an answer; no design may read it.
     rate : float [Hz]
-        Of its controller.
+        Sampling rate of its controller.
     delay : float [samples]
         From measurement to actuation.
     step : float [m]
-        Of its sensors; 0: none.
+        Step of its sensors; 0 for none.
     drawing : mapping
         Size, thickness and material of its plate (or block) as drawn; the paper's when not given.
     magnets : tuple of GroundSpring
@@ -110,16 +110,16 @@ class WaferStage(Value):
             Numbers from 1, rigid-body modes included, as in the paper; elastic ones by frequency,
             those left out that damping keeps from swinging.
         deviation : float
-            Of their errors, relative to their size; 0: ideal, without a covariance.
+            Standard deviation of their errors, relative to their size; 0: ideal, no covariance.
         rng : int or Generator, optional
-            Of the errors.
+            Seed of the errors.
 
         Raises
         ------
         LabelError
             When a mode is not there, or is a rigid-body mode (a drift has no pole to measure).
         ModelError
-            When a mode is no whole number, or lies above half the machine's rate, where no
+            When a mode is not a whole number, or lies above half the machine's rate, where no
             sampled measurement shows it, or the deviation is negative.
         """
         own = self._own_poles
@@ -153,7 +153,7 @@ class WaferStage(Value):
         ports : Ports
             Its channels, with positions.
         schedule : ScheduledLoop
-            Of a model: its controllers run on the machine.
+            Schedule of a model's controllers, which then run on the machine.
         """
         return schedule.around(self._plant(ports))
 
@@ -178,7 +178,7 @@ class WaferStage(Value):
         duration : float [s]
         reference : SetPointProfile, array or mapping, optional
         rng : int or Generator, optional
-            Of the noise.
+            Seed of the noise.
         runs : int, optional
             Repetitions with independent noise.
         moving : mapping {position: path}, optional
@@ -227,19 +227,19 @@ class WaferStage(Value):
         ports : Ports
             Actuators and sensors; its disturbances and sensor noises act.
         period : float [s]
-            Of the multisine; its inverse is the frequency resolution.
+            Period of the multisine; its inverse is the frequency resolution.
         periods, discard : int
             Periods that are averaged, and those before, for the transient to die out.
         amplitude : float [N]
             Rms excitation of each actuator.
         rng : int or Generator, optional
-            Of phases and noise.
+            Seed of phases and noise.
 
         Returns
         -------
         Frf
-            Of the plant with its zero-order hold, without the delay; zero frequency left out. With
-            two periods or more, what changes between them gives coherence, variance and
+            Responses of the plant with its zero-order hold, without the delay; zero frequency left
+            out. With two periods or more, what changes between them gives coherence, variance and
             correlation.
         """
         instance(ports, Ports, "ports", "Pass Ports(u=[...], y=[...]).")

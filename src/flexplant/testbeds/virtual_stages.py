@@ -50,7 +50,7 @@ def wafer_stage(
     A free plate of Table 1 with rotary inertia in polynomials, solved to convergence: no mesh of
     any drawing has its frequencies. A point mass is added at
     (L/2, L/4), the paper's z_8, and up to 0.1 kg somewhere; stiffness is scattered over the plate
-    by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is no
+    by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is not a
     whole number of samples.
 
     Parameters
@@ -183,7 +183,7 @@ def magnet_stage(
     of the rigid body grow until a loop holds them; theirs are up to 10 % off the drawn ones. A
     mass is added on the bottom at (3/4, 1/4) of its sides, and another of up to 0.1 kg
     somewhere; stiffness is scattered over the block by 0.3 %, damping over its modes by 30 %,
-    sensors have steps of 0.05 nm, and the delay is no whole number of samples.
+    sensors have steps of 0.05 nm, and the delay is not a whole number of samples.
 
     Parameters
     ----------
