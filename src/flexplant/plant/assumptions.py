@@ -23,7 +23,7 @@ from .visibility import SHOWN, WEAK, ModeVisibility, aliased_modes, mode_visibil
 
 
 class _Case(NamedTuple):
-    """One test of the modes that do not decay by themselves."""
+    """One test of the modes that do not decay."""
 
     key: str
     verb: str
@@ -63,7 +63,7 @@ def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
             continue
         text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
-        found.append(Assumption(case.key, True, text if words else "every mode decays by itself."))
+        found.append(Assumption(case.key, True, text if words else "every mode decays."))
     return found
 
 
@@ -345,7 +345,7 @@ def _frequency(plant: PartitionedSystem, zero: complex) -> str:
     own = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))
     if own.size:
         nearest = int(np.argmin(np.abs(own - omega)))
-        if abs(own[nearest] - omega) < 1e-4 * omega:  # one mode, filters beside it
+        if abs(own[nearest] - omega) < 1e-4 * omega:  # one mode and filters
             return f"{text} (mode {nearest + 1})"
     return text
 
@@ -358,7 +358,7 @@ class Assumption(Value):
     ----------
     key : str
         `excited` (w reaches), `detectable` (y sees), `performance` (z sees), `stabilisable`
-        (u reaches) every mode that does not decay by itself; `D12`, `D21` (full rank); `P12`,
+        (u reaches) every mode that does not decay; `D12`, `D21` (full rank); `P12`,
         `P21` (u -> z and w -> y have no invariant zeros on the stability limit).
     holds : bool
         Whether it does.

@@ -78,7 +78,7 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
 
 def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Ports) -> StateSpace:
     """Return the structure between the filters of its ports, absolute motions included."""
-    # noise at an amplifier's input is an input more, beside the command: it has no states
+    # noise at an amplifier's input is a further input next to the command: it has no states
     # states are those of the sensors' filters, the structure's, those of the forces' filters: what
     # drives stands behind what is driven, so that A is block upper triangular
     before, after = _named_filters(ports.forces), _named_filters(ports.y)
@@ -191,7 +191,7 @@ def _integrals(part: StateSpace | None, most: int) -> int:
 
 
 def _with_ground_input(part: StateSpace, name: str, times: int) -> StateSpace:
-    """Return a filter with a second input that it integrates some times besides."""
+    """Return a filter with a second input that it also integrates some times."""
     B = np.linalg.matrix_power(np.linalg.inv(part.A), times) @ part.B
     return part.replace(
         B=np.hstack([part.B, B]),
@@ -295,7 +295,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
 def sampled_motions(
     plant: Partition, blocks: Iterable[FloatArray], outputs: Sequence[str], inputs: Sequence[str]
 ) -> list[StateSpace]:
-    """Return a plant from actuators to sensors, no more, for each set of its modes' (b, 2, 2)."""
+    """Return only the path from actuators to sensors, for each set of modes' blocks (b, 2, 2)."""
     # sampled like the plant; the states are some of the plant's
     origin = plant.continuous.assembled
     some, found = origin.replace(physical=origin.physical.select(outputs, inputs)), []
@@ -346,7 +346,7 @@ def changed_densities(plant: Partition) -> dict[str, float]:
 
 def loud_like(plant: Partition, fresh: P) -> P:
     """Return a continuous plant with the densities that were changed in another one."""
-    # not of ports that have a new density of their own
+    # ports that were given a new density keep the new one
     own = plant.assembled.ports.densities
     kept = {
         name: level

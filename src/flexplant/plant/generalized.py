@@ -31,7 +31,7 @@ class GeneralizedPlant(PartitionedSystem):
     """The plant of a synthesis: ``W_z P W_w`` with y read through a block.
 
     Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Its w and
-    z are no physical channels once weights are applied; `unweighted` is the way back to the
+    z stop being physical channels once weights are applied; `unweighted` is the way back to the
     machine, which holds ports, modes, noise, uncertainty and evaluation model.
 
     Parameters
@@ -72,7 +72,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def scaled(self) -> bool:
-        """Whether weights were applied, so that w and z are no physical channels."""
+        """Whether weights were applied, so that w and z are not physical channels."""
         return not all(isinstance(step, StateSpace) for step in self.steps)
 
     @property
@@ -124,7 +124,7 @@ class GeneralizedPlant(PartitionedSystem):
         """
         if self.scaled:
             raise ModelError(
-                "the plant is weighted: its w are no physical noise, so that the process noise of "
+                "the plant is weighted: its w are not physical noise, so that the process noise of "
                 "each sample is not known. Use plant.unweighted."
             )
         _ = self.reading_gain  # static: the states are those of the machine

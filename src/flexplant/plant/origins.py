@@ -29,7 +29,7 @@ class Assembled(Value):
     noise_factor : (n, r) array, optional
         G with G G' the covariance of x that disturbances add in one sample.
     delay : float [samples]
-        Of the inputs u.
+        Delay of the inputs u.
     continuous : StandardPlant, optional
         The plant before sampling.
 

@@ -193,7 +193,7 @@ class PartitionedSystem(Value):
     def form(self) -> str:
         """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
 
-        Weights and filters of the ports add blocks of their own.
+        Weights and filters of the ports add further blocks.
         """
         return self.realisation.form
 
@@ -352,7 +352,7 @@ class Partition(PartitionedSystem):
         return self
 
     def around(self, machine: Self) -> Self:
-        """Return another machine: there are no weights and blocks to put around it."""
+        """Return another machine as it is: a plain plant has neither weights nor blocks."""
         return machine
 
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
@@ -383,7 +383,7 @@ class Partition(PartitionedSystem):
     def of(cls, given: Any) -> Self:
         """Return a plant; of a system with labels when these name w, u, z and y.
 
-        Of an `UncertainPlant` its nominal plant, with what is uncertain in `uncertainty`.
+        An `UncertainPlant` gives its nominal plant, whose `uncertainty` holds what is uncertain.
         LabelError when the labels do not, ModelError when it is neither.
         """
         given = getattr(given, "nominal", given)

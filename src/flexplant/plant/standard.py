@@ -240,13 +240,13 @@ class StandardPlant(Partition):
         return found if self.uncertainty is None else self.uncertainty.on(found).nominal
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
-        """Return what the position does: decoupling, modes seen and reached, figures of one's own.
+        """Return what the position changes: decoupling, modes seen and reached, the user's figures.
 
         Parameters
         ----------
         judge : callable or mapping {name: callable}, optional
-            Of a plant at each position, to a number: ``{"margin": lambda p: fx.modulus_margin((p,
-            controller))}``.
+            Function of the plant at each position that returns a number: ``{"margin": lambda p:
+            fx.modulus_margin((p, controller))}``.
         points : int or mapping {name: int or array}
             How many values of each position are taken over its range, or which [m or rad].
 
@@ -406,7 +406,7 @@ def plant_of(given: AnyPlant | UncertainPlant[StandardPlant] | System) -> AnyPla
     LabelError
         When the labels of a system do not distinguish w, u, z and y.
     ModelError
-        When it is none of these kinds.
+        When it is of another kind.
 
     Examples
     --------

@@ -41,7 +41,7 @@ def aliased_modes(plant: PartitionedSystem) -> str:
     )
 
 
-#: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
+#: a mode reached or seen less than this, relative to the channel's strongest mode, is called weak
 WEAK = 0.01
 
 
@@ -64,7 +64,8 @@ class ModeVisibility(Value):
     zeta : float
     shares : mapping {"w", "u", "y", "z": float}
         The best channel's modal force per unit force (or modal displacement per unit motion)
-        beside that of the elastic mode where this channel is strongest: 1 at best, 0 at a node.
+        relative to that of the elastic mode where this channel is strongest: at most 1, 0 at a
+        node.
     channels : mapping {"w", "u", "y", "z": str}
         That channel.
 
@@ -110,7 +111,7 @@ def mode_visibility(plant: PartitionedSystem) -> tuple[ModeVisibility, ...]:
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
     swinging = pairs.copy()
-    swinging[pairs[:, 0, 0] == 0.0, 1, 1] = 0.0  # damping is no part of the shape of a real mode
+    swinging[pairs[:, 0, 0] == 0.0, 1, 1] = 0.0  # damping does not bend a real mode
     # filters of ports act at the pole; one that does not swing stands for its frequency
     wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
     wanted = np.where(zeta < 1.0, wanted, 1j * omega)
@@ -183,9 +184,9 @@ def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArr
 
 
 def response_at(block: StateSpace, at: complex) -> ComplexArray:
-    """Return the response of a block at a point of the plane; beside it where it has a pole."""
+    """Return the response of a block at a point of the plane, or next to a pole there."""
     eye = np.eye(block.n_states)
-    # beside a pole the response is large, but a number
+    # next to a pole the response is large but finite
     for point in (at, at + 1e-6 * max(abs(at), 1.0)):
         try:
             found = block.D + block.C @ np.linalg.solve(point * eye - block.A, block.B)

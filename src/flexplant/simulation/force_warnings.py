@@ -133,7 +133,7 @@ def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     if not np.any(np.abs(mean) > _SHARE * most):
         return
     mean = opposing_part(loop.machine, loop.driven, mean)
-    # the deviation of this part: of forces that move the machine there may be more
+    # the deviation of these forces alone: those that move the machine may vary more
     about = opposing_part(loop.machine, loop.driven, end.reshape(len(end), -1)).reshape(end.shape)
     steady = np.abs(mean) > np.maximum(_SHARE * most, _STEADY * about.std(axis=2))
     opposed = np.sum(steady, axis=0) > 1  # no actuator pushes against another alone

@@ -35,8 +35,8 @@ _DEPTH, _WIDTH = 0.05, 0.3
 POWERS = {"mass": 2.0, "damper": 1.0, "spring": 0.0}
 
 
-#: a line is tried when slope and phase of the response are no further from it than this beyond the
-#: nearest line; both distances are counted in powers of s
+#: a line is tried when slope and phase of the response are at most this much further from it than
+#: from the nearest line; both distances are counted in powers of s
 _ASIDE = 0.8
 
 
@@ -136,7 +136,7 @@ def combinations(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
 
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0
-#: notches that are placed at most, modes that are tried for each, and what one has to gain
+#: notches that are placed at most, modes that are tried for each, and the least gain of one
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
 #: loops of this number of plants are kept: their designs at other bandwidths begin with them
 _KEPT = 8
@@ -197,7 +197,7 @@ class ServoLoop:
         return float(size[top]), float(self.freq[top])
 
     def _near(self, T: FloatArray) -> FloatArray:
-        """Return the size of T E beside each mode (n_freq, k), elsewhere 0."""
+        """Return the size of T E near each mode (n_freq, k), and 0 elsewhere."""
         near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
         through = self.moved if self.own is None else self.moved + self.own
         return np.asarray(near * np.linalg.norm(T @ through, axis=(1, 2))[:, None])
