@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-#: files at most whose functions "A whole design" executes: the bands of machines that the fit allows
-#: take five of them. The goal is 78; lower this number with each file that leaves the way
+#: files at most whose functions "A whole design" executes, bands of machines that a fit allows
+#: included. The goal is 78: lower this number with each file that leaves the way
 FILES = 101
 
 COUNT = """
