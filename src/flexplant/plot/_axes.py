@@ -160,7 +160,7 @@ def legend_below(ax: Axes) -> None:
 
 
 def legend(ax: Axes, *, given: bool) -> None:
-    """Draw the legend where it covers nothing: beside new axes, in a given one's emptiest corner.
+    """Draw the legend where it covers nothing: next to new axes, in a given one's emptiest corner.
 
     Beside is empty whatever part of the lines is shown later. Where no corner is empty, the
     ordinate of a given one reaches further up. More lines than a legend tells apart are named at
@@ -297,7 +297,7 @@ _WORDS = {
     "full": "truth", "full model": "truth", "machine": "truth", "true": "truth",
     "reduced model": "reduced", "weight": "bound", "difference": "difference",
 }  # fmt: skip
-#: lines that are none of these, in their order
+#: styles of all other lines, in their order
 CYCLE: Sequence[Style] = (
     {"color": BLUE, "linestyle": "-", "linewidth": _WIDTH},
     {"color": ORANGE, "linestyle": "-", "linewidth": _WIDTH},
@@ -346,7 +346,7 @@ def mark_devices(
     ax: Axes, factor: float, kinds: Mapping[str, Sequence[Device]], *, various: bool | None = None
 ) -> None:
     """Mark and name devices by kind in a view from above, in x and y with arrows."""
-    # directions that no arrow shows stand beside the names where they are various
+    # directions that no arrow shows stand next to the names where they are various
     various = differ(kinds) if various is None else various
     extent = np.ptp(ax.dataLim.get_points(), axis=0).max() or 1.0
     names: dict[tuple[float, ...], list[str]] = {}
@@ -382,7 +382,7 @@ def mark_devices(
         shown.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
-#: a measurement beside models over frequency: points, none of which hides a line
+#: a measurement drawn with models over frequency: points, none of which hides a line
 POINTS: Style = {
     "color": BLACK, "linestyle": "none", "marker": ".", "markersize": 3.0, "zorder": 1.8,
 }  # fmt: skip
@@ -396,7 +396,7 @@ def role_of(label: str) -> str | None:
 
 
 def apart(ax: Axes | None, labels: Iterable[str]) -> bool:
-    """Return whether lines need panels of their own: many that name no role of `STYLES`."""
+    """Return whether lines need separate panels: many that name no role of `STYLES`."""
     return ax is None and sum(role_of(label) is None for label in labels) > TOGETHER
 
 
@@ -404,7 +404,7 @@ def styles(
     labels: Iterable[str], colors: Mapping[str, str] | None = None, *, taken: int = 0
 ) -> list[Style]:
     """Return the styles of lines by their labels; those that name nothing follow the cycle."""
-    # so many lines are there already. More than the cycle holds are solid, each of its own colour;
+    # this number of lines is there already. More than the cycle holds are solid, in other colours;
     # what is named keeps its colour for itself, where the cycle has enough others
     found, others = [], taken
     labels = list(labels)
@@ -500,7 +500,7 @@ _MOST = 36
 
 
 def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float) -> Any:
-    """Return the axes of channels, so many below each other for each as there are heights."""
+    """Return the axes of channels, one below the other, one for each height."""
     # they are those given for one channel, or new ones
     channels, each = rows * columns, len(ratios)
     if not channels:

@@ -45,7 +45,7 @@ def bode(
     """Draw magnitude [dB] and phase [deg] over frequency, a pair of panels for each channel.
 
     Phases of systems are continuous over frequency; those of measurements, drawn as points, follow
-    the first system by whole turns, or lie between -180 and 180 degrees where there is none.
+    the first system by whole turns, or lie between -180 and 180 degrees without one.
     With ``wrap=True`` all lie between -180 and 180 degrees, as a dynamic analyser draws them.
 
     Parameters
@@ -202,9 +202,9 @@ def frf(
         What to compare.
     output, input : str
     colors : mapping {label: color}, optional
-        Of some lines.
+        Colours of some lines.
     unit : str, optional
-        Of the gain, where the responses have none; 0 dB is one of it.
+        Unit of the gain, where the responses have none; 0 dB is one of it.
     reference : str, optional
         A label: the differences of the other responses from this one are drawn as well, where
         they share its frequencies.
@@ -221,14 +221,14 @@ def frf(
     Returns
     -------
     Axes
-        Of the magnitude; `.figure.axes` are all.
+        Axes of the magnitude; `.figure.axes` are all.
 
     Raises
     ------
     LabelError
-        When there is no such reference or channel, or `also` names something else.
+        When the reference or channel is unknown, or `also` names something else.
     ModelError
-        When there is no such mapping, the responses are of different units, nothing of one is in
+        When a mapping is not given, the responses are of different units, nothing of one is in
         the band, or none has the coherence or variance that is asked for.
 
     Examples
@@ -301,12 +301,12 @@ def frf(
     return ax
 
 
-#: what can be drawn beside a magnitude
+#: what can be drawn in addition to a magnitude
 _ALSO = ("phase", "coherence", "deviation")
 
 
 def _magnitude_axes(ax: Axes | None, count: int) -> list[Axes]:
-    """Return axes for a magnitude and so many lower panels below it."""
+    """Return axes for a magnitude and a number of lower panels below it."""
     if ax is not None or not count:
         return [axes(ax, figsize=(9.0, 4.5))]
     size, ratios = (9.0, 4.5 + 1.8 * count), [2.5] + count * [1.0]

@@ -48,13 +48,13 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     found : ErrorBudget
         From `ClosedLoop.budget`.
     most : int
-        Sources that are drawn by themselves, the largest first; the others are one area.
+        Sources that are drawn separately, the largest first; the others are one area.
     ax : Axes, optional
 
     Raises
     ------
     ModelError
-        When it is no ErrorBudget.
+        When it is not an ErrorBudget.
 
     Examples
     --------
@@ -109,13 +109,13 @@ def spectra(
     Parameters
     ----------
     found : ClosedLoop, Response, Spectrum, or mapping {label: one of these}
-        Of one signal.
+        Loops, runs or spectra of one signal.
     channel : str, optional
         Which signal of loops and runs; a Spectrum, from `loop.psd(channel)`, is of one already.
     unit : str, optional
         SI unit of the signal; that of the channel when not given.
     colors : mapping {label: color}, optional
-        Of some lines.
+        Colours of some lines.
     ax : Axes, optional
 
     Returns
@@ -199,7 +199,7 @@ def exposures(
     Raises
     ------
     ModelError
-        When `run` is no Response, or an exposure is not within it or shorter than the window.
+        When `run` is not a Response, or an exposure is not within it or shorter than the window.
     LabelError
         When the channel is unknown, or the run has no error.
 
@@ -267,7 +267,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     Raises
     ------
     ModelError
-        When `found` is no ErrorMap, has fewer than three points, or `what` is neither.
+        When `found` is not an ErrorMap, has fewer than three points, or `what` is neither.
 
     Examples
     --------

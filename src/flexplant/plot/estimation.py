@@ -42,7 +42,7 @@ def predictions(
     unit: str = "m",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw predicted errors beside those that were found, one line for each design.
+    """Draw predicted errors next to those that were found, one line for each design.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def predictions(
         Comparisons of the same estimators in k cases; or for each design and case the predicted
         rms error, the one found, and the ends of its confidence interval.
     colors : mapping {design: color}, optional
-        Of the diamonds.
+        Colours of the diamonds.
     cases : sequence of str, optional
         Names of the k cases, written above those of the first design.
     unit : str
@@ -65,7 +65,7 @@ def predictions(
     Raises
     ------
     ModelError
-        When there is no such mapping, or an error is not positive.
+        When a mapping is not given, or an error is not positive.
     ShapeError
         When a row has not four columns, or there are not as many names as cases.
 
@@ -129,7 +129,7 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     Raises
     ------
     ModelError
-        When it is no LagReport.
+        When it is not a LagReport.
     LabelError
         When it has no such channel.
 
@@ -190,7 +190,7 @@ def estimate(
     Raises
     ------
     ModelError
-        When it is no Estimate, or the truth or the width is no number.
+        When it is not an Estimate, or the truth or the width is not a number.
 
     Examples
     --------
@@ -273,13 +273,13 @@ def consistency(
     found : ConsistencyReport, optional
         The verdict of `flexplant.estimation.consistency`, as the title.
     level : float
-        Of the bounds.
+        Confidence level of the bounds.
     ax : three Axes, optional
 
     Returns
     -------
     Axes
-        Of the NIS; `.figure.axes` are all.
+        Axes of the NIS; `.figure.axes` are all.
 
     Raises
     ------

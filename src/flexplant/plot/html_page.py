@@ -24,7 +24,7 @@ from ..tolerances import divisor
 
 
 class Chapter(NamedTuple):
-    """A part of the page: what it is called, and its HTML."""
+    """A part of the page: its heading, and its HTML."""
 
     heading: str
     html: str
@@ -106,7 +106,7 @@ def note(text: str, kind: str = "note") -> str:
 
 
 def tiles(found: Iterable[tuple[str, str, str, str]]) -> str:
-    """Return large figures side by side: (what, figure, beside it, "good", "bad" or "")."""
+    """Return large figures side by side: (what, figure, text next to it, "good", "bad" or "")."""
     return (
         '<div class="tiles">'
         + "".join(
@@ -154,7 +154,7 @@ class Gallery:
 
 #: width [inch] at which text of 10 points can be read in a column of 30 rem, or on 500 pixels
 _COLUMN = 5.6
-#: height that a label beside the axes takes, with a legend below them
+#: height that a label next to the axes takes, with a legend below them
 _LOWEST = 4.2
 
 
@@ -171,7 +171,7 @@ def _fit_page(figure: Figure) -> None:
     for ax in figure.axes:
         shown = ax.get_legend()
         if shown is None or shown.get_window_extent().x0 < ax.get_window_extent().x1:
-            continue  # not beside the axes
+            continue  # not next to the axes
         texts = [text.get_text() for text in shown.get_texts()]
         across = 1 if max(map(len, texts)) > 30 else 2
         # a fixed distance below the axes, for the label of the abscissa
@@ -331,7 +331,7 @@ def _translations(modes: Modes) -> tuple[FloatArray, FloatArray]:
 
 
 def _thinned(xyz: FloatArray) -> IntArray:
-    """Return about so many nodes as can be drawn, one for each cell of a grid."""
+    """Return about as many nodes as can be drawn, one for each cell of a grid."""
     cells = 4 * _NODES
     chosen: IntArray = np.arange(len(xyz))
     while chosen.size > _NODES:

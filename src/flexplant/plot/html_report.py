@@ -55,7 +55,7 @@ _HEADINGS = {
 }
 #: channels of a Bode diagram that can be read on a page
 _CHANNELS = 9
-#: parameters of an update that are drawn, each by itself
+#: parameters of an update that are drawn, each separately
 _PARAMETERS = 6
 
 Picture = tuple[str, Callable[[], Any]]
@@ -83,7 +83,7 @@ def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
 
 
 def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str:
-    """Return a value: its name, what it says of itself, tables and pictures."""
+    """Return a value: its name, its repr, tables and pictures."""
     parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
     loop = next(iter(design.of(ClosedLoop).values()), None)
     if isinstance(value, Response) and value.seed is not None and loop is not None:
@@ -462,7 +462,7 @@ def report(
     channel : str, optional
         The z whose error comes first; the first error at a POI when not given.
     seeds : mapping {str: seed}, optional
-        What chance was drawn from, for the record, beside the seeds that runs keep.
+        What chance was drawn from, for the record, in addition to the seeds that runs keep.
 
     Returns
     -------
@@ -472,7 +472,7 @@ def report(
     Raises
     ------
     ModelError
-        When there is nothing to report, or a part is no value of this package.
+        When there is nothing to report, or a part is not a value of this package.
 
     Examples
     --------

@@ -75,7 +75,7 @@ def stabilisation(
         )
         behind.semilogy(frf.freq[inside], size[inside] / factor, color=GREY, linewidth=0.8)
         behind.set_ylabel(named("sum of all |FRF|", unit))
-    if frf is not None and not given:  # beside is the ordinate of the responses
+    if frf is not None and not given:  # the other ordinate is that of the responses
         ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
         given = None
     return finish(ax, x="frequency [Hz]", y="model order", given=given)
@@ -136,5 +136,5 @@ def identified(
     return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit), given=given)
 
 
-#: lines of the table of poles: more do not fit beside the diagram
+#: lines of the table of poles: more do not fit next to the diagram
 _LISTED = 16

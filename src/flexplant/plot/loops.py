@@ -44,7 +44,7 @@ from ._axes import (
     three_axes,
 )
 
-#: step of L beside its distance from -1 that is filled in
+#: step of L relative to its distance from -1 that is filled in
 _STEEP = 0.15
 
 
@@ -59,7 +59,7 @@ def nyquist(
 ) -> Axes:
     """Draw loop gains L in the complex plane, with -1 and the circle in which ``|S| > modulus``.
 
-    Of more than four each has a panel of its own.
+    Each of more than four has a separate panel.
 
     ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
     the mirror image is not drawn. Where a measured gain steps over a resonance the curve follows
@@ -71,11 +71,11 @@ def nyquist(
         L of one channel each, the sign being that of ``1 + L``. Of a closed loop, the gain at each
         actuator while the others stay closed.
     channel : (output, input), optional
-        Of systems with several.
+        Channel of systems with several.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     modulus : float
-        Of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
+        Largest |S| of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
     reach : float
         The picture shows real and imaginary parts up to it.
     ax : Axes, optional
@@ -143,7 +143,7 @@ def nyquist(
 
 
 def _refine_loop_gain(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, ComplexArray]:
-    """Return a loop gain with points between lines where it moves much beside 1 + L."""
+    """Return a loop gain with points between lines where it moves much relative to 1 + L."""
     if freq.size < LINES:
         return freq, L
     away = np.abs(1.0 + L)
@@ -197,7 +197,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     Raises
     ------
     ModelError
-        When one is no system, or none has states.
+        When one is not a system, or no system has states.
 
     Examples
     --------
@@ -277,7 +277,7 @@ def sensitivity(
 ) -> Axes:
     """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
-    Of more than four each has a panel of its own.
+    Each of more than four has a separate panel.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def sensitivity(
         and of `(plant, controller)`, the largest singular value of S at u; of an `Frf`, such as
         `sensitivity(loop)`, its largest singular value.
     colors : mapping {label: color}, optional
-        Of some lines.
+        Colours of some lines.
     dashed : collection of str
         Labels of lines to draw thin and dashed, so that they show on equal ones.
     weight : StateSpace or float, optional
@@ -298,7 +298,7 @@ def sensitivity(
     Raises
     ------
     ModelError
-        When one of them is none of these, or the weight has several channels.
+        When one of them is something else, or the weight has several channels.
 
     Examples
     --------
@@ -371,7 +371,7 @@ def sensitivities(
     freq : (n_freq,) array [Hz], optional
         A grid of each loop, refined at its resonances, when not given.
     colors : mapping {label: color}, optional
-        Of some lines.
+        Colours of some lines.
     ax : three Axes, optional
         Where to draw S, T and KS.
 
@@ -383,7 +383,7 @@ def sensitivities(
     Raises
     ------
     ModelError
-        When one is no loop, weights are of other names or of several channels, or there are not
+        When one is not a loop, weights are of other names or of several channels, or there are not
         three axes.
 
     Examples

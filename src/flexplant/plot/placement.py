@@ -58,7 +58,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Raises
     ------
     ModelError
-        When `found` is no SensorMap, or its points lie on one line.
+        When `found` is not a SensorMap, or its points lie on one line.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     Raises
     ------
     ModelError
-        When `found` is no ParetoCurve.
+        When `found` is not a ParetoCurve.
 
     Examples
     --------
@@ -159,7 +159,7 @@ def placed(
     """Draw the sensors, actuators and POIs of a plant on its structure, seen from above.
 
     Each is named; arrows show along what those in x and y act and measure. Of a solid with devices
-    in its lower half these are drawn beside it, seen from below.
+    in its lower half these are drawn next to it, seen from below.
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     Raises
     ------
     ModelError
-        When `found` is no PositionMap, or has three or more positions.
+        When `found` is not a PositionMap, or has three or more positions.
 
     Examples
     --------

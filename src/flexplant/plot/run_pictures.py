@@ -49,7 +49,7 @@ def response(
 ) -> Axes:
     """Draw channels of a run over time, one panel for each unit; of several runs the first.
 
-    Of more than four channels each has a panel and a scale of its own: they would hide each other.
+    Each of more than four channels has a separate panel and scale: they would hide each other.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def response(
     label : str, optional
         Put before the channels' names, or in place of a single one, to compare runs in one axes.
     color : str, optional
-        Of the lines; a cycle when not given.
+        Colour of the lines; a cycle when not given.
     span : (start, end) [s], optional
-        The part of the run to draw; all of it when not given. The prefix is chosen for this part.
+        The part of the run to draw; all of it when not given. The prefix is chosen for that span.
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPointProfile.exposures`: they are shaded.
     ax : Axes, optional
@@ -78,7 +78,7 @@ def response(
     Raises
     ------
     ModelError
-        When `run` is no Response, nothing of it is within `span`, or channels of several units
+        When `run` is not a Response, nothing of it is within `span`, or channels of several units
         shall go into one axes.
 
     Examples
@@ -206,12 +206,12 @@ def step(
     Returns
     -------
     Axes
-        Of the first channel; `.figure.axes` are all, row by row.
+        Axes of the first channel; `.figure.axes` are all, row by row.
 
     Raises
     ------
     ModelError
-        When one is no system, there is nothing to draw, or more channels than can be read.
+        When one is not a system, there is nothing to draw, or more channels than can be read.
 
     Examples
     --------

@@ -57,13 +57,13 @@ def mode_shape(
     Parameters
     ----------
     modes : Modes
-        Of a full or reduced model, or of an update (`fit.modes()`).
+        Modes of a full or reduced model, or of an update (`fit.modes()`).
     number : int
         From 1, rigid-body modes included.
     scale : float
         The largest displacement that is drawn, of the largest dimension of the structure.
     phase : float [rad]
-        Of the motion ``Re(phi exp(i phase))``: 0 is the end of its way.
+        Phase of the motion ``Re(phi exp(i phase))``: 0 is the end of its way.
     color : str, optional
         One colour for the surface.
     ax : Axes3D, optional
@@ -71,8 +71,8 @@ def mode_shape(
     Raises
     ------
     ModelError
-        When there is no such mode, no displacement along x, y or z, or so many nodes that no
-        picture could show them.
+        When the mode does not exist, there is no displacement along x, y or z, or there are more
+        nodes than a picture can show.
 
     Examples
     --------
@@ -314,7 +314,7 @@ def layout(
     Parameters
     ----------
     dofs : DofSet
-        Of the full model.
+        DOFs of the full model.
     ports : Ports, optional
         Their places.
     desired : iterable of str
@@ -326,7 +326,7 @@ def layout(
     Raises
     ------
     ModelError
-        When a solid has so many nodes that no picture could show them, or is to be drawn on axes of
+        When a solid has more nodes than a picture can show, or is to be drawn on axes of
         two dimensions.
 
     Examples

@@ -59,7 +59,7 @@ def localisation(
     candidates : sequence of Parameter, optional
         As given to `localise`. With `dofs`: a plan view, the candidates where they act.
     dofs : DofSet, optional
-        Of the model.
+        DOFs of the model.
     ax : Axes, optional
 
     Returns
@@ -70,7 +70,7 @@ def localisation(
     Raises
     ------
     ModelError
-        When `found` is no Localisation, or candidates are not those of it.
+        When `found` is not a Localisation, or candidates are not those of it.
 
     Examples
     --------
@@ -162,7 +162,7 @@ def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
     return np.asarray(row @ dofs.xyz[:, :2] / row.sum())
 
 
-#: parameters that are drawn by themselves; the rest are left to the repr
+#: number of parameters that are drawn separately; the rest are left to the repr
 SHOWN = 12
 
 
@@ -187,20 +187,20 @@ def update(
         A measurement that was not fitted, drawn instead of that of the residuals; as a residual
         where its channels are not named by their DOFs, or it was measured behind a hold.
     level : float
-        Of the confidence intervals.
+        Level of the confidence intervals.
 
     Returns
     -------
     dict of Axes
         `frequencies` and `damping` (errors before and after, with poles), `mac before` and
         `mac after` (with shapes), `parameters` (estimates with intervals and priors in grey, each
-        parameter in a row with an axis of its own), `convergence`, `response` (measured, before and
+        parameter in a row with its own axis), `convergence`, `response` (measured, before and
         after, with responses).
 
     Raises
     ------
     ModelError
-        When `fit` is no UpdateResult, or a residual does not fit the model.
+        When `fit` is not an UpdateResult, or a residual does not fit the model.
 
     Examples
     --------
@@ -290,7 +290,7 @@ def _mac(ax: Axes, seen: Correlation, name: str) -> None:
 
 
 def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
-    """Draw each parameter in a row with an axis of its own: estimate, interval, prior, start."""
+    """Draw each parameter in a row with its own axis: estimate, interval, prior, start."""
     count = min(len(fit.parameters), SHOWN)
     half = np.zeros(len(fit.values))
     if fit.std is not None:
@@ -464,7 +464,7 @@ def parameters(
         finish(ax, x="iteration", y=f"[{unit}]" if many else named(name, unit))
         if truth is not None and (i == 0 or not many):
             legend(ax, given=axs is not None or many)
-        if many:  # a name does not fit beside a low panel
+        if many:  # a name does not fit next to a low panel
             ax.set_title(name, loc="left", fontsize="medium", pad=3.0)
     bottom_only(panels if axs is None else [])
     return panels

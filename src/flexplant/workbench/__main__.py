@@ -25,10 +25,10 @@ def main(words: list[str] | None = None) -> int:
         "--quantity", choices=tuple(ORDERS), help="what measured outputs shall be, converted"
     )
     parser.add_argument("--scale", type=float, help="what brings a measurement to SI")
-    parser.add_argument("--model", help="a saved StandardPlant beside a measurement")
+    parser.add_argument("--model", help="a saved StandardPlant in addition to a measurement")
     parser.add_argument("--rate", type=float, help="of the controller [Hz]; of a measurement")
     parser.add_argument("--continuous", action="store_true", help="no rate, so no C: to look only")
-    parser.add_argument("--delay", type=float, help="samples beside what was measured")
+    parser.add_argument("--delay", type=float, help="samples in addition to what was measured")
     parser.add_argument("--sampled", action="store_true", help="measured from sample to sample")
     parser.add_argument("--rigid", type=int, help="rigid-body modes of the measured plant")
     parser.add_argument(

@@ -56,8 +56,8 @@ class DesignHistory:
         return self.now
 
 
-#: first crossover beside the lowest resonance, and beside the first line; its low-pass beside it;
-#: loop gain at resonances that is small; times that the crossover is lowered until it is
+#: first crossover relative to the lowest resonance, and to the first line; its low-pass relative
+#: to it; loop gain at resonances that is small; times that the crossover is lowered until it is
 _BELOW, _ABOVE, _ROLL, _QUIET, _TRIES = 0.12, 10.0, 8.0, 0.4, 12
 
 
@@ -111,7 +111,7 @@ class Bench:
 
     @cached_property
     def question(self) -> Question:
-        """What is computed beside the axis."""
+        """Results that are computed in addition to the axis."""
         return Question(self.machines[0], self.model, self.channel, self.move)
 
     def question_of(self, index: int) -> Question:

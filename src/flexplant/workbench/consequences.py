@@ -29,7 +29,7 @@ from ..synthesis import LoopDesign, ShapedAxis, tune_loops
 from ..synthesis.laws.law import axes_controller
 from .evaluation import AxisLoop, BenchMachine
 
-#: duration of a step beside the time of a crossover, and samples at most
+#: duration of a step relative to the time of a crossover, and samples at most
 _PERIODS, _SAMPLES = 8.0, 20_000
 #: samples of the response from lines, a power of two
 _LINES = 1 << 14
@@ -72,7 +72,7 @@ class Question:
     def answer(self, design: LoopDesign, loop: AxisLoop) -> Consequences:
         """Return everything that takes longer than a slider may wait."""
         found = Consequences()
-        with warnings.catch_warnings(action="ignore"):  # what they say is on the page
+        with warnings.catch_warnings(action="ignore"):  # the page shows their text
             steps = (self._all_axes, self._on_the_plant, self._in_time)
             for step in steps:
                 try:
@@ -186,7 +186,7 @@ class Tuning:
         folder = Path(self._folder.name)
         getattr(plant, "nominal", plant).save(folder / "plant.npz")
         design.save(folder / "design.npz")
-        #: what it does, in words
+        #: its effect, in words
         self.said = "starting"
         words = [sys.executable, "-m", __name__, self._folder.name, repr(peak), str(notches)]
         self._process = subprocess.Popen(

@@ -201,7 +201,7 @@ _STEPS, _WAIT = 200, 1
 
 
 class Number:
-    """A slider in logarithmic steps beside a number that can be typed."""
+    """A slider in logarithmic steps next to a number that can be typed."""
 
     def __init__(
         self, label: str, unit: str, low: float, high: float, value: float,

@@ -29,7 +29,7 @@ from ..synthesis.laws.law import Axes, Law
 
 #: standard deviations of a line that the band around it shows
 DEVIATIONS = 2.0
-#: change from a peak to its neighbour, beside the peak, above which fewer than four lines lie
+#: change from a peak to its neighbour, relative to the peak, above which fewer than four lines lie
 #: within the half-power width of a mode
 _STEP = 0.5
 #: logarithmic part of the frequencies at which a model is drawn
@@ -298,7 +298,7 @@ def _count_others(
 
 
 def coupling(machine: BenchMachine, design: LoopDesign, name: str) -> dict[str, FloatArray]:
-    """Return how the command of an axis moves the others, beside its own motion."""
+    """Return how the command of an axis moves the others, relative to its own motion."""
     names = list(design.axes)
     a = names.index(name)
     own = np.abs(machine.G[a, a])

@@ -133,7 +133,7 @@ class WorkbenchServer(Bench):
     _server: Served | None = None
 
     def panel(self) -> Any:
-        """Return a page of its own, as a Panel object."""
+        """Return a separate page, as a Panel object."""
         return Page(self).layout
 
     def servable(self) -> Any:
@@ -224,7 +224,7 @@ def open_page(
     design : LoopDesign, optional
         To go on with; else each axis begins with PID and low-pass well below its resonances.
     model : StandardPlant or StateSpace, optional
-        Of a measured plant: drawn beside it, for its error and the modes left out.
+        Model of a measured plant: drawn with it, for its error and the modes left out.
     before, after, rate, delay, hold, rigid, unstable, references
         As for `design_loops`; by default those of the plant or model: the axes that it drives.
     channel : str, optional
@@ -236,7 +236,7 @@ def open_page(
     source : str
         The line of Python that makes the plant, for the scripts that are copied.
     port : int
-        Of the server; 0 takes a free one.
+        Port of the server; 0 takes a free one.
     open_browser : bool
         False returns the object without serving: call `serve`.
     block : bool, optional
@@ -297,9 +297,9 @@ def open_file(
     FlexplantError
         When it holds none of these.
     ModelError
-        When `quantity` or `scale` is given for what is no measurement.
+        When `quantity` or `scale` is given for something else than a measurement.
     FileNotFoundError
-        When there is no such file.
+        When the file does not exist.
 
     Examples
     --------

@@ -385,7 +385,7 @@ class Page:
         return self._evaluator.loop(machine, design, self.axis)
 
     def _draw_model(self, design: LoopDesign) -> None:
-        """Draw the model beside a measurement."""
+        """Draw the model with a measurement."""
         model = self.bench.model
         if model is not None and model is not self.machine and self.machine.is_measured:
             self.views.show_beside("model", self._of(model, design))

@@ -108,7 +108,7 @@ _LIMITS = (
 
 
 class SideCards:
-    """The cards beside the law; `page` is the tab that they belong to."""
+    """The cards next to the law; `page` is the tab that they belong to."""
 
     def __init__(self, page: Any) -> None:
         self.page = page

@@ -16,7 +16,7 @@ from .evaluation import DEVIATIONS, AxisLoop
 from .verdict import LoopLimits
 
 #: colours that differ in brightness too: the loop, its second curve, the worst machine,
-#: what is forbidden, the model beside a measurement
+#: what is forbidden, the model with a measurement
 BLUE, ORANGE, RED, GREEN, GREY = "#0B6FB8", "#D98200", "#C23B22", "#2A8C55", "#9AA3AD"
 #: earlier designs, the latest first
 KEPT = ("#8C6BB1", "#B4935A", "#6AA39B", "#B77E96")
@@ -86,7 +86,7 @@ class Views:
 
         ranges = more
         if freq:
-            y = Range1d(-60.0, 20.0)  # of their own: zooming stays while curves change
+            y = Range1d(-60.0, 20.0)  # separate ranges: zooming stays while curves change
             ranges = {"x_range": self.freq_range, "x_axis_type": "log", "y_range": y}
         fig = figure(
             title=title, height=height, min_width=280, sizing_mode="stretch_width",
@@ -116,7 +116,7 @@ class Views:
     def _line(
         self, figure: str, curve: str, color: str, width: float = 1.6, /, **look: Any
     ) -> None:
-        """Draw a line of a source of its own; the cursor reads the main one."""
+        """Draw a line of a separate source; the cursor reads the main one."""
         from bokeh.models import HoverTool
 
         fig, source = self.figures[figure], self._source(f"{figure} {curve}")
@@ -390,7 +390,7 @@ def _visible_part(loop: AxisLoop) -> tuple[Any, Any]:
     return L.real[::step], L.imag[::step]
 
 
-#: how near a handle or a curve is that the mouse means, beside the picture
+#: how near a handle or a curve is that the mouse means, relative to the picture
 _NEAR = 0.06
 
 
@@ -415,7 +415,7 @@ class Gestures:
             self.page.views.figures[name].on_event(Tap, partial(self.tap, name))
 
     def _distances(self, x: float, y: float, xs: Any, ys: Any) -> Any:
-        """Return distances to points of the magnitude picture, beside its size."""
+        """Return distances to points of the magnitude picture, relative to its size."""
         fig, span = self.page.views.figures["magnitude"], self.page.views.freq_range
         wide = np.log(span.end / span.start)
         tall = fig.y_range.end - fig.y_range.start
