@@ -76,7 +76,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - place sensors and actuators: `examples/placement.py`
 - design for many machines: `examples/fleet.py`
 - write a specification as tests: `examples/test_specifications.py`
-- run a controller in C beside the machine, at 10 kHz: `examples/real_time.py`
+- run a controller in C with the machine, at 10 kHz: `examples/real_time.py`
 
 **Beside its peers.** CPU seconds on one core of a server, ours and a peer's in one run of
 ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio above 1 means that ours is

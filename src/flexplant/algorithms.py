@@ -18,7 +18,7 @@ explained is warned of, with its frequency. A pole with another at the same plac
 too close for the diagram) is taken apart where that lowers chi-square by more than noise does.
 
 Measurements that no linear machine explains: a pole is added only for what the outputs share,
-beyond poles of their own at each of them, and misfit that is correlated over neighbouring lines
+beyond separate poles at each of them, and misfit that is correlated over neighbouring lines
 counts as so much less. Of two poles within a bandwidth with the same shape and participation one
 remains. Where outputs (inputs, runs) disagree on the poles, they are warned of: poles are then
 means of each output's own, with the deviations of random effects. Poles whose deviation of

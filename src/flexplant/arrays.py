@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from .errors import ModelError, ShapeError, short
 
-#: from here on the cube of a number is none of float64
+#: above this, x**3 overflows
 TOO_LARGE = 1e100
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
@@ -159,7 +159,7 @@ def number(value: Any, name: str) -> float:
 
 
 def floats_of(value: Any, name: str, count: int) -> tuple[float, ...]:
-    """Return so many finite numbers as a tuple."""
+    """Return a number of finite numbers as a tuple."""
     return tuple(real_array(value, name, (count,)).tolist())
 
 
@@ -178,7 +178,7 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
 
 
 def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None) -> int:
-    """Return `value` as an int between bounds; 3.0 is none, nor is True."""
+    """Return `value` as an int between bounds; floats and bools are refused."""
     least = f"at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise ModelError(f"{name} must be a whole number {least}, got {short(value)}. Pass an int.")
@@ -189,7 +189,7 @@ def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None
 
 
 def positions(values: Any, name: str, count: int) -> IntArray:
-    """Return positions, from 0, among so many as int64 (n,)."""
+    """Return positions, from 0 to below the count, as int64 (n,)."""
     array = real_array(values, name, (None,))
     if np.any(array != np.round(array)) or np.any((array < -count) | (array >= count)):
         raise ModelError(

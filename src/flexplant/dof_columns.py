@@ -37,7 +37,7 @@ class Interpolation(Value):
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        A joint makes DOFs follow: they are no rows of the matrices, but their labels stay known.
+        A joint makes DOFs follow: they are not rows of the matrices, but their labels stay known.
         """
         return None
 
@@ -174,7 +174,7 @@ def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) ->
     return np.asarray(xyz[order[np.searchsorted(known[order], wanted)]], dtype=np.float64)
 
 
-#: of so many labels the closest are found by comparing each with the one that is unknown
+#: up to this number of labels the closest are found by comparing each with the one that is unknown
 _COMPARABLE = 2000
 _ROTATIONS = frozenset(DIRECTIONS[3:])
 
@@ -223,7 +223,7 @@ class DofIndex:
             number = int(node)
         except ValueError:
             return -1
-        if str(number) != node or abs(number) > LARGEST_NODE:  # "07:z" and "1_0:z" are no labels
+        if str(number) != node or abs(number) > LARGEST_NODE:  # "07:z" and "1_0:z" are not labels
             return -1
         start, end = self._ends[component]
         key = number * len(DIRECTIONS) + DIRECTIONS.index(direction)

@@ -15,8 +15,8 @@
 An unknown name is a `LabelError`, sizes that do not match are a `ShapeError` and a value out of
 range is a `ModelError` everywhere: Raises lists what one would not expect. Every message says what
 is wrong, what was got, why it matters and what to do next. What is tried inside, fails and is
-replaced by something else is no error: ``logging.getLogger("flexplant")`` says so at the level INFO
-(``logging.basicConfig(level="INFO")`` shows it).
+replaced by something else is not an error: ``logging.getLogger("flexplant")`` says so at the
+level INFO (``logging.basicConfig(level="INFO")`` shows it).
 """
 
 import logging

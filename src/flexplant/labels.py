@@ -254,7 +254,7 @@ class DofSet(Value):
             Its lowest and highest corner, both belonging to it: ``[(0, 0, 0), (0, 0.6, 0)]`` is an
             edge. Infinite entries are allowed.
         component : str, optional
-            Of a joined machine.
+            Component of a joined machine.
         """
         keep = self._owned(component)
         if nodes is not None:
@@ -300,7 +300,7 @@ class DofSet(Value):
         direction : str
             One of the directions present.
         component : str, optional
-            Of a joined machine; None: of all.
+            Component of a joined machine; None: all.
         """
         known = isinstance(direction, str) and direction in DIRECTIONS
         kind = DIRECTIONS.index(direction) if known else -1

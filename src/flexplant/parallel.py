@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 #: samples, lines or columns that are computed at once: they stay in the cache
 PIECE = 2048
-#: work of one chunk [s]: long beside the cost of sending it, short beside the whole
+#: work of one chunk [s]: long relative to the cost of sending it, short relative to the whole
 CHUNK = 0.5
 #: items computed here before the rest is sent take this long [s]: they show how long one takes
 PROBE = 0.05
@@ -81,7 +81,7 @@ def one_thread() -> Iterator[None]:
 def interruptible(function: Callable[[], Result]) -> Result:
     """Return ``function()``, which Ctrl-C ends at once although compiled code does not look for it.
 
-    It runs in a thread of its own, on one thread of BLAS, while this one waits. Interrupted, it is
+    It runs in a separate thread, on one thread of BLAS, while this one waits. Interrupted, it is
     left alone and ends with the limit of time that it has.
     """
     if threading.current_thread() is not threading.main_thread():  # signals reach the main thread
@@ -153,7 +153,7 @@ def _send(
     executor: Executor,
     keep: Callable[[int, Result], None],
 ) -> None:
-    """Compute calls, each of which takes so many seconds, in chunks on an executor."""
+    """Compute calls, each of which takes some seconds, in chunks on an executor."""
     size = max(1, round(CHUNK / max(seconds, 1e-9)))  # clocks have no finer tick
     chunks = [calls[i : i + size] for i in range(0, len(calls), size)]
     out = {i: (function, [call for _, call in chunk]) for i, chunk in enumerate(chunks)}
@@ -210,8 +210,8 @@ def survived(
     function: Callable[..., Any], calls: Mapping[int, tuple[Any, ...]], executor: Executor
 ) -> Iterator[tuple[int, Any]]:
     """Yield numbers and results of ``function(*call)`` as they come."""
-    # when a process of a pool dies, the calls that were out are done once more, each in a process
-    # of its own, where one that dies again yields `Lost`; the rest goes on in another pool
+    # when a process of a pool dies, the calls that were out are done once more, each in a
+    # separate process, where one that dies again yields `Lost`; the rest goes on in another pool
     left, pool, own = dict(calls), executor, False
     while left:
         lost: set[int] = set()
@@ -314,7 +314,7 @@ class Progress:
     longer, a second line says so when it is done. What `expect` knows before is said before.
     `advice` follows where more than 20 seconds are left. `progress=False` is silent.
 
-    Work inside of other work shows none of its own, neither here nor in the process of a pool.
+    Work inside of other work shows no bar, neither here nor in the process of a pool.
     """
 
     def __init__(
@@ -445,7 +445,7 @@ def _seconds_each() -> float:
     """Return the seconds of one multiplication here, in products of matrices."""
     square, spent = np.ones((256, 256)), []
     with one_thread():
-        for _ in range(5):  # the quickest: others compute beside it
+        for _ in range(5):  # the quickest: others compute at the same time
             start = perf_counter()
             square @ square
             spent.append(perf_counter() - start)

@@ -227,7 +227,7 @@ def load(path: str | Path) -> Any:
     Returns
     -------
     Value
-        Of the type that was saved, arrays read-only.
+        Value of the type that was saved, arrays read-only.
 
     Raises
     ------

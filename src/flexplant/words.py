@@ -185,7 +185,7 @@ def mapping(
     kind: Any = object,
     error: type[FlexplantError] = ModelError,
 ) -> dict[Any, Any]:
-    """Return a mapping of so many entries at least, all of a class, as a dict."""
+    """Return a mapping with a least number of entries, all of a class, as a dict."""
     if not isinstance(value, Mapping) or len(value) < least:
         filled = f" with {least} or more entries" if least else ""
         raise error(f"{name} must be a mapping{filled}, got {short(value)}. {hint}")

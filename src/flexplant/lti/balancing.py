@@ -183,7 +183,7 @@ def _rejoined(g: StateSpace, split: StableSplit, reduced: StateSpace) -> StateSp
 
 
 def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace:
-    """Return a weight, ones where there is none."""
+    """Return a weight, ones where it is not given."""
     ours = g.inputs if side == "input" else g.outputs
     w = as_statespace(np.eye(len(ours)) if weight is None else weight)
     theirs = w.outputs if side == "input" else w.inputs
@@ -254,7 +254,7 @@ def hankel_norm(sys: System) -> float:
     Raises
     ------
     ModelError
-        When `sys` is no system.
+        When `sys` is not a system.
 
     Examples
     --------
@@ -277,7 +277,7 @@ class NormReport(Value):
     h2, hinf, linf, hankel : float
         The norms; infinite with a reason.
     freq : float [Hz]
-        Of the peak of the frequency response, or of the pole that makes the norms infinite.
+        Frequency of the peak of the response, or of the pole that makes the norms infinite.
     reasons : sequence of str
         One sentence for each thing that makes a norm infinite; empty when all are finite.
 

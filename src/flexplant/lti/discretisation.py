@@ -97,7 +97,7 @@ ONE_VECTOR, CALL = 3.0, 3e4
 def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
     """Return the size of a block that costs least, and the operations that a sample then takes."""
 
-    # n states, p outputs, m inputs; the preparation is shared by so many samples
+    # n states, p outputs, m inputs; the preparation is shared by a number of samples
     def cost(size: int) -> float:
         prepare = 2 * size * n * n * (m + p) + 4 * np.log2(size) * n**3
         step = (2 * ONE_VECTOR * n * n + CALL) / size
@@ -145,12 +145,12 @@ class Recursion(NamedTuple):
         return out, x
 
     def best_size(self, samples: int) -> int:
-        """Return the size of a block that costs least for a record of so many samples."""
+        """Return the size of a block that costs least for a record of this length."""
         p, m = self.J.shape
         return cheapest(self.F.shape[0], p, m, samples)[0]
 
     def in_blocks(self, size: int) -> Blocks:
-        """Return the matrices of a block of so many samples."""
+        """Return the matrices of a block of a number of samples."""
         # out = O x + T v and x[k+b] = F^b x[k] + R v: observability, reachability, Toeplitz of
         # Markov
         b, n, (p, m) = size, self.F.shape[0], self.J.shape

@@ -16,7 +16,7 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even."""
     # A is bordered by the sizes of B's rows and C's columns and balanced with them: balancing A
     # alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
-    # got units of 1e26 beside 1e-34), which costs B and C all their digits
+    # got units of 1e26 and 1e-34), which costs B and C all their digits
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     # borders as large as the balanced A, whatever the units of A, inputs, outputs
     size = float(np.linalg.norm(balanced_matrix(A))) or 1.0
@@ -92,7 +92,7 @@ def reciprocal(size: FloatArray) -> FloatArray:
 _Schur = tuple[ComplexArray, ComplexArray]
 #: doublings: 2^60 terms of a series; a slower decay is not distinguished from none
 DOUBLINGS = 60
-#: a term of this part of its sum is below rounding (2e-16), and so is all that follows
+#: a term of this size, relative to its sum, is below rounding (2e-16), and so is all that follows
 _LAST = 1e-17
 #: a doubled Riccati equation has converged: the next term would be the square of this
 _CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
@@ -106,7 +106,7 @@ _CORRECTIONS = 4
 
 
 def relative(residual: FloatArray, *sizes: float) -> float:
-    """Return the norm of a residual beside the sizes of the terms of its equation."""
+    """Return the norm of a residual relative to the sizes of the terms of its equation."""
     return float(np.linalg.norm(residual)) / (sum(sizes) or 1.0)
 
 
@@ -300,7 +300,7 @@ def accumulated(A: FloatArray, Q: FloatArray) -> FloatArray:
     for _ in range(8):
         X = X + A @ X @ A.T
         A = A @ A
-        # unstable: what it has come to is scale enough, and later terms would hide the others
+        # unstable: its size so far is scale enough, and later terms would hide the others
         if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
             break
     return np.abs(X.diagonal())

@@ -75,8 +75,8 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     matched at one frequency. Notches keep their frequency and depth exactly, which Tustin only
     does at one.
 
-    Of one input and one output alone, as in MATLAB's c2d: zeros of several channels belong to all
-    of them together. A filter with a section for each channel is sampled section by section:
+    Systems of one input and one output alone, as in MATLAB's c2d: zeros of several channels belong
+    to all of them together. A filter with a section for each channel is sampled section by section:
     ``append(*(matched(f, rate) for f in sections))``.
 
     Parameters
@@ -314,7 +314,7 @@ def inverse_sensitivity(
     floor : float
         Bound on |S| at frequency zero; above 0, so that the weight is stable.
     slope : {1, 2}
-        Of the bound below the bandwidth, in decades per decade.
+        Slope of the bound below the bandwidth, in decades per decade.
 
     Returns
     -------

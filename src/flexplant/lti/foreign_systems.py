@@ -59,7 +59,7 @@ def tf_fields(
 
 
 def matrix_fields(channels: list[list[dict[str, Any]]]) -> dict[str, Any]:
-    """Return the fields of a matrix of transfer functions, each with states of its own."""
+    """Return the fields of a matrix of transfer functions, each with separate states."""
     every = [part for row in channels for part in row]
     inputs = [np.eye(len(row))[j : j + 1] for row in channels for j in range(len(row))]
     outputs = [np.eye(len(channels))[:, i : i + 1] for i, row in enumerate(channels) for _ in row]
@@ -106,7 +106,7 @@ def _near_zeros(pair: ComplexArray, left: list[ComplexArray]) -> ComplexArray:
 def _section(
     poles: ComplexArray, zeros: ComplexArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return ``prod (s - zero) / prod (s - pole)`` of order one or two, with no more zeros."""
+    """Return ``prod (s - zero) / prod (s - pole)`` of order one or two, proper."""
     through = np.array([[float(zeros.size == poles.size)]])
     if poles.size == 1:
         p = float(poles[0].real)

@@ -127,21 +127,21 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     inputs, outputs : sequences of str, optional
         Names; `u1`..., `y1`... when not given.
     quantity : str, optional
-        Of a measurement: displacement, velocity or acceleration.
+        Quantity of a measurement: displacement, velocity or acceleration.
     coherence : (n_out, n_in, n_freq) array, optional
-        Of a measurement, between 0 and 1.
+        Coherence of a measurement, between 0 and 1.
     variance : (n_out, n_in, n_freq) array, optional
-        Of a measurement, E|error|^2 of each entry.
+        Variance of a measurement, E|error|^2 of each entry.
     freedom : float, optional
         Complex degrees of freedom nu of each variance, where it was estimated from few runs (R
         runs: R - 1): the mean of |error|^2 / variance is then ``nu / (nu - 1)``.
     correlation : (n_out, n_out, n_freq) complex array, optional
-        Of a measurement: of the errors of different outputs under the same input (a disturbance
-        reaches all of them), with ones on the diagonal.
+        Correlation of the errors of different outputs of a measurement under the same input (a
+        disturbance reaches all of them), with ones on the diagonal.
     resolution : float [Hz], optional
-        Of a measurement: inverse of the length of a segment or period that was transformed.
+        Resolution of a measurement: inverse of the length of the transformed segment or period.
     window : str or tuple, optional
-        Of a measurement averaged over windowed segments: their window, as
+        Window of a measurement averaged over windowed segments: their window, as
         `scipy.signal.get_window` takes; needs `resolution`. Such lines leak, and their errors are
         correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
     overlap : float

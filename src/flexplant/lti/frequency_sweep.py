@@ -41,7 +41,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     with points through every resonance; then intervals are halved, the worst first, until in the
     middle of each the logarithm of every channel's magnitude lies within `tolerance` of the line
     between its ends, and no phase turns by more than 0.6 rad: a line drawn through the points is
-    the response. At an undamped resonance, where there is none, the grid leaves a gap.
+    the response. At an undamped resonance, which has no response, the grid leaves a gap.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     points : int
         Most points. 64 channels of 24 lightly damped modes need some 3500.
     tolerance : float
-        Of the natural logarithm of a magnitude: 0.05 is 0.4 dB.
+        Step of the natural logarithm of a magnitude: 0.05 is 0.4 dB.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def _halve_intervals(
 
 
 def _log_channels(data: ComplexArray) -> ComplexArray:
-    """Return log H (n_channel, n_freq), what is negligible beside its row and column flattened."""
+    """Return log H (n_channel, n_freq), entries negligible in row and column flattened."""
     size = np.abs(data)
     scale = np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
     floor = np.maximum(FLOOR * scale, TINY)
@@ -208,7 +208,7 @@ def highest(
 ) -> tuple[float, float]:
     """Return the largest value of a function of frequency, and its frequency [Hz]."""
     # `values` on the grid where these are known
-    # brackets around the highest maxima are divided, until a parabola gains no more
+    # brackets around the highest maxima are divided, until a parabola gains nothing
     values = find(grid) if values is None else values
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
     freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each

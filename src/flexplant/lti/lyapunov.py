@@ -110,7 +110,7 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     A, Q = _square_pair(A, Q)
     if not A.size:
         return Q
-    # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 beside Q
+    # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 with Q
     d = even_scale(A)
     As, Qs = A * d / d[:, None], Q / d / d[:, None]
     X = lyapunov(As, Qs)
@@ -195,7 +195,7 @@ def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
     return solve_stein(A, B @ B.T) if g.dt else solve_lyapunov(A, B @ B.T)
 
 
-#: least square of a pair's frequency, beside that of its decay: a damping ratio of 0.95
+#: least square of a pair's frequency, relative to that of its decay: a damping ratio of 0.95
 _SWINGING = 0.1
 
 
@@ -226,7 +226,7 @@ def _modal_gramian(
     return symmetrised(padded[np.ix_(keep, keep)])
 
 
-#: largest residual beside the terms of the equation: rounding leaves 1e-13 of some hundred states
+#: largest residual relative to the terms of the equation: rounding of some hundred states is 1e-13
 TOLERANCE = 1e-10
 
 
@@ -257,7 +257,7 @@ def _factor(A: FloatArray, B: FloatArray, C: FloatArray, dt: float) -> FloatArra
 
 
 def compressed(L: FloatArray) -> FloatArray:
-    """Return a factor with the same ``L L'`` and no more columns than rows."""
+    """Return a factor with the same ``L L'`` and at most as many columns as rows."""
     return triangular(L) if L.shape[1] > L.shape[0] else L
 
 

@@ -100,10 +100,10 @@ def _window_overlap(distance: FloatArray, window: Any, overlap: float) -> FloatA
     return np.asarray(power / own)
 
 
-#: change of a response between two lines, beside its size, below which it is a straight line
+#: change of a response between two lines, relative to its size, below which it is a straight line
 _STRAIGHT = 1e-9
-#: third difference, beside the terms of its sum, that is rounding, and how far away the pole of
-#: such lines is put
+#: third difference, relative to the terms of its sum, that is rounding, and how far away the pole
+#: of such lines is put
 _ROUNDING, _FAR = 1e-14, 1e6
 #: neighbouring lines through which a mode on a straight line is fitted
 LINES = 4
@@ -193,13 +193,12 @@ def _circle_values(
 
 #: damping ratio below which a mode is not considered: no structure has less
 _LEAST = 1e-5
-#: how far outside its interval, beside its length, a fit may find a mode of it
+#: how far outside its interval, relative to its length, a fit may find a mode of it
 _ASIDE = 0.25
-#: what fits are taken to be wrong by, beside what they differ by; the part of an interval up to
+#: error of fits, relative to the difference of two of them; the part of an interval up to
 #: which that is a mode found; and the part of its shift within which they have to agree on that
 _SAFETY, _FOUND, _ALIKE = 2.0, 0.3, 0.5
-#: half-power width, beside the distance of two lines, of a mode that the lines themselves show:
-#: some of them lie on its circle, so that the steps from line to line follow it
+#: half-power width, relative to the distance of two lines, of a mode that the lines show: some of them lie on its circle, so that the steps from line to line follow it
 _SHOWN = 4.0
 #: phase step of det(I - L) between two lines above which its path is not known
 _STEP = 0.6 * np.pi
@@ -292,7 +291,7 @@ def _hidden_modes(
     turns = np.round((turn - step) / (2.0 * np.pi))
     followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < _STEP
     followed &= turns.max(axis=0) == turns.min(axis=0)
-    far = np.abs(step) > _STEP  # also beside a mode of a neighbouring interval
+    far = np.abs(step) > _STEP  # also next to a mode of a neighbouring interval
     turns = np.where(found | (far & alike & followed), turns[0], 0.0)
     unknown = np.where(found, ~followed, far & ~(alike & followed))
     critical = np.max(np.where(acts, np.where(found, needed, size), 0.0), axis=0, initial=0.0)

@@ -22,15 +22,15 @@ from .statespace import StateSpace, System, as_statespace
 #: shares and Hankel singular values below this of what they are computed from are rounding
 NOISE = 1e-13
 #: poles this close together, relative to their size, are judged together: copies of one mode lose
-#: a state, whose share is the square of their distance beside their damping
+#: a state, whose share is the square of their distance relative to their damping
 SAME = 1e-6
 #: conditions of a pole above which they say nothing more: two poles in one that rounding leaves,
 #: then any number
 DEFECTIVE = (DOUBLE, 1e12)
 #: condition of the bases of the modes above which the modes are not judged one by one
 LARGEST = 1e6
-#: part of a frequency by which a point lies beside the imaginary axis: wide enough for no resonance
-#: and no zero to be met
+#: fraction of a frequency by which a point lies next to the imaginary axis: wide enough for no
+#: resonance and no zero to be met
 BESIDE = 0.1
 #: the same, so near that all but undamped poles have their whole peak
 NEAR = 1e-9
@@ -67,7 +67,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     Raises
     ------
     ModelError
-        When `sys` is no system or tol is not between 0 and 1.
+        When `sys` is not a system or tol is not between 0 and 1.
     SolverError
         When stable and unstable modes cannot be distinguished.
 
@@ -104,7 +104,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
 
 @dataclass(frozen=True)
 class _Group:
-    """Modes of equal poles as a system of their own, without feedthrough, and where they act."""
+    """Modes of equal poles as a separate system, without feedthrough, and where they act."""
 
     part: StateSpace
     omega: FloatArray  # [rad/s], 0 for a rigid-body mode or an integrator
@@ -208,7 +208,7 @@ def _frequencies(groups: list[_Group]) -> FloatArray:
 
 
 def _visible(groups: list[_Group], tol: float) -> list[_Group]:
-    """Return the groups whose share of the response around their own frequency is no rounding."""
+    """Return the groups whose share of the response around their own frequency exceeds rounding."""
     slowest = _frequencies(groups)[0]
     omega = [np.maximum(np.unique(group.omega), slowest) for group in groups]
     whole = sum(_gains(group.part, np.concatenate(omega), BESIDE) for group in groups)
@@ -239,7 +239,7 @@ def _equalisers(gains: FloatArray) -> FloatArray:
 
 
 def _agree(found: StateSpace, g: StateSpace, omega: FloatArray) -> bool:
-    """Return whether two systems have the same responses beside the frequencies of modes."""
+    """Return whether two systems have the same responses next to the frequencies of modes."""
     omega = (1.0 - OFF) * omega
     ours, wanted = (responses(s, omega / (2.0 * np.pi)).transpose(2, 0, 1) for s in (found, g))
     unit = _equalisers(np.abs(wanted))

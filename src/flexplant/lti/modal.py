@@ -15,7 +15,7 @@ from .equations import state_scale
 from .modal_map import eigenvalues_with_error, uncertain_poles
 from .statespace import StateSpace, System, as_statespace
 
-#: speed of a rigid-body pair, relative to A, below which there is none
+#: speed of a rigid-body pair, relative to A, below which it counts as zero
 RIGID = 1e-6
 #: relative distance of two poles, and sine of the angle between their eigenvectors, below which
 #: they share a block: apart, what each does would be a thousand times what both do together
@@ -35,7 +35,7 @@ class ModalForm(Value):
     transformation : (n, n) array
         ``x = T x_modal``; the identity when `reason` is not empty.
     condition : float
-        Of the eigenvectors, states balanced: what rounding is multiplied with.
+        Condition of the eigenvectors, states balanced: what rounding is multiplied with.
     residual : float
         Norm of what the blocks leave out of ``T^-1 A T``, relative to A, states balanced.
     reason : str
@@ -72,12 +72,12 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     sys : StateSpace or control.StateSpace
         Any; a system that has 2 x 2 and 1 x 1 blocks on its diagonal alone comes back as it is.
     largest_condition : float
-        Of the eigenvectors; above it the system is kept as given, and `reason` says so.
+        Condition of the eigenvectors; above it the system is kept as given, and `reason` says so.
 
     Raises
     ------
     ModelError
-        When `sys` is no system or largest_condition not positive.
+        When `sys` is not a system or largest_condition not positive.
 
     Examples
     --------
@@ -129,7 +129,7 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
 def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[int]]:
     """Return real eigenvectors (n, n), the block-diagonal A and its blocks, slow poles first."""
     eye = np.eye(A.shape[0])
-    # a slow mode is no rigid-body one, however fast the others: rounding says which may be
+    # a slow mode is not a rigid-body one, however fast the others: rounding says which may be
     values, vectors, error = eigenvalues_with_error(A)
     near = np.abs(values - centre) <= error
     columns, parts = [np.zeros((A.shape[0], 0))], []

@@ -25,7 +25,7 @@ class ModalMap(NamedTuple):
 
     @classmethod
     def of_pairs(cls, pairs: FloatArray) -> ModalMap:
-        """Return that of blocks (b, 2, 2) by themselves; T^-1 is not finite where one lacks a mode.
+        """Return that of separate blocks (b, 2, 2); T^-1 is not finite where one lacks a mode.
 
         The poles are m +- r, m half the trace and ``r^2 I = (A - m I)^2`` (Cayley-Hamilton): their
         damping is as exact as the block.

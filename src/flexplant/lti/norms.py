@@ -50,7 +50,7 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     Raises
     ------
     ModelError
-        When `sys` is no system.
+        When `sys` is not a system.
 
     References
     ----------
@@ -114,8 +114,8 @@ def linf_norm(sys: System) -> float:
     """Return the L-infinity norm: the largest gain on the frequency axis, stable or not.
 
     Equal to the H-infinity norm for a stable system. For an unstable one (a controller, a plant
-    with negative stiffness) it is the peak of the frequency response, which is no gain from inputs
-    to outputs of bounded energy; use it for model errors and measured responses.
+    with negative stiffness) it is the peak of the frequency response, not a gain from inputs to
+    outputs of bounded energy; use it for model errors and measured responses.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def h2_norm(sys: System) -> float:
     if is_block_diagonal(g):
         square, terms = _trace(g.C, controllability_gramian(g))
         other, their = _trace(g.B.T, observability_gramian(g))
-    else:  # by factors: slow poles beside fast ones cost the Gramians themselves half their digits
+    else:  # by factors: slow poles next to fast ones cost the Gramians themselves half their digits
         square, terms = _trace_of_factor(g.C, controllability_factor(g))
         other, their = _trace_of_factor(g.B.T, observability_factor(g))
     direct = float(np.sum(g.D**2)) if g.dt else 0.0

@@ -63,7 +63,7 @@ def proved_peak(model: Residues, tolerance: float) -> tuple[float, float] | None
 
 
 class _Expansion(NamedTuple):
-    """``G* G = A_0 + A_1 d + A_2 d^2`` beside frequencies, in the singular vectors there."""
+    """``G* G = A_0 + A_1 d + A_2 d^2`` next to frequencies, in the singular vectors there."""
 
     values: FloatArray
     A1: ComplexArray
@@ -149,7 +149,7 @@ def _zone_radii(
 
 
 def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
-    """Return frequencies at which the gain is above a level, empty when proved: there are none."""
+    """Return frequencies at which the gain is above a level, empty when proven not to exist."""
     # None: undecided, at as much work as an eigenvalue problem
     through = float(np.linalg.norm(model.through, 2))
     if not level > through * (1.0 + CLEAR):
@@ -239,7 +239,7 @@ class Residues(NamedTuple):
 
     @property
     def resonances(self) -> FloatArray:
-        """The frequencies (n,) beside which peaks lie: ``|p| (1 - 2 zeta^2)^(1/2)``."""
+        """The frequencies (n,) next to which peaks lie: ``|p| (1 - 2 zeta^2)^(1/2)``."""
         return np.sqrt(np.maximum(self.poles.imag**2 - self.poles.real**2, 0.0))
 
     def apart(self, omega: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from .equations import scaled_schur
 from .modal_map import diagonal_form
 from .statespace import StateSpace
 
-#: so many complex numbers are less than 128 kB
+#: number of complex numbers in less than 128 kB
 SMALL = 7000
 #: where a system keeps what was prepared: it is often swept again and again
 _KEPT = "_responder"

@@ -334,7 +334,7 @@ def _riccati_gain(p: RiccatiProblem, P: FloatArray) -> FloatArray:
 
 
 def _residual(p: RiccatiProblem, P: FloatArray, K: FloatArray) -> tuple[FloatArray, float]:
-    """Return the residual of the equation, given the gain of P, and its size beside the terms."""
+    """Return the residual of the equation, given the gain of P, and its relative size."""
     closed = p.A - K @ p.C
     # Joseph form: a sum of squares in P and J, so rounding stays relative to P
     driven = (K * p.J) @ K.T + p.Q
@@ -512,8 +512,8 @@ _STALLS = 6
 #: Newton's steps: from a start with 1e8 times the noise it took 20, the last four of them
 #: quadratic
 STEPS = 60
-#: powers of ten by which sensors have more noise, beside their motion in a sample and own noise:
-#: from rounding to a million times as much
+#: powers of ten by which sensors have more noise, relative to their motion in a sample and to
+#: their own noise: from rounding to a million times as much
 DECADES = (-16, 7)
 
 
@@ -548,7 +548,7 @@ def _measured(
 
 def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiRoot:
     """Return the stationary filter, by Newton's steps from that of noisier sensors."""
-    # in square roots `P = L L'`, twice the digits of P: little noise beside much motion leaves P
+    # in square roots `P = L L'`, twice the digits of P: little noise next to much motion leaves P
     # with directions that are 1e-16 of others, below its rounding, and yet the gain hangs on them
     start = _noisier(A, C, G, H)
     d = scale_of(np.abs(start.P.diagonal()))
@@ -557,7 +557,7 @@ def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> 
 
 
 def _noisier(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiSolution:
-    """Return the filter for the least noise that sensors have besides, in decades, with one."""
+    """Return the filter for the least noise that sensors have in addition, in decades, with one."""
     why: Exception | None = None
     R, moved = H @ H.T, C @ G
     reach = np.diag(R) + np.sum(moved**2, axis=1)

@@ -343,7 +343,7 @@ class StateSpace(Value):
     def zeros(self) -> ComplexArray:
         """Return the finite invariant zeros [rad/s, or z]: where inputs leave no trace in outputs.
 
-        Of states that inputs do not reach or outputs do not see too.
+        The poles of states that inputs do not reach or outputs do not see are among them.
         """
         return invariant_zeros(self)
 

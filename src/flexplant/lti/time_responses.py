@@ -217,7 +217,7 @@ def lsim(
         )
     first = np.zeros(g.n_states) if start is None else real_array(start, "start", (g.n_states,))
     if between == "linear" and not g.dt:
-        # u is a state of its own, whose held derivative is the input
+        # u is a separate state, whose held derivative is the input
         slope = np.diff(signal, append=signal[:, -1:]) / (instants[1] - instants[0])
         data = _driven(_integrated(g), instants, slope.T, np.concatenate([first, signal[:, 0]]))
     else:
@@ -244,7 +244,7 @@ class StepInfo(Value):
     peak_time : float [s]
         When it is reached.
     unit : str, optional
-        Of the output.
+        Unit of the output.
     """
 
     steady: float

@@ -110,7 +110,7 @@ class Guyan(ReductionMethod):
     dofs : sequence of str, DofSet or DofSelection
         The DOFs that are kept; held, they must stop all rigid-body motion.
     damping : ModalDamping or Rayleigh, optional
-        Of the reduced model's own modes; None: ``T^T D T``.
+        Damping of the reduced model's own modes; None: ``T^T D T``.
 
     References
     ----------
@@ -153,9 +153,9 @@ class Irs(ReductionMethod):
     ----------
     dofs, damping : as for `Guyan`
     iterations : int
-        At most so many.
+        Largest number of iterations.
     tolerance : float
-        Stop when no omega^2 changes by more than this part of itself.
+        Stop when no omega^2 changes by more than this fraction of itself.
 
     Notes
     -----
@@ -318,7 +318,7 @@ class CraigBampton(ReductionMethod):
     below : float [Hz], optional
         In place of `modes`: all fixed-interface modes up to this frequency.
     damping : ModalDamping or Rayleigh, optional
-        Of the reduced model's own modes; None: ``T^T D T``.
+        Damping of the reduced model's own modes; None: ``T^T D T``.
 
     References
     ----------
@@ -379,7 +379,7 @@ class _FreeInterface(ReductionMethod):
 
     boundary: Iterable[str] = field(metadata=checked(labels_given, name="boundary DOFs"))
     modes: int = field(metadata=checked(whole))
-    #: whether the residual flexibility has no inertia, and what it is called
+    #: whether the residual flexibility has no inertia, and its name
     _massless: ClassVar[bool]
     _kind: ClassVar[str]
 
@@ -464,7 +464,7 @@ class Rubin(_FreeInterface):
     modes : int
         Number of free modes, rigid-body modes included.
     damping : ModalDamping or Rayleigh, optional
-        Of modes and attachment vectors; None: ``T^T D T``.
+        Damping of modes and attachment vectors; None: ``T^T D T``.
 
     References
     ----------

@@ -36,7 +36,7 @@ class SelectionCriterion(Value):
 
     @abstractmethod
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return which rows of the pool (p, k) to take beside the required ones (q, k)."""
+        """Return which rows of the pool (p, k) to take in addition to the required ones (q, k)."""
 
     @abstractmethod
     def values(self, rows: Rows) -> FloatArray:
@@ -261,7 +261,7 @@ def select_dofs(
     Raises
     ------
     ModelError
-        When `count` is no whole number, or no candidates distinguish them.
+        When `count` is not a whole number, or no candidates distinguish them.
 
     Examples
     --------

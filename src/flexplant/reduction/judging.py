@@ -1,4 +1,4 @@
-"""A reduced model beside the full one: modes, responses and static compliance compared."""
+"""A reduced model compared with the full one: modes, responses and static compliance compared."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ def _mode_comparison(
     }
 
 
-#: points over the band, beside resonances and antiresonances
+#: points over the band, in addition to resonances and antiresonances
 _GRID = 200
 #: direct solutions that check the responses of a small and of a large structure
 _CHECKS, _SMALL = (6, 3), 2000
@@ -341,7 +341,7 @@ def static_error(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ReductionQuality(Value):
-    """The error of a reduced model beside the full one.
+    """The error of a reduced model relative to the full one.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ class ReductionQuality(Value):
     freq_error : (m,) array
         Relative; 0 for rigid-body modes, NaN without a partner.
     mac : (m,) array
-        Of each full mode with the reduced one: mass-weighted for an FEModel. Of repeated modes,
+        MAC of each full mode with the reduced one: mass-weighted for an FEModel. Of repeated modes,
         whose shapes are any basis of a subspace, the squared cosines of the angles between the two
         subspaces.
     group : (m,) array of int
@@ -375,14 +375,14 @@ class ReductionQuality(Value):
         where one has an antiresonance that the other does not have. NaN without one. Of silent
         channels relative to what `silent` names.
     static_error : (p, q) array
-        Of the elastic static compliance, relative to its size sqrt(G_ii G_jj); where this is
+        Error of the elastic static compliance, relative to its size sqrt(G_ii G_jj); where this is
         rounding, relative to the responses of both places at the upper end of the band.
     true_error : float [m/N]
         Largest singular value of the error at the check frequencies.
     orthogonality : float
         Departure of the expanded reduced modes from M-orthonormality; NaN against Modes.
     condition : float
-        Of what the method inverted.
+        Condition of the matrix that the method inverted.
     inputs, outputs : sequence of str
     route : str
         How the full responses were found.
@@ -447,7 +447,7 @@ class ReductionQuality(Value):
     def holds(self) -> bool:
         """Whether the true error at the check frequencies is within the bound, if there is one.
 
-        A bound that does not cover all modes that were compared with is none (`bounded`).
+        A bound that does not cover all modes that were compared does not count (`bounded`).
         """
         limit = self.band_bound if self.bounded else None
         return limit is None or self.true_error <= limit * (1 + SAME)

@@ -46,7 +46,7 @@ class Krylov(ReductionMethod):
     moments : int
         At each frequency.
     damping : ModalDamping or Rayleigh, optional
-        Of the reduced model's own modes, beside a basis of the undamped structure; None: the
+        Damping of the reduced model's own modes, with a basis of the undamped structure; None: the
         model's D, in the basis too.
 
     References

@@ -202,7 +202,7 @@ def projected_model(
     )
 
 
-#: part of the largest pivot above which a row of phi determines a mode of its own
+#: fraction of the largest pivot above which a row of phi determines another mode
 _TELLS = 1e-3
 _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
 

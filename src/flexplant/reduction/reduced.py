@@ -71,14 +71,14 @@ class ReducedModel(Value):
         kept ones. They stay as they were solved when M, D or K change (an update): the modes of
         the changed full structure are then nearer.
     n_vectors : int
-        How many shapes are attachment vectors: as many of the model's modes are none of the
-        structure's, but hold the compliance of those left out.
+        Number of shapes that are attachment vectors: the same number of the model's modes are not
+        modes of the structure, but hold the compliance of those left out.
     static_at : sequence of str
         Places whose static compliance it holds in full.
     joint_motions : (k, m) array, optional
-        Of a joined machine: motions of its components as rigid bodies that its rigid joints allow.
+        Motions of the components of a joined machine that its rigid joints allow.
     joining : Value, optional
-        Of a joined machine: how it was joined, with the checks that were made; not after an update.
+        How a joined machine was joined, with the checks that were made; not after an update.
     calibration : MeasuredModes, optional
         The measured poles that `calibrated` put in.
     machines : Machines, optional
@@ -387,7 +387,7 @@ class ReducedModel(Value):
         Raises
         ------
         ModelError
-            When `full` is of another kind or another size, or the band is none.
+            When `full` is of another kind or another size, or the band is not one.
         """
         refuse_unstable(self, "a comparison of responses")
         with Progress(0, "quality"):

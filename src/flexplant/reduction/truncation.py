@@ -165,7 +165,7 @@ class ModalBalanced(ReductionMethod):
     that were solved (`ErrorBound.covers`: with `among`, or from `Modes`, not all); over a band
     `ErrorBound.below(freq)` is tighter. Twice the
     sum of neglected Hankel values [Glover1984]_ bounds the truncation of the exactly balanced
-    model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
+    model (`flexplant.balanced`), which is not of second order; `rank_modes(...).exact` has them.
 
     References
     ----------
@@ -270,7 +270,7 @@ def _with_static(kept: Modes, gone: Modes, static: Any) -> Modes:
 
 
 def _vectors_as_modes(kept: Modes) -> Modes:
-    """Return attachment vectors as modes of their own."""
+    """Return attachment vectors as separate modes."""
     return Modes(kept.vector_omega, kept.vector_zeta, kept.vectors, kept.dofs)
 
 
