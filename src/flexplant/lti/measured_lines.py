@@ -198,7 +198,8 @@ _ASIDE = 0.25
 #: error of fits, relative to the difference of two of them; the part of an interval up to
 #: which that is a mode found; and the part of its shift within which they have to agree on that
 _SAFETY, _FOUND, _ALIKE = 2.0, 0.3, 0.5
-#: half-power width, relative to the distance of two lines, of a mode that the lines show: some of them lie on its circle, so that the steps from line to line follow it
+#: half-power width, relative to the distance of two lines, of a mode that the lines show: some of
+#: them lie on its circle, so that the steps from line to line follow it
 _SHOWN = 4.0
 #: phase step of det(I - L) between two lines above which its path is not known
 _STEP = 0.6 * np.pi
