@@ -117,4 +117,4 @@ def interval_line(loop: Any) -> str:
                 else interval_text(one.low, one.high, "Hz" if figure == BANDWIDTH else "")
             )
             parts.append(f"{figure} {ends}")
-    return f"on {100 * LEVEL:.3g} % of such machines: " + ", ".join(parts)
+    return f"on {100 * LEVEL:.3g} % of such machines:\n    " + ", ".join(parts)
