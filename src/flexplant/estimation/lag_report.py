@@ -1,6 +1,6 @@
-"""How a lag reduces the predicted error at the POIs, beside the static geometric relation.
+"""How a lag reduces the predicted error at the POIs, and the error of the static relation.
 
-That takes the POI from the sensors as if the structure were rigid.
+The static relation takes the POI from the sensors as if the machine stood at rest.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ class StaticEstimator(Value):
         What the disturbances bend, the modes left out among it where they are known, and the
         sensor noise; free motions have no error. `channel` and
         `on`, a plant, are as for `KalmanEstimator.rms`; `on` None is its own with the modes left
-        out. AssumptionError besides when the plant is continuous (a sample of white sensor noise
+        out. AssumptionError also when the plant is continuous (a sample of white sensor noise
         has no variance then), SolverError when an elastic mode is not damped.
         """
         row = row_of(poi_channels(self.plant), channel)

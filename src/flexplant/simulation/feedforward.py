@@ -20,7 +20,7 @@ from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
 from ..plant.rest_expansion import OfS, at_rest, solved
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from ..words import instance, name_list
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
@@ -36,8 +36,6 @@ _FASTEST = 0.4
 _STEPS = 2000
 #: relative: errors that feedforward leaves and that are worth a warning
 _LEFT = 0.2
-#: relative: combinations of gains that change the errors less are left out
-_RESOLVED = 1e-8
 #: what a set-point gives, by the order of the derivative
 TERMS = ("position", *DERIVATIVES)
 
@@ -140,7 +138,7 @@ def design_feedforward(
     negative, the compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
     are their stiffness and damping. The coefficients are Cauchy's integrals on a circle around
     rest, the largest on which two radii agree and within which the expansion is the inverse itself:
-    a zero of P (a mass on a spring beside the POI) is left outside. All axes that the actuators
+    a zero of P (a mass on a spring near the POI) is left outside. All axes that the actuators
     move apart (`flexplant.plant.driven_axes`, next to rest) are taken together: the forces that
     keep the axes without a reference at rest are in it.
 
@@ -165,8 +163,8 @@ def design_feedforward(
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
     elements : mapping {name: element, or a list of some}, optional
-        Of actuators and sensors, as for `simulate`: a `Saturation` that the move exceeds is warned
-        of, with what the move needs. The gains do not depend on it.
+        Elements of actuators and sensors, as for `simulate`: a warning says which `Saturation` the
+        move exceeds, and what it needs. The gains do not depend on it.
 
     Returns
     -------
@@ -242,7 +240,7 @@ def known_forces(plant: StandardPlant) -> StateSpace:
     Raises
     ------
     ModelError
-        When it is no plant.
+        When another value is given.
 
     Examples
     --------
@@ -368,7 +366,7 @@ def _least(
         matrix = effects.reshape(error.size, -1)
         rows, given = (np.concatenate([x.real, x.imag]) for x in (matrix, error.ravel()))
         unit = divisor(np.linalg.norm(rows, axis=0))
-        gains = np.linalg.lstsq(rows / unit, -given, rcond=_RESOLVED)[0]
+        gains = np.linalg.lstsq(rows / unit, -given, rcond=SAME)[0]
         left = float(np.linalg.norm(given + rows / unit @ gains) / divisor(np.linalg.norm(given)))
         if left > _LEFT:
             warn(

@@ -13,14 +13,12 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
 from ..seeds import MOST_DRAWS
 from ..store import Value
+from ..tolerances import SAME
 from ..words import function, instance, with_unit
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPointProfile
 from .response import Response
 from .sampled_runs import simulate
-
-#: condition of the basis (columns scaled to one) beyond which directions are left as they are
-_RESOLVED = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,20 +68,20 @@ def learn_feedforward(
     Parameters
     ----------
     start : Feedforward
-        Of the first move.
+        Feedforward of the first move.
     trial : function
         Makes the move with a Feedforward on the machine and returns what was recorded.
     loop : ClosedLoop
         The same controller (without feedforward) on a model of the machine, for Phi.
     move : SetPointProfile
     duration : float [s]
-        Of each run.
+        Duration of each run.
     terms : sequence of str
         Derivatives that are tuned.
     trials : int
         Moves.
     step : float
-        Part of each correction that is made: 1 unless noise is large beside what repeats.
+        Part of each correction that is made: 1 unless the noise is larger than what repeats.
 
     Returns
     -------
@@ -126,7 +124,7 @@ def learn_feedforward(
     effects = _gain_effects(start, loop, move, duration, orders, channels)
     unit = np.linalg.norm(effects, axis=1)
     used = unit > 0
-    pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=_RESOLVED)
+    pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=SAME)
     function(trial, "trial", "It takes a Feedforward and returns a Response.")
     current, errors, gains = start, [], []
     for _ in range(whole(trials, "trials", maximum=MOST_DRAWS)):

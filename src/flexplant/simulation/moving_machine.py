@@ -25,12 +25,10 @@ from ..plant.scheduling import Position
 from ..tolerances import SAME
 from .motion import SetPointProfile
 from .nonlinear_elements import Acting
-from .runs import NO_NOISE
+from .runs import ABREAST, NO_NOISE, STRETCH
 
 #: nodes of Gauss's rule in a sample, beyond one for each radian of the fastest mode
 _NODES = 12
-#: samples of a stretch, and runs side by side
-_STRETCH, _ABREAST = 128, 16
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ class Sample(NamedTuple):
 class MovingPlant:
     """A sampled plant along a trajectory of positions."""
 
-    stretch = _STRETCH
+    stretch = STRETCH
 
     def __init__(self, plant: StandardPlant, path: Trajectory, *, noise: bool = True) -> None:
         self.plant, self.path, self.first = plant, path, 0
@@ -223,7 +221,7 @@ class MovingPlant:
 class MovingMachine(MovingPlant):
     """Runs of a closed loop along a trajectory of positions, sample by sample."""
 
-    abreast = _ABREAST
+    abreast = ABREAST
 
     def __init__(
         self,

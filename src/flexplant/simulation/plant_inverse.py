@@ -49,7 +49,7 @@ def inverse_forces(
     move : SetPointProfile
         With a rest before it that is long enough for the preview; a warning says when it is not.
     duration : float [s]
-        Of the run.
+        Duration of the run.
     bandwidth : float [Hz]
         Up to which the plant is inverted.
     reference : str, optional
@@ -67,7 +67,8 @@ def inverse_forces(
     CertificateError
         When responses by the plant's matrices give other forces, at five of the frequencies.
     ModelError
-        When the plant is continuous or held, `move` is no SetPoint, or a number is not positive.
+        When the plant is continuous or held, `move` is not a set-point profile, or a number is not
+        positive.
 
     Warns
     -----
@@ -177,7 +178,7 @@ def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPointProfile, name: 
     direct = np.linalg.inv(law.D[np.ix_(rows, f_at)])
     known = np.zeros_like(force)
     for k, y in enumerate(read):
-        # the force beside the controller's own that makes the sum what is wanted
+        # the force in addition to the controller's own that makes the sum what is wanted
         known[k] = direct @ (force[k] - law.C[rows] @ x - law.D[np.ix_(rows, y_at)] @ y)
         x = law.A @ x + law.B[:, y_at] @ y + law.B[:, f_at] @ known[k]
     return force - known
