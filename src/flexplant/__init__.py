@@ -133,6 +133,7 @@ lower bound too, by a perturbation that reaches it.
 | ``study(timeout=)`` | gone; ``study(key=)`` names the study of a checkpoint |
 | ``weighted``, ``through`` give a StandardPlant | a `plant.GeneralizedPlant` |
 | ``plant.is_weighted`` | ``isinstance(plant, GeneralizedPlant)`` |
+| ``plant.is_assembled`` | ``plant.model is not None``; ``plant.ports`` of any plant |
 | ``plant.unweighted`` of any plant | of a GeneralizedPlant; ``plant.machine`` of any |
 | ``plant.uncertain(fit, modes=, deviations=)`` | ``plant.uncertain(Fit(fit, modes=))`` |
 | ``plant.uncertain(gain=, delay=)`` | ``plant.uncertain(Gains(...), Delay(...))`` |
