@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, ModelError, warn
 from ..tolerances import SAME, TINY, divisor
 from ..words import check_names
-from .blocks_of_states import block_eigenvalues, diagonal_blocks, uncoupled_run
+from .blocks_of_states import block_diagonal, block_eigenvalues, diagonal_blocks, uncoupled_run
 from .equations import state_scale
 from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace
@@ -84,7 +84,12 @@ def held_exactly(
     some = range(len(g.inputs)) if delayed is None else g.input_index(delayed)
     names = [g.inputs[i] for i in some]
     check_names(names, "inputs that are delayed")
-    return sample_and_hold(g, rate, dict.fromkeys(names, late))[0]
+    pairs = uncoupled_pairs(g.A) if not late and set(g.blocks or ()) == {2} else None
+    if pairs is None:
+        return sample_and_hold(g, rate, dict.fromkeys(names, late))[0]
+    own, integral = pair_exponential(pairs, 1.0 / rate)
+    B = integral @ g.B.reshape(len(pairs), 2, -1)
+    return g.replace(A=block_diagonal(own), B=B.reshape(g.B.shape), dt=1.0 / rate)
 
 
 #: `e^(A t)` and `int_0^t e^(A s) ds B` of a time [s]
