@@ -204,7 +204,7 @@ WRONG = {
         ), "lie 100 % off",
     ),
     "bound of neglected modes": (
-        "plant.uncertainty.neglected_modes._MARGIN", lambda margin: 0.5 * margin,
+        "plant.uncertainty.neglected_dynamics._MARGIN", lambda margin: 0.5 * margin,
         lambda: two_masses().uncertain(Neglected(two_masses(3)), frequency=0.01),
         "times the weights",
     ),
@@ -227,7 +227,7 @@ WRONG = {
         "is not stable.*stays undamped",
     ),
     "inverse of a plant": (
-        "simulation.inverse_forces.responder",
+        "simulation.plant_inverse.responder",
         lambda function: lambda g: larger(1.001)(function(g)),
         lambda: fx.simulation.inverse_forces(
             servo(), fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05),

@@ -438,7 +438,7 @@ def test_the_command_takes_what_its_refusals_ask_for(frf, tmp_path, capsys, monk
         return str(path)
 
     opened = []
-    monkeypatch.setattr(command, "workbench", lambda plants, **_: opened.append(plants) or exit(0))
+    monkeypatch.setattr(command, "open_page", lambda plants, **_: opened.append(plants) or exit(0))
     mixed = written("mixed.uff", (12, 8), "NONE")
     assert command.main([mixed, "--continuous"]) == 1
     said = capsys.readouterr().err
