@@ -20,7 +20,7 @@ from .judgement.goodness import chi_square, covariance, is_bad, resolution, wors
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
-from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
+from .search import Auto, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .update_result import History, UpdateResult
@@ -161,7 +161,7 @@ def update(
     # the paper's problem: eigenvalues alone, nothing known beforehand
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
     if method is None:
-        method = Secured() if plain and not bounded else TrustRegion()
+        method = Auto() if plain and not bounded else TrustRegion()
     if bounded and not method.keeps_bounds:
         raise ModelError(
             f"{type(method).__name__} takes no bounds: use updating.TrustRegion(), or drop bounds=."

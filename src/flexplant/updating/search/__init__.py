@@ -1,7 +1,7 @@
 """Searches: the parameters that make an objective least, each method a value with `.search`."""
 
+from .least_squares import Auto as Auto
 from .least_squares import GaussNewton as GaussNewton
-from .least_squares import Secured as Secured
 from .least_squares import TrustRegion as TrustRegion
 from .objective import Objective as Objective
 from .objective import SearchEnd as SearchEnd

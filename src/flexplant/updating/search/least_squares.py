@@ -380,7 +380,7 @@ class Quick(GaussNewton):
 
 
 @dataclass(frozen=True, eq=False)
-class Secured(UpdateMethod):
+class Auto(UpdateMethod):
     """The paper's (13) and (14); from a start where they lead nowhere, a trust region.
 
     Its end is settled by the paper's steps, which say so where their S is singular.
