@@ -32,8 +32,8 @@ class Decoupling(Value):
     to_actuators : StateSpace
         T: commands `die:z:command` of the axes [m/s^2, rad/s^2] to actuators.
     to_motions : StateSpace
-        T_y: sensors to motions of the axes `die:z` [m, rad], least squares; the identity on axes
-        that are sensors themselves.
+        T_y: sensors to motions of the axes `die:z` [m, rad], least squares weighted by the noise of
+        the sensors; the identity on axes that are sensors themselves.
 
     Examples
     --------
@@ -145,9 +145,9 @@ def motions_of(plant: Partition, driven: DrivenAxes, sensors: Sequence[str]) -> 
             f"{some_names(list(driven.channels))} apart. Add or move some, or choose fewer axes, "
             "axes=[...]."
         )
-    # of several units each sensor counts by what it shows
-    alike = len({plant.units.get(name) for name in sensors}) == 1
-    size = np.ones(len(sensors)) if alike else 1.0 / divisor(np.linalg.norm(Y, axis=1))
+    # each sensor counts by its noise; by what it shows where one has no noise
+    noise = np.array([plant.assembled.ports.sensor(name).asd for name in sensors])
+    size = 1.0 / (noise if np.all(noise > 0.0) else divisor(np.linalg.norm(Y, axis=1)))
     return np.asarray(np.linalg.pinv(size[:, None] * Y) * size)
 
 

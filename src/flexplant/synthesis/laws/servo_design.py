@@ -19,7 +19,7 @@ from ...loop.other_machines import growing_modes, modes_in_words
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
-from ...plant.axes import driven_axes
+from ...plant.axes import driven_axes, elastic
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
@@ -27,6 +27,7 @@ from .law import Axes, axes_controller, connected
 from .servo_loops import (
     POWERS,
     TARGET,
+    WIDE,
     Axis,
     Reading,
     ServoLaw,
@@ -39,6 +40,7 @@ from .servo_loops import (
     reading_of,
     seeing,
     servo_loop,
+    widened,
 )
 
 
@@ -255,8 +257,12 @@ def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
 #: bandwidths that `ServoTask.largest` tries, from 0.19 of the rate down to a part of it below
 #: which loops lose digits, before it halves intervals
 _TRIALS, _SLOWEST = 80, 2e-4
-#: roll-off beside the bandwidth: on a spring the integrator leaves more phase for it
-_ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
+#: roll-off relative to the bandwidth: on a spring the integrator leaves more phase for it
+_ROLLOFF = {"mass": 8.0, WIDE: 16.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
+#: corner of the integral action relative to the bandwidth; below the zero of a wide lead
+_INTEGRATOR = {WIDE: 0.02}
+#: wide leads are tried where a mode lies above the bandwidth within this factor
+_NEAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -297,25 +303,28 @@ class ServoTask:
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
         gains = np.abs(gains_at(self.plant, driven))
-        tried = [
-            ServoLaw(
-                driven,
-                tuple(
-                    self.axis(line, float(f), float(gain))
-                    for line, f, gain in zip(lines, driven.freq, gains, strict=True)
-                ),
-            )
-            for lines in combinations(lines_of(self.plant, driven))
-        ]
-        if len(tried) == 1:
-            return tried[0]
-        return min(tried, key=lambda one: (not self.closed(one).is_stable, self.loop.peak(one)[0]))
+        def of(lines: tuple[str, ...]) -> ServoLaw:
+            each = zip(lines, driven.freq, gains, strict=True)
+            return ServoLaw(driven, tuple(self.axis(n, float(f), float(g)) for n, f, g in each))
+
+        tried = [of(lines) for lines in combinations(lines_of(self.plant, driven))]
+        best = tried[0] if len(tried) == 1 else min(tried, key=self._badness)
+        wide = of(widened([axis.line for axis in best.axes]))
+        modes, lowest = elastic(self.plant), float(driven.freq.min())
+        if wide == best or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
+            return best
+        return min((best, wide), key=lambda one: self._badness(self.notched(one)))
+
+    def _badness(self, law: ServoLaw) -> tuple[bool, float]:
+        """Return whether the loop of a law is unstable, and the peak of |S| at u."""
+        return not self.closed(law).is_stable, self.loop.peak(law)[0]
 
     def axis(self, line: str, bandwidth: float, gain: float) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""
         usual = min(_ROLLOFF[line] * bandwidth, 0.4 * self.rate)
         rolloff = usual if self.rolloff is None else self.rolloff
-        slow = 0.1 * bandwidth if self.integrator is None else self.integrator
+        own = _INTEGRATOR.get(line, 0.1) * bandwidth
+        slow = own if self.integrator is None else self.integrator
         for name, freq in (("rolloff", rolloff), ("integrator", slow)):
             below_half_rate(freq, name, self.rate)
         notches = self.notches or ()

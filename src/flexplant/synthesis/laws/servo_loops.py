@@ -21,18 +21,24 @@ from ...plant.axes import DrivenAxes, complex_gain, elastic, real_gain
 from .controller_elements import Integrator, LowPass, Notch, Pid
 from .law import Law
 
+#: a mass line whose lead is wide: where a mode lies just above the bandwidth, its notch takes phase
+WIDE = "mass, wide lead"
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of a free mass then
-#: peaks near 4 dB with the roll-off and integrator of `design_servo`
-_LEAD = 4.0
+#: peaks near 4 dB with the roll-off and integrator of `design_servo`. Random searches over PID,
+#: roll-off and notches for the largest frequency with |S| < 1 end at wide leads: 16 served a ball
+#: screw and a flexible joint
+_LEAD = {"mass": 4.0, WIDE: 16.0}
 
 
+#: highest corner of a law, as a fraction of the rate
+_HIGHEST = 0.4
 #: gain at a notch's centre, and damping ratio of its poles
 _DEPTH, _WIDTH = 0.05, 0.3
 
 
 #: lines on which an axis may lie, by the power of 1 / s of its response: a mass that is free (or
 #: above its springs), a damper, a spring (or a mass below its springs' frequency)
-POWERS = {"mass": 2.0, "damper": 1.0, "spring": 0.0}
+POWERS = {"mass": 2.0, WIDE: 2.0, "damper": 1.0, "spring": 0.0}
 
 
 #: a line is tried when slope and phase of the response are at most this much further from it than
@@ -49,7 +55,8 @@ _STEP, _BELOW, _VANISHED = 1.05, 1e-3, 1e-2
 class Axis:
     """The law of an axis, sampled by Tustin's rule, with which its loop crosses 1 at the bandwidth.
 
-    On a mass line ``(1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)``, on that of a damper
+    On a mass line ``(1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` with r = 4, or 16
+    where the lead is wide, on that of a damper
     ``(1 + w_i / s) F(s)``, of a spring ``F(s) / s``, of a response that vanishes at rest ``F(s)``;
     F is a second-order low-pass and the notches.
     """
@@ -74,8 +81,9 @@ class Axis:
 
     @property
     def _action(self) -> tuple[Pid | Integrator, ...]:
-        if self.line == "mass":
-            zero, pole = self.bandwidth / _LEAD, self.bandwidth * _LEAD
+        if self.line in _LEAD:
+            lead = _LEAD[self.line]
+            zero, pole = self.bandwidth / lead, min(self.bandwidth * lead, _HIGHEST * self.rate)
             return (Pid.corners(1.0, integrator=self.integrator, zero=zero, pole=pole),)
         if self.line == "damper":
             return (Integrator(self.integrator),)
@@ -116,6 +124,7 @@ def _likely(slope: float, phase: float) -> tuple[str, ...]:
     off = {
         line: abs(slope - power) + abs(turned / (0.5 * np.pi) + power)
         for line, power in POWERS.items()
+        if line != WIDE
     }
     nearest = min(off.values())
     order = sorted(off, key=off.__getitem__)
@@ -132,6 +141,11 @@ def combinations(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     tried = [tuple(one[min(k, len(one) - 1)] for one in lines) for k in range(count)]
     tried.append(tuple("speed" if one == ("speed",) else "mass" for one in lines))
     return list(dict.fromkeys(tried))
+
+
+def widened(lines: Sequence[str]) -> tuple[str, ...]:
+    """Return lines with wide leads on the mass lines."""
+    return tuple(WIDE if line == "mass" else line for line in lines)
 
 
 #: |S| at u that a notch is to bring the loop below: 6 dB
@@ -203,9 +217,11 @@ class ServoLoop:
         return np.asarray(near * np.linalg.norm(T @ through, axis=(1, 2))[:, None])
 
     def resonant(self, law: ServoLaw) -> FloatArray:
-        """Return the modes [Hz] whose resonances have loop gain, the largest first."""
+        """Return the modes [Hz] above the bandwidth with loop gain, the largest first."""
         gain = np.abs(law.at(self.freq)).max(axis=1)
         peaks = np.max(gain[:, None] * self._near(law.driven.T), axis=0, initial=0.0)
+        # below the bandwidths a notch would take the gain that suppresses the error
+        peaks[self.modes < law.driven.freq.min()] = 0.0
         order = np.argsort(-peaks, kind="stable")
         return np.asarray(self.modes[order][peaks[order] > _QUIET])
 
