@@ -303,6 +303,7 @@ class ServoTask:
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
         gains = np.abs(gains_at(self.plant, driven))
+
         def of(lines: tuple[str, ...]) -> ServoLaw:
             each = zip(lines, driven.freq, gains, strict=True)
             return ServoLaw(driven, tuple(self.axis(n, float(f), float(g)) for n, f, g in each))
