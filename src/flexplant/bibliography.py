@@ -15,6 +15,7 @@
 .. [AndersonMoore1979] Anderson, Moore, Optimal Filtering, Prentice Hall, 1979.
 .. [ApkarianNoll2006] Apkarian, Noll, Nonsmooth H-infinity synthesis, IEEE Trans. Autom. Control 51,
    2006.
+.. [AstromMurray2008] Astrom, Murray, Feedback Systems, Princeton University Press, 2008.
 .. [AstromWittenmark1997] Astrom, Wittenmark, Computer-Controlled Systems, 3rd ed., Prentice Hall,
    1997.
 .. [BaiSu2005] Bai, Su, Dimension reduction of large-scale second-order dynamical systems via a

@@ -145,6 +145,7 @@ def made():
     more = a_system()
     yield from (lti.balanced(more, order=2), lti.modal_form(more), lti.norm_report(more))
     yield fx.simulation.input_shaper(10.0)
+    yield fx.synthesis.tune_pid(fx.lti.tf([1.0], [1.0, 1.0]), bandwidth=1.0)
     yield fx.synthesis.margins(fx.lti.tf([1.0], [1.0, 1.0, 0.0]))
     yield from (lti.step(fx.lti.tf([1.0], [1.0, 1.0])), lti.step_info(fx.lti.tf([1.0], [1.0, 1.0])))
     yield from (

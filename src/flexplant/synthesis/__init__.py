@@ -30,7 +30,8 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 | ``hinfsyn``, ``h2syn`` | `design_hinf`, `design_h2` |
 | ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
 | ``ncfsyn``, ``ncfmargin`` | `design_ncf`, `ncf_margin` |
-| ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
+| ``hinfstruct``, ``systune`` | `design_structured`, `tune_loops` |
+| ``pidtune`` | `tune_pid`; of a machine `design_servo` |
 | ``allmargin``, ``diskmargin`` | `margins` |
 | ``mussv``, ``robstab`` | `mu`, `robust_stability` |
 | ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
@@ -62,6 +63,8 @@ from .laws.hand_design import ShapedAxis as ShapedAxis
 from .laws.law import Law as Law
 from .laws.loop_design import DesignedLoops as DesignedLoops
 from .laws.loop_design import design_loops as design_loops
+from .laws.pid_tuning import PidTuning as PidTuning
+from .laws.pid_tuning import tune_pid as tune_pid
 from .laws.servo_design import design_servo as design_servo
 from .laws.servo_design import servo_bandwidth as servo_bandwidth
 from .laws.tune import tune_loops as tune_loops
