@@ -210,7 +210,7 @@ class _Choice(NamedTuple):
     def law(self, dt: float, freq: float) -> StateSpace:
         """Return the controller of gain 1, sampled with the response at a frequency kept."""
         w_i, w_d, w_f = (2.0 * np.pi * one for one in self)
-        num, den = [1.0, w_i], [1.0, 0.0]
+        num, den = np.array([1.0, w_i]), np.array([1.0, 0.0])
         if w_f > w_d:
             num, den = np.polymul(num, [1.0 / w_d, 1.0]), np.polymul(den, [1.0 / w_f, 1.0])
         law = tf(num, den)
