@@ -26,7 +26,7 @@ from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
-from ..tolerances import ROUNDING, TINY
+from ..tolerances import ROUNDING, SPLIT, TINY
 from ..words import inner_names
 from .scaling import (
     POINT,
@@ -210,8 +210,8 @@ def _none_zero(sizes: FloatArray) -> FloatArray:
     return np.asarray(np.where(sizes > 0.0, sizes, np.max(sizes, initial=0.0) or 1.0))
 
 
-#: relative: poles so small are zero, real parts above this are not stable
-_ZERO, _STABLE = 1e-6, -1e-10
+#: relative to the size of A: poles with real parts above this are not stable
+_STABLE = -1e-10
 #: |z| of poles that are delays; e-folds of a mode during them that leave nothing to be gained
 _NILPOTENT, _TOO_LONG = 0.5, 15.0
 
@@ -267,7 +267,7 @@ def require_reach(problem: Prepared) -> None:
     poles = np.linalg.eigvals(A)
     size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, TINY)
     # the poles of a chain of integrators come out of rounding as a ring around zero
-    poles = np.where(np.abs(poles) < _ZERO * size, 0.0, poles)
+    poles = np.where(np.abs(poles) < SPLIT * size, 0.0, poles)
     for pole in poles[poles.real > _STABLE * size]:
         for matrix, gain, text in (
             (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
@@ -287,7 +287,7 @@ def require_reach(problem: Prepared) -> None:
 def beyond_rounding(problem: Prepared) -> str:
     """Return why no controller stabilises a problem in rounding, and what to do, in words."""
     poles = np.linalg.eigvals(problem.A)
-    unstable = poles[poles.real > _ZERO * float(np.linalg.norm(problem.A, 2))]
+    unstable = poles[poles.real > SPLIT * float(np.linalg.norm(problem.A, 2))]
     if not unstable.size:
         return (
             "the plant is too badly conditioned. Weight z and w so that their sizes are alike "
@@ -306,7 +306,7 @@ def beyond_rounding(problem: Prepared) -> str:
 
 def _delay_effect(problem: Prepared, growth: float) -> str:
     """Return what a delay does to a mode of that growth, in words; empty where it does little."""
-    if not problem.dt or problem.direct or growth <= _ZERO:
+    if not problem.dt or problem.direct or growth <= SPLIT:
         return ""
     half = 0.5 * problem.dt * problem.speed
     # delays are poles at z = 0; a chain of n of them comes out of rounding on a circle eps^(1/n)
@@ -324,8 +324,8 @@ def _delay_effect(problem: Prepared, growth: float) -> str:
 
 
 def _pole_in_words(problem: Prepared, pole: complex) -> str:
-    if abs(pole.imag) > _ZERO and abs(pole.imag) > pole.real:
+    if abs(pole.imag) > SPLIT and abs(pole.imag) > pole.real:
         return f"at {problem.frequency(abs(pole.imag)):.3g} Hz"
-    if pole.real > _ZERO:
+    if pole.real > SPLIT:
         return f"it grows e-fold in {1.0 / (problem.speed * pole.real):.3g} s"
     return "at 0 Hz: rigid-body or integrating"

@@ -11,13 +11,10 @@ from ..lti.equations import bordered_scale, state_scale
 from ..lti.modal_map import eigenvalues_with_error
 from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace
-from ..tolerances import TINY, divisor
+from ..tolerances import SAME, TINY, divisor
 
 #: point at which answers are taken, in the unit of the loop's speed: away from resonances
 POINT = complex(np.exp(0.25j * np.pi))
-#: relative singular value of D12 or D21, its columns of unit size, that counts as zero; so does a
-#: column that is smaller than the answer at the last corner
-_RANK = 1e-9
 #: fraction of its terms that an answer has at least: what they cancel to may be rounding
 _HIDDEN = 1e-3
 #: effort or noise that is smaller, relative to the plant's own answer at the loop's speed, is not
@@ -34,7 +31,7 @@ THIRD = float(np.tan(np.pi / 3.0))
 _POINTS, _START, _FALL = 8, 0.09, 2.0
 #: change of slope [factor a decade] that makes a corner of an answer. Efforts of 1e-3 to 1e-8 of
 #: the answers come within 1 % in 40 of 40 trials where the loop's speed is at most the last corner,
-#: in 38 with three times as much
+#: in 39 with twice as much
 _CORNER = 1.5
 
 
@@ -112,7 +109,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     lowest = np.min(sliding_window_view(ahead, _POINTS, axis=1), axis=2)
     settled = (lowest >= sizes_of[:, :-1] - np.log(_FALL)) & ~falls
     settled &= np.logical_or.accumulate(falls, axis=1)
-    settled &= lowest > sizes_of[:, [last]] + np.log(_RANK)
+    settled &= lowest > sizes_of[:, [last]] + np.log(SAME)
     found = [omega[np.argmax(one)] for one in settled if one.any()]
     if not found:
         return float(np.exp(np.mean(np.log(sizes))))
@@ -137,7 +134,7 @@ def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray
     left, values, right = la.svd(np.where(felt, D, 0.0) / columns, full_matrices=True)
     sizes = np.zeros(m)
     sizes[: values.size] = values
-    rank = int(np.count_nonzero(sizes > _RANK))
+    rank = int(np.count_nonzero(sizes > SAME))
     # columns of Z: what D does not reach first, then what it does
     Z = np.hstack([left[:, rank:], left[:, :rank]])
     S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))

@@ -18,7 +18,7 @@ from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...store import Value, checked
-from ...tolerances import ROUNDING
+from ...tolerances import ROUNDING, SETTLED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import are_coupled, both_sides, parrott
@@ -33,13 +33,12 @@ _REGULAR, _ADDED, _SINGULAR = 0.008, 0.003, 0.05
 _QUICK = 0.005
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
-#: a norm beside that of the least quadratic cost at which nothing is left to gain
-_NOTHING = 1e-9
-#: sensitivity at infinite frequency that is taken for zero; below which a central controller is
-#: taken for one of infinite gain
-_ILL_POSED, _INFINITE = 1e-6, 1e-3
-#: relative: by how much rounding may put a gain above its gamma; what is nothing but rounding
-_SLACK, _ROUNDING = 1e-6, 1e-14
+#: sensitivity at infinite frequency below which a central controller is taken for one of infinite
+#: gain
+_INFINITE = 1e-3
+#: relative: by how much rounding may put a gain above its gamma; a sensitivity at infinite
+#: frequency that is taken for zero
+_SLACK = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Riccati(Value):
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. Unless given 0.8 % where D12 and D21 have
+        Relative distance from the smallest gamma found. Unless given at most 0.8 % where D12 and D21 have
         full rank (0.3 % with what is added for a missed mode or to a tiny effort or noise), and
         5 % where they have not.
     tolerance : float
@@ -132,12 +131,15 @@ class Riccati(Value):
                 "no controller of least quadratic cost stabilises in rounding: "
                 + beyond_rounding(problem)
             )
-        if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
+        if unit <= ROUNDING * _open_size(problem):  # w reaches nothing in z
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
         scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
         with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
             high, low = self._searched(scaled, bar)
-            K, norm = self._accepted(scaled, high, back_off, norm_of)
+            # what the bisection leaves open is a part of it, up to a half
+            spent = min(high / low - 1.0, 0.5 * min(back_off, _REGULAR)) if low else 0.0
+            step = back_off - spent if self.back_off is None else self.back_off
+            K, norm = self._accepted(scaled, high, step, norm_of)
         if K is None:  # nothing below it holds
             K = least.replace(C=least.C / unit)
             norm = norm_of(scaled, K)
@@ -152,7 +154,7 @@ class Riccati(Value):
         high = 1.0
         low = tried = min(high, max(one.direct for one in both_sides(problem)))
         for _ in range(_BISECTION):
-            if high <= tried * (1.0 + self.tolerance) or high < _NOTHING:
+            if high <= tried * (1.0 + self.tolerance) or high < SETTLED:
                 break
             middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
             K, refuted = _attempt(problem, middle)
@@ -170,11 +172,10 @@ class Riccati(Value):
         self,
         problem: Prepared,
         high: float,
-        back_off: float,
+        step: float,
         norm_of: Callable[[Prepared, StateSpace], float],
     ) -> tuple[StateSpace | None, float]:
         """Return the backed-off controller with the norm of its loop, going up until it holds."""
-        step = back_off if self.back_off is None else self.back_off
         for _ in range(_GROWTH):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller
@@ -202,7 +203,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
 def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:
     """Raise InfeasibleError when putting D22 back takes infinite gain at infinite frequency."""
     loop = np.eye(len(problem.y)) + problem.D22 @ controller.D
-    if la.svdvals(loop)[-1] < _ILL_POSED:
+    if la.svdvals(loop)[-1] < _SLACK:
         where = "at half the rate" if problem.dt else "at infinite frequency"
         raise InfeasibleError(
             f"there is no smallest gamma: {gamma:.3g} is reached, by infinite gain {where}, where "

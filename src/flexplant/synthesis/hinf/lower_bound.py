@@ -15,17 +15,13 @@ from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
-from ...tolerances import divisor
+from ...tolerances import SAME, SPLIT, divisor
 from ..preparation import Prepared
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
-#: singular values of a pencil, its rows and columns of unit size, that are zero (`axis_zeros`)
-_LOST = 1e-9
-#: relative: a pole so close to the axis is taken for undamped, no point lies so close to it
-_UNDAMPED = 1e-6
 
 
 def raised_bound(problem: Prepared, gamma: float, known: float, close: float = _CLOSE) -> float:
@@ -47,9 +43,9 @@ def pointwise_bound(problem: Prepared) -> float:
     system = problem.system
     poles = system.poles()
     grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS)])
-    undamped = poles[np.abs(poles.real) <= _UNDAMPED * np.max(np.abs(poles), initial=1.0)]
+    undamped = poles[np.abs(poles.real) <= SPLIT * np.max(np.abs(poles), initial=1.0)]
     apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))
-    grid = grid[np.all(apart > _UNDAMPED * (1.0 + np.abs(undamped.imag)), axis=1)]
+    grid = grid[np.all(apart > SPLIT * (1.0 + np.abs(undamped.imag)), axis=1)]
 
     def bounds(freq: FloatArray) -> FloatArray:
         return parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
@@ -77,11 +73,11 @@ def _bound_at_zeros(side: FullInformation) -> float:
         pencil = pencil / divisor(np.linalg.norm(pencil, axis=0))
         rows = divisor(np.linalg.norm(pencil, axis=1))
         left, values, _ = np.linalg.svd(pencil / rows[:, None])
-        rank = int(np.count_nonzero(values > _LOST))
+        rank = int(np.count_nonzero(values > SAME))
         null = (left[:, rank:] / rows[:, None]).conj().T
         driven = null @ np.vstack([B1, D11])
         turn, sizes, _ = np.linalg.svd(null[:, n:], full_matrices=False)
-        if 0 < sizes.size == len(null) and sizes[-1] > _LOST * sizes[0]:
+        if 0 < sizes.size == len(null) and sizes[-1] > SAME * sizes[0]:
             found = max(found, float(np.linalg.norm(turn.conj().T @ driven / sizes[:, None], 2)))
     return found
 
@@ -106,17 +102,12 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(M.conj().swapaxes(1, 2), dtype=np.complex128)
 
 
-#: relative: a direction of D12 that is smaller is rounding
-_RANK = 1e-9
-#: relative to the largest eigenvalue of X: a negative one that is its error (the residual is 1e-6);
-#: rounding of the terms of its equation
-_NEGATIVE, _ROUNDED = 1e-5, 1e-14
-#: relative: how much rho(X Y) exceeds gamma^2 where gamma is refuted
-_BEYOND = 1e-5
-#: gamma is tried at these parts of what is reached, until one is refuted; then halving intervals
-_PARTS = (0.999 / 1.05, 0.8, 0.5, 0.2, 0.05, 1e-2, 1e-3)
-#: relative width at which the halving stops
-_WIDTH = 1e-3
+#: relative: errors of X and Y (their residuals are 1e-6), by which eigenvalues of X may be negative
+#: and rho(X Y) may exceed gamma^2; rounding of the terms of their equations
+_INACCURATE, _ROUNDED = 1e-5, 1e-14
+#: gamma is tried just below what a back-off of 5 % leaves, then at squares of that part until one
+#: is refuted; then intervals are halved to a relative width
+_PART, _SQUARES, _WIDTH = 0.951, 8, 1e-3
 
 
 class FullInformation(NamedTuple):
@@ -161,7 +152,7 @@ class FullInformation(NamedTuple):
         if not X.size:
             return False
         values, vectors = la.eigh(X)
-        if values[0] >= -_NEGATIVE * max(values[-1], -values[0]):
+        if values[0] >= -_INACCURATE * max(values[-1], -values[0]):
             return False
         # a residual of the equation moves X by itself over twice the slowest decay
         x = vectors[:, 0]
@@ -178,12 +169,12 @@ class FullInformation(NamedTuple):
             sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
             B2, D12 = B2 / divisor(sizes), D12 / divisor(sizes)
             _, values, turn = la.svd(D12, full_matrices=True)
-            rank = int(np.count_nonzero(values > _RANK))
+            rank = int(np.count_nonzero(values > SAME))
             if rank == D12.shape[1]:
                 break
             free = B2 @ turn[rank:].T
             basis, moved, _ = la.svd(free, full_matrices=True)
-            count = int(np.count_nonzero(moved > _RANK * max(np.max(moved, initial=0.0), 1.0)))
+            count = int(np.count_nonzero(moved > SAME * max(np.max(moved, initial=0.0), 1.0)))
             left, fast = basis[:, count:], basis[:, :count]
             B2 = left.T @ np.hstack([A @ fast, B2 @ turn[:rank].T])
             D12 = np.hstack([C @ fast, D12 @ turn[:rank].T])
@@ -209,7 +200,7 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     sides = [side.regular() for side in both_sides(p)]
     low = max(known, *(one.direct for one in sides))
     high = gamma
-    for part in _PARTS:
+    for part in _PART**2.0 ** np.arange(_SQUARES):
         if part * gamma <= low:
             break
         if _refuted(sides, part * gamma):
@@ -243,4 +234,4 @@ def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
 def are_coupled(X: FloatArray, Y: FloatArray, gamma: float) -> bool:
     """Return whether rho(X Y) is above gamma^2, as far as X and Y are accurate."""
     rho = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
-    return rho > gamma**2 * (1.0 + _BEYOND)
+    return rho > gamma**2 * (1.0 + _INACCURATE)

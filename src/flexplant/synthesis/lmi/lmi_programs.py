@@ -22,7 +22,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
 from ...store import Value, checked
 from ...tolerances import RANK, TINY, divisor
-from ..controller import SolvedController
+from ..controller import AGREEMENT, SolvedController
 from ..hinf.lower_bound import pointwise_bound, raised_bound
 from ..preparation import Prepared
 
@@ -41,16 +41,13 @@ TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 VIOLATION = 1e-6
 #: the same of LMIs that only choose states
 STATES = 1e-5
-#: relative distance from the smallest gamma at which states are chosen for the next program
-AWAY = 0.02
 #: part of the back-off at which states are chosen for the controller's LMIs
 NEARER = 0.4
 #: multiples of the back-off that are tried in turn, while they are at most so large
 LOOSER, LOOSEST = np.array([2.0, 4.0, 8.0]), 0.05
-#: relative distance of the smallest gamma from its lower bound above which neither is trusted
-UNRESOLVED = 0.02
-#: what a closed loop may exceed its target by
-_EXCESS = 1e-3
+#: relative distance from the smallest gamma at which states are chosen for the next program; of the
+#: smallest gamma from its lower bound, above which neither is trusted
+AWAY = 0.02
 #: gamma, relative to the plant's size, that is taken for zero
 _NOTHING = 1e-7
 #: settings of Clarabel, tried in turn: its own; without its scaling of the data; regularised more
@@ -333,7 +330,7 @@ def verified(problem: Prepared, K: Matrices, target: float) -> float:
             f"its closed loop is unstable (largest real part {np.max(loop.poles().real):.3g})."
         )
     norm, _ = peak_gain(loop)
-    if not norm <= target * (1.0 + _EXCESS):
+    if not norm <= target * (1.0 + AGREEMENT):
         raise SolverError(f"its closed loop has the norm {norm:.6g}, not {target:.6g}.")
     return norm
 
@@ -481,7 +478,7 @@ class Lmi(Value):
             )
         with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:
             found, lower = self._smallest(problem, bar.advance)
-        if found.value > lower * (1.0 + UNRESOLVED):
+        if found.value > lower * (1.0 + AWAY):
             raise SolverError(
                 f"the LMIs give gamma = {found.value:.6g} as smallest, but no proof excludes more "
                 f"than {lower:.6g}: {counted(n, 'state')} of such unlike speeds are beyond the "

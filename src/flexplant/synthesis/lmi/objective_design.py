@@ -17,7 +17,7 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant, plant_of
 from ...tolerances import TINY
-from ..controller import Controller, with_left_out
+from ..controller import AGREEMENT, Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
@@ -26,8 +26,6 @@ from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 
-#: what a verified norm may exceed its bound by
-_EXCESS = 1e-3
 #: rates of decay that are tried for peak gains, beside the plant's own speed
 _RATES = (0.1, 0.3, 1.0, 3.0)
 #: steps from the best of them, the last one so small that the optimum is flat within it
@@ -232,7 +230,7 @@ def _verified_values(
             continue
         w, z = spec.chosen(plant)
         value = spec.measured(closed.select(z, w))
-        if spec.below is not None and not value <= spec.below * (1.0 + _EXCESS):
+        if spec.below is not None and not value <= spec.below * (1.0 + AGREEMENT):
             raise CertificateError(f"{spec!r} is {value:.6g} in the closed loop.")
         reached[repr(spec)] = value
     return reached

@@ -17,7 +17,7 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...seeds import MOST, Rng, generator
-from ...tolerances import SAME
+from ...tolerances import SAME, TINY
 from ..controller import (
     Controller,
     certified_norm,
@@ -59,8 +59,6 @@ _SHORT = 1e-2
 _SAME = 0.01
 #: part of the largest norm from which on another plant's counts
 _PART = 0.5
-#: a norm that has a logarithm
-_NOTHING = np.finfo(float).tiny
 
 
 @one_thread()
@@ -380,7 +378,7 @@ class _StructureSearch:
         self._latest = theta, each
         worst = int(np.argmax([number for number, _ in each]))
         number, place = each[worst]
-        return float(np.log(max(number, _NOTHING))) + _SMALL * _theta_size(theta), (worst, place)
+        return float(np.log(max(number, TINY))) + _SMALL * _theta_size(theta), (worst, place)
 
     def pieces(self, theta: FloatArray) -> Pieces:
         """Return the numbers that are near the largest, as `value` counts them."""
