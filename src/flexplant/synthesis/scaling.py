@@ -107,7 +107,8 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     # resonances an answer rises, and falls on. One that falls to rounding has not settled
     ahead = np.pad(sizes_of[:, 1:], [(0, 0), (0, _POINTS - 1)], mode="edge")
     lowest = np.min(sliding_window_view(ahead, _POINTS, axis=1), axis=2)
-    settled = (lowest >= sizes_of[:, :-1] - np.log(_FALL)) & ~falls
+    settled = lowest >= sizes_of[:, :-1] - np.log(_FALL)
+    settled[:, -_POINTS:] &= ~falls[:, -_POINTS:]  # less than a decade is known ahead of these
     settled &= np.logical_or.accumulate(falls, axis=1)
     settled &= lowest > sizes_of[:, [last]] + np.log(SAME)
     found = [omega[np.argmax(one)] for one in settled if one.any()]

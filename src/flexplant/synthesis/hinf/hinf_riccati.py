@@ -61,7 +61,7 @@ class Riccati(Value):
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. Unless given at most 0.8 % where D12 and D21 have
+        Relative distance from the smallest gamma found. Unless given 0.8 % where D12 and D21 have
         full rank (0.3 % with what is added for a missed mode or to a tiny effort or noise), and
         5 % where they have not.
     tolerance : float
@@ -136,10 +136,7 @@ class Riccati(Value):
         scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
         with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
             high, low = self._searched(scaled, bar)
-            # what the bisection leaves open is a part of it, up to a half
-            spent = min(high / low - 1.0, 0.5 * min(back_off, _REGULAR)) if low else 0.0
-            step = back_off - spent if self.back_off is None else self.back_off
-            K, norm = self._accepted(scaled, high, step, norm_of)
+            K, norm = self._accepted(scaled, high, back_off, norm_of)
         if K is None:  # nothing below it holds
             K = least.replace(C=least.C / unit)
             norm = norm_of(scaled, K)
@@ -172,10 +169,11 @@ class Riccati(Value):
         self,
         problem: Prepared,
         high: float,
-        step: float,
+        back_off: float,
         norm_of: Callable[[Prepared, StateSpace], float],
     ) -> tuple[StateSpace | None, float]:
         """Return the backed-off controller with the norm of its loop, going up until it holds."""
+        step = back_off if self.back_off is None else self.back_off
         for _ in range(_GROWTH):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller
