@@ -132,7 +132,7 @@ def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
 
 
 @pytest.mark.xfail(
-    reason="the weights' unit of force is the rms over the axes: 60 Hz no longer keep the margin",
+    reason="no loop of 60 Hz keeps the margin with its modes off; that of larger efforts did",
     raises=InfeasibleError,
 )
 @pytest.mark.long
