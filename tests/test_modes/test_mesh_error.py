@@ -6,6 +6,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.testbeds.ritz import plate_modes, ritz_plate
+from oracles_mindlin import mindlin_frequencies
 
 #: so thin that rotary inertia, which the meshes lack, is 1e-6
 THIN = {
@@ -64,3 +65,26 @@ def test_meshes_that_say_nothing_are_refused():
 @pytest.mark.slow
 def test_it_is_said_in_one_line():
     assert repr(modes(8, 6).mesh_error(modes(16, 6))).startswith("<MeshError: 3 modes, ")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_frequencies_of_two_meshes_point_to_the_converged_plate(seed):
+    """Less than half of the error of the finer mesh is left, of repeated modes too."""
+    side = (0.6, 0.6) if seed else (0.6, 0.5)  # a square has modes of one frequency
+    drawing = THIN | {"size": side, "thickness": 0.03}
+
+    def solved(n):
+        cells = tuple(round(n * length / 0.6) for length in side)
+        return fx.solve_modes(fx.plate(elements=cells, **drawing), count=20)
+
+    fine = solved(30)
+    found = fine.extrapolated(solved(18))
+    exact = mindlin_frequencies(side, 0.03, 2700.0, 70e9, 0.3, order=14, count=11)
+    before, after = (np.abs(one.freq[3:14] / exact - 1.0) for one in (fine, found))
+    assert before.max() > 3e-3
+    assert after.max() < 0.5 * before.max()
+    assert np.median(after) < 0.4 * np.median(before)
+    assert found.n_rigid == 3
+    assert np.all(np.diff(found.freq) >= 0)
+    with pytest.raises(ModelError, match="Halve"):
+        solved(18).extrapolated(fine)
