@@ -505,8 +505,8 @@ class Modes(Placed, Value):
         Parameters
         ----------
         coarser : Modes
-            Modes of the same structure with larger elements, 1.5 or 2 times as large, say, and a few more
-            modes than are needed, among which the highest find a partner.
+            Modes of the same structure with larger elements, 1.5 or 2 times as large, say, and
+            a few more modes than are needed, among which the highest find a partner.
         order : float
             2 for plates and for bricks of eight nodes.
 
