@@ -94,7 +94,7 @@ def models(damping: float) -> dict[str, Any]:
     own, fine = meshed(damping, *fit.values), meshed(damping)
     mesh = fx.solve_modes(plate, count=24, damping=fx.ModalDamping(damping)).mesh_error(fine)
     full = {"drawing": fine, "updated": own, "measured": own.calibrated(numbered(found, own))}
-    return case | {"full": full, "off": fit.frequency_uncertainty(poles, mesh=mesh)}
+    return case | {"full": full, "off": fit.uncertainty(poles, mesh=mesh).frequency}
 
 
 def study(damping: float) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def models(machine, size, thickness, elements, seed, zeta=ZETA):
     fine = meshed(size, thickness, [4 * n for n in elements], fit.values[1])
     loaded = fine.with_parts(fx.PointMass(fine.dofs.nearest(place, "z"), fit.values[0]))
     whole = fx.solve_modes(loaded, count=120, damping=low).calibrated(poles)
-    return fit.calibrated(poles), whole, fit.frequency_uncertainty(poles)
+    return fit.calibrated(poles), whole, fit.uncertainty(poles).frequency
 
 
 @pytest.mark.parametrize("name", list(CASES))

@@ -253,7 +253,7 @@ def test_the_search_judges_the_modes_left_out():
     )
     known = fx.MeasuredModes(poles.poles[:6], modes=poles.modes[:6])
     plant = fx.assemble_plant(fit.calibrated(known), own).discretized(RATE, delay=one.delay)
-    off = fit.frequency_uncertainty(known)
+    off = fit.uncertainty(known).frequency
     fast = fx.design_stage(plant.uncertain(frequency=off), bandwidth=100.0)
     assert fx.close_loop(plant, fast).modulus_margin > 0.45
     assert one.loop(own, fast).spectral_radius > 1.003
@@ -306,22 +306,22 @@ def test_frequencies_are_uncertain_by_what_was_not_explained():
     )
     poles = machine().poles([4, 6, 7, 9, 13])
     wide = poles.replace(covariance=np.diag((0.002 * np.abs(np.r_[poles.poles, poles.poles])) ** 2))
-    found = fit.frequency_uncertainty(poles)
+    found = fit.uncertainty(poles).frequency
     assert {found[m] for m in (4, 6, 7, 9, 13)} == {1e-3}
     assert 0.005 < found[5] < found[20] < 0.1
-    assert fit.frequency_uncertainty(wide)[6] == pytest.approx(0.004, rel=0.05)
+    assert fit.uncertainty(wide).frequency[6] == pytest.approx(0.004, rel=0.05)
     coarse, fine = (
         fx.solve_modes(fx.kirchhoff_plate(elements=(n, n), **DRAWN), count=24) for n in (8, 16)
     )
     mesh = coarse.mesh_error(fine)
-    beside = fit.frequency_uncertainty(poles, mesh=mesh)
+    beside = fit.uncertainty(poles, mesh=mesh).frequency
     assert beside[20] == pytest.approx(max(found[20], 1.5 * abs(mesh.error[16])))
     assert beside[4] == 1e-3
     true = np.abs(machine().poles(range(4, 25)).freq / fit.model.modes().freq[3:24] - 1.0)
     inside = [true[m - 4] < share for m, share in beside.items() if share > 1e-3]
     assert np.mean(inside) > 0.9
     with pytest.raises(ModelError, match="mesh"):
-        fit.frequency_uncertainty(poles, mesh=0.01)
+        fit.uncertainty(poles, mesh=0.01).frequency
 
 
 @pytest.mark.slow

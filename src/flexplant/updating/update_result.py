@@ -447,12 +447,6 @@ class UpdateResult(Value):
             )
         return trend_of(self, poles)
 
-    def frequency_uncertainty(
-        self, measured: Any, *, mesh: MeshError | None = None
-    ) -> dict[int, float]:
-        """Return the frequencies' part of `uncertainty`, {mode: share}."""
-        return self.uncertainty(measured, mesh=mesh).frequency
-
     def uncertainty(
         self, measured: Any = None, *, mesh: MeshError | None = None
     ) -> ModalUncertainty:
