@@ -6,8 +6,8 @@ that varies by 2 % over it, and dampings that scatter by a quarter. It is drawn 
 updated with its measured poles, and its filter and servo are designed as the README does. No
 constant of the drawing of machines was chosen on these.
 
-Measured: 90 of 100 intervals are stated, of these 84 hold (die:rx of the first kind on 6 of 9, die:z
-of the second on 7 of 9). Where none is stated the model is said to lack something.
+Measured: 90 of 100 intervals are stated, of these 84 hold (die:rx of the first kind on 6 of 9,
+die:z of the second on 7 of 9). Where none is stated the model is said to lack something.
 """
 
 import warnings
