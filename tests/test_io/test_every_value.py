@@ -72,6 +72,11 @@ def made():
     )
     residual = fx.Eigenvalues(poles)
     fit = fx.update(rom, unknowns, [residual])
+    yield from (fit.machines(poles), fx.placement.LeftOutModes())
+    yield from (
+        fit.trend(poles),
+        fx.structure.ThickPlateShape((1.0, 1.0), 0.1, (2, 2), softness=3e-3),
+    )
     plant = fx.assemble_plant(rom, ports())
     sampled = plant.discretized(RATE, delay=1)
     yield fx.assemble_plant(rom, ports(), evaluation=fe).evaluation

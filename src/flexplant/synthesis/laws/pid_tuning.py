@@ -143,7 +143,7 @@ def tune_pid(
             )
         return found
     for freq in _crossovers(g):
-        if (found := _tuned(g, freq, margin)) is not None:
+        if (found := _tuned(g, float(freq), margin)) is not None:
             return found
     raise ModelError(
         f"no PID keeps a modulus margin of {margin:g} of {g!r}: design_hinf of a mixed sensitivity "
@@ -180,7 +180,7 @@ def _tuned(g: StateSpace, freq: float, margin: float) -> PidTuning | None:
     for low, lead, sign in product(_INTEGRAL, _LEAD, (1.0, -1.0)):
         choice = _Choice(freq / low, freq / lead, freq * lead)
         L = response * choice.response(lines, g.dt, freq)
-        k = sign / abs(L[-1])
+        k = sign / float(abs(L[-1]))
         if np.min(np.abs(1.0 + k * L)) >= margin:
             kept.append((k, choice))
     # the most integral gain first: what the grid shows is verified on the closed loop
