@@ -106,7 +106,7 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
                 C = ready.correlated(a, b)
                 if C is not None:
                     held[a, b] = _of_modes(direct[a], C * others)
-                    total += C.conj() * J[a]
+                    total += np.conj(C) * J[a]
             common += _inner_product(total, ready.spread(slope))
             mixed[b] = inverse @ _inner_product(total, others)
         common = inverse @ common @ inverse
