@@ -256,7 +256,7 @@ WRONG = {
     "structured claim": (
         "synthesis.structured.structured_design._end_norm", larger(1.001),
         lambda: fx.synthesis.design_structured(problem(), FixedOrder(0), starts=1),
-        "in the scaled problem",
+        "by the search",
     ),
 }  # fmt: skip
 
