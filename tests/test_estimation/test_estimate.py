@@ -194,7 +194,7 @@ def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatc
     y[700:710] = y[1400:1402, 1] = np.nan
     mixed = kalman.estimate(records(model, y, u), method)
     for module in ("passage", "estimate"):
-        monkeypatch.setattr(f"flexplant.estimation.{module}.SETTLED", -1.0)
+        monkeypatch.setattr(f"flexplant.estimation.{module}.STATIONARY", -1.0)
     monkeypatch.setattr("flexplant.estimation.passage.excess", lambda *_: None)
     slow = kalman.estimate(records(model, y, u), method)
     for channel in ("die:hat", "y1:innovation", "y2:innovation"):

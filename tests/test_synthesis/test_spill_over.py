@@ -55,7 +55,7 @@ def weighted(plant, bandwidth, **knobs):
 
 
 @cache
-def design(bandwidth=100.0, knobs=OLD, whole=True):
+def design(bandwidth=110.0, knobs=OLD, whole=True):
     errors, problem = weighted(sampled(small()), bandwidth, **dict(knobs))
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
@@ -93,7 +93,7 @@ def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     errors, _, found, messages = design()
     assert found.certificate["spectral radius"] < 1
     radius = found.certificate["spectral radius with modes left out"]
-    assert radius > 1.0
+    assert radius > 1.0015
     assert found.certificate["modulus margin with modes left out"] == 0.0
     whole = sampled(many())
     # oracle: stability() is the radius' logarithm or the like: only its sign counts

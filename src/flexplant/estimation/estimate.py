@@ -24,7 +24,7 @@ from ..words import instance, known_units, sizes_of
 from .estimator_channels import ChannelError, estimates, recorded
 from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
-from .passage import Moment, Start, Walk, stationary_start
+from .passage import STATIONARY, Moment, Start, Walk, stationary_start
 
 #: part of a sensor's samples above which those beyond a gate are no outliers
 _MOST = 0.1
@@ -310,7 +310,7 @@ def _backward(
     some = (here.c @ onward / size[:, :, None]).reshape(-1, F.shape[0])
     weight = solve_stein(F, some.T @ some / here.c.shape[0])
     k = span[1]
-    while k > span[0] and abs(np.sum(weight * (settled - M))) > TYPED:
+    while k > span[0] and abs(np.sum(weight * (settled - M))) > STATIONARY:
         k -= 1
         T = here.part(slice(k - span[0], k - span[0] + 1)).c[0] @ onward
         variance[k] -= np.einsum("zi,ij,zj->z", T, M, T)

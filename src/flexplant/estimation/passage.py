@@ -20,6 +20,8 @@ from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains
 
 #: samples between two looks whether it is
 _LOOK = 16
+#: relative: a covariance that is this near to the one it settles at is taken for it
+STATIONARY = TYPED
 
 
 class Moment(NamedTuple):
@@ -226,13 +228,13 @@ class Walk:
             assert self.found is not None  # noqa: S101
             X = Z @ self.found.X
             # a pass back changes delta itself by the root of what is left of it here
-            left = TYPED * (1e-8 if self.keep else 1.0)
+            left = STATIONARY * (1e-8 if self.keep else 1.0)
             if self.found.open.size or np.sum((weight @ X) * X) > left:
                 return False, x, Z
             x, Z = x + Z @ self.found.value, Z[:, :0]
         excess = float(np.sum(weight * (P - self.steady.P)))
         # beside the rounding of both covariances
-        return abs(excess) < TYPED + 1e-13 * size, x, Z
+        return abs(excess) < STATIONARY + 1e-13 * size, x, Z
 
     @cached_property
     def _weight(self) -> tuple[FloatArray, float]:
