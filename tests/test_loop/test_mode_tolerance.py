@@ -339,7 +339,9 @@ LATE = {
 
 
 #: the change that a latency of a fraction of a sample makes in the mapped A is left out
-NOT_TO_TWO_PERCENT = pytest.mark.xfail(reason="a tolerance next to a latency is off by some 2 %")
+NOT_TO_TWO_PERCENT = pytest.mark.xfail(
+    reason="a tolerance next to a latency is off by some 2 %", strict=False
+)
 
 
 @pytest.mark.slow

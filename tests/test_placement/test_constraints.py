@@ -35,11 +35,6 @@ COSTS = {0: 5.0, 2: 4.0, 9: 3.0, 11: 3.0}
 XY = np.array(GRID)[:, :2]
 
 
-def image(i):
-    """The candidate opposite in x."""
-    return (3 - i // 3) * 3 + i % 3
-
-
 #: a constraint and the same in words of Python, over sets of indices
 CASES = {
     "excluded": (
@@ -86,7 +81,7 @@ def machine(make):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "side"), [*((kind, "y") for kind in CASES), ("mirrored", "u"), ("budget", "u")]
+    ("kind", "side"), [*((kind, "y") for kind in CASES), ("apart", "u"), ("budget", "u")]
 )
 def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, side):
     for name, few in (("_SCREENED", 30), ("_SCORED", 5)):
@@ -116,14 +111,14 @@ def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, 
 @pytest.mark.slow
 def test_several_at_once_and_required(machine):
     plant, sensors, _ = machine
-    given = [CASES["mirrored"][0], CASES["excluded"][0], OffPoi(-1)]
+    given = [CASES["together"][0], CASES["excluded"][0], OffPoi(-1)]
     found = place_sensors(plant, sensors, 4, required=["c3"], constraints=given)
     every = [
         s
         for s in combinations(range(12), 4)
-        if {3, 6} <= set(s) and CASES["mirrored"][1](set(s)) and not set(s) & {0, 11, 2, 9}
+        if 3 in s and CASES["together"][1](set(s)) and not set(s) & {0, 11}
     ]
-    assert {"c3", "c6"} <= set(found.chosen)
+    assert "c3" in found.chosen
     assert found.evaluations == len(every)
     with pytest.raises(InfeasibleError, match=r"satisfies the constraints OffPoi\(radius=0.0\) "):
         place_sensors(plant, sensors, 4, required=["c3"])
