@@ -11,12 +11,14 @@ from math import comb, prod
 from typing import TypeAlias
 
 import numpy as np
+import scipy.linalg as la
 
 from ..arrays import FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative
-from ..lti.riccati import control_dare
+from ..lti.lyapunov import square_root
+from ..lti.riccati import control_dare, riccati_root
 from ..store import Value
 from ..tolerances import SETTLED, TINY, divisor
 from .criterion import Scorer
@@ -434,7 +436,7 @@ def quadratic(
     owned: IntArray | None = None,
 ) -> Quadratic:
     """Return the problem in states in which X, with all candidates, has a unit diagonal."""
-    X = control_dare(A, items.T, Q=H, R=np.eye(items.shape[0])).P
+    X = _certain(A, H, items)
     s = np.sqrt(divisor(X.diagonal()))
     own = np.zeros((items.shape[0], 0), dtype=np.int64) if owned is None else owned
     return Quadratic(A * s[:, None] / s, H / s / s[:, None], S * s, items * s, own, constant)
@@ -448,7 +450,21 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
         # closed loops that are barely stable look converged: `control_dare` distinguishes them
         if relative(residual, float(np.linalg.norm(X))) <= RESIDUAL:
             return X
-    return control_dare(A, g.T, Q=H, R=np.eye(g.shape[0])).P
+    return _certain(A, H, g)
+
+
+def _certain(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
+    """Return X by Newton's steps; in square roots where it has too few digits for these."""
+    one = np.eye(g.shape[0])
+    try:
+        return control_dare(A, g.T, Q=H, R=one).P
+    except SolverError as error:
+        noise = la.block_diag(square_root(H), one)
+        try:
+            L = riccati_root(A.T, g, noise[: len(A)], noise[len(A) :]).L
+        except SolverError:
+            raise error from None
+        return np.asarray(L @ L.T)
 
 
 def _square_root(g: FloatArray) -> FloatArray:
