@@ -226,7 +226,8 @@ class PoiVariance(Criterion):
         plant.check().require(("excited",), "a stationary Kalman filter")
         noise = plant.sensor_noise.diagonal()
         sizes = {name: noise[i] for i, name in enumerate(plant.y)}
-        sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
+        if plant.model is not None:  # sensors of foreign matrices are rows, with noise of their own
+            sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
         require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
         _check_direct(plant, candidates)
 
