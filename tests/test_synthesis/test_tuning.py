@@ -164,7 +164,7 @@ def joint_peaks(plant, design):
 @pytest.mark.xfail(
     reason="in the axes that the sensors of a block alone give, six loops that each hold |S| below "
     "1.7 are unstable together at every bandwidth down to 0.5 Hz",
-    raises=SolverError,
+    raises=fx.errors.SolverError,
 )
 @pytest.mark.long
 def test_six_axes_hold_the_peak_together():

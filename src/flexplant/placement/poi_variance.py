@@ -229,7 +229,8 @@ class PoiVariance(Criterion):
         if plant.model is not None:  # sensors of foreign matrices are rows, with noise of their own
             sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
         require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
-        _check_direct(plant, candidates)
+        if plant.model is not None:
+            _check_direct(plant, candidates)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
