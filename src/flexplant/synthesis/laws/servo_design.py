@@ -65,7 +65,9 @@ def design_servo(
     damper ``k (1 + w_i / s) F(s)``, of a spring ``k F(s) / s``, and ``k F(s)`` where the response
     vanishes at rest. F is a second-order roll-off and the notches; with k the loop of the axis
     crosses 1 at the bandwidth, by the exact response of the plant. Where two lines are near, the
-    exact |S| at u decides.
+    exact |S| at u decides; it also decides, where a mode lies above the bandwidth within a factor
+    of 4, whether the lead of a mass line is wide: 16 instead of 4. A wide lead suppresses the error
+    up to a higher frequency, but less at low ones: give `integrator` where errors must settle soon.
 
     Certified is the loop that will run: with observer, flexible modes and delay, and with the modes
     left out where they are known. `servo_bandwidth` gives the largest bandwidth that holds 6 dB.
@@ -83,10 +85,11 @@ def design_servo(
         Channels of z (axes of POIs) or y (sensors) to control, as for
         `flexplant.plant.driven_axes`.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths (3 of an
-        axis on a spring), or 0.4 of the rate where that is less.
+        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths (16 with
+        a wide lead, 3 of an axis on a spring), or 0.4 of the rate where that is less.
     integrator : float [Hz], optional
-        Corner of the integral action; a tenth of the bandwidth unless given.
+        Corner of the integral action; a tenth of the bandwidth unless given, with a wide lead a
+        fiftieth.
     notches : sequence of float [Hz], optional
         Frequencies of resonances to notch, each below half the rate. Unless given they are placed
         at the plant's modes, one by one, while |S| at u is above 6 dB (or the loop unstable) and a
