@@ -8,11 +8,11 @@ in nm, the largest and the mean over 5 ms after it::
 
     feedforward      best servo         tolerant
                    largest   after   largest   after
-    none              6430     803      1111     150
-    acceleration       116      30        30     7.5
-    jerk               8.3     2.2       5.2     1.7
-    snap               5.0     0.6       4.3     0.5
-    inverse            3.3     0.3       3.2     0.2
+    none              5310    1780      1170     149
+    acceleration        72      14        33     8.3
+    jerk               7.4     1.8       5.4     1.9
+    snap               3.9     0.1       4.4     0.5
+    inverse            3.0     0.2       3.3     0.2
 """
 
 # %% Names and numbers
