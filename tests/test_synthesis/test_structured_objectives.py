@@ -206,7 +206,7 @@ def test_a_claim_that_is_wrong_is_refused_and_so_are_wrong_objectives(monkeypatc
     monkeypatch.setattr(
         H2Judge, "found", lambda self, loop: tuple(1.01 * part for part in right(self, loop))
     )
-    with pytest.raises(CertificateError, match="in the scaled problem"):
+    with pytest.raises(CertificateError, match="by the search"):
         design(plant, FixedOrder(0), objective=H2(), starts=1)
     for wrong in (H2, "h2", 3.0):
         with pytest.raises(ModelError, match="objective must be"):
