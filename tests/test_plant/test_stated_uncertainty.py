@@ -251,7 +251,7 @@ def test_a_gain_margin_is_what_mu_says():
     P = fx.testbeds.three_masses()
     observer = fx.design_kalman(P)
     servo = fx.design_servo(P, bandwidth=20.0, observer=observer)
-    uncertain = P.uncertain(Gains({"u1": 0.5}))
+    uncertain = P.uncertain(Gains({"u1": 0.95}))
     found = fx.synthesis.robust_stability(uncertain, observer, servo, machines=2)
 
     def stable(delta):

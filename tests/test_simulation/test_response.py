@@ -79,11 +79,6 @@ def test_runs_keep_their_axis():
     np.testing.assert_array_equal(
         one.moving_std("b", window=1.0), run.moving_std("b", window=1.0)[1]
     )
-    with pytest.raises(ModelError, match="3 runs"):
-        run.to_sep005()
-    first, second = one.to_sep005()
-    assert (first["name"], second["name"]) == ("a", "b")
-    assert first["fs"] == pytest.approx(10.0)
 
 
 def test_the_interval_of_the_rms_covers_the_truth():

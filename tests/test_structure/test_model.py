@@ -231,7 +231,7 @@ def test_rayleigh_damping_matrix(plate):
 
 
 def test_with_damping_refuses_other_things(plate):
-    with pytest.raises(ModelError, match="ModalDamping or Rayleigh"):
+    with pytest.raises(ModelError, match="ModalDamping, a Rayleigh or a matrix D"):
         plate.with_damping(0.01)
     with pytest.raises(ModelError, match="too large"):
         make_plate(elements=(45, 45)).with_damping(ModalDamping(0.01))

@@ -62,6 +62,7 @@ with Client(n_workers=2, threads_per_worker=1, dashboard_address=None) as client
 from ..rooms import public_names as _public_names
 from .errors_along import PathFilters as PathFilters
 from .errors_along import PathRms as PathRms
+from .errors_along import estimate_along as estimate_along
 from .errors_along import filters_along as filters_along
 from .errors_along import rms_along as rms_along
 from .exposure import ErrorMap as ErrorMap

@@ -415,3 +415,49 @@ class _Filters:
 
 def _constant(value: float, time: FloatArray) -> FloatArray:
     return np.full(time.size, value)
+
+
+def estimate_along(
+    plant: StandardPlant, records: Mapping[str, Any], *, moving: Mapping[str, Any]
+) -> dict[str, FloatArray]:
+    """Return what the exact filter of a machine on the move makes of a record.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, with ports that move.
+    records : mapping {name: (n_time,) array}
+        Sensors y and commands u, by name; a `Response` serves.
+    moving : mapping {position: path}
+        Where the machine was, as for `simulate`.
+
+    Returns
+    -------
+    dict {str: (n_time,) array}
+        Estimates `die:z` of every motion of the POIs, y of the same sample included.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        As `filters_along`; when a record is missing or has another length.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> "exact filter" in fx.simulation.estimate_along.__doc__
+    True
+    """
+    sensors = [sensor.name for sensor in plant.assembled.ports.y]
+    needed = [*sensors, *plant.u]
+    require_known("record", needed, list(getattr(records, "names", records)))
+    count = np.asarray(records[needed[0]]).size
+    data = np.array([real_array(records[n], n, (count,)) for n in needed]).T
+    filters = _Filters(plant, moving, count * float(plant.dt), 2)
+    P, found = filters.steady(), np.zeros((len(filters.z), count))
+    x = np.zeros(len(P))
+    for k, (sample, M, *_) in enumerate(filters.corrected(P, None)):
+        y, u = data[k, : len(sensors)], data[k, len(sensors) :]
+        x = x + M @ (y - sample.C[filters.y] @ x)
+        found[:, k] = sample.C[filters.z] @ x
+        x = sample.A @ x + sample.B[:, len(plant.w) :] @ u
+    return dict(zip(filters.names, found, strict=True))

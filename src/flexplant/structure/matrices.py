@@ -90,6 +90,7 @@ class FEMatrices(Value):
         notes = name_list(self.notes, "notes")
         eta = positive(self.loss_factor, "loss_factor", zero=True)
         if not eta and np.iscomplexobj(stiff):
+            stiff = stiff if sp.issparse(stiff) else np.asarray(stiff)
             eta = _loss_factor(square(stiff.real, "K"), square(stiff.imag, "imaginary part of K"))
             notes = (*notes, _modal_damping_note(eta))
         K = square(stiff.real if np.iscomplexobj(stiff) else stiff, "K")
