@@ -14,7 +14,7 @@ MODEL = fx.chain(masses=[1.0, 2.0, 1.0], stiffnesses=[4e5, 3e5], ground=[1e4, 0.
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch(fx.plant.SensorPort):
+class StretchGauge(fx.plant.SensorPort):
     """How far two places move apart [m]."""
 
     name: str
@@ -27,7 +27,7 @@ class Stretch(fx.plant.SensorPort):
 
 
 @dataclass(frozen=True, eq=False)
-class Strain(Stretch):
+class Strain(StretchGauge):
     """The same over a length: it states its own unit."""
 
     length: float = 0.1
@@ -49,7 +49,7 @@ def plant(*sensors):
 
 
 def test_a_sensor_keeps_its_unit(tmp_path):
-    made = plant(Stretch("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8))
+    made = plant(StretchGauge("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8))
     made = made.discretized(5e3, delay=1)
     made.save(tmp_path / "plant.npz")
     for one in (made, fx.load(tmp_path / "plant.npz")):

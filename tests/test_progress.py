@@ -185,7 +185,7 @@ def test_interrupted_work_leaves_nothing_behind():
         process.kill()
     assert process.returncode == 0, err.decode()
     answer = json.loads(out)
-    assert len(answer["found"]) == 15 and answer["same"]
+    assert len(answer["found"]) == 14 and answer["same"]
     for name, left in answer["found"].items():
         assert left == {"threads": True, "bars": 0, "children": 0, "alive": 1}, name
 

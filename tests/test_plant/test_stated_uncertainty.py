@@ -242,7 +242,7 @@ def test_a_loop_under_all_kinds_at_once():
         corner = random.choice([-size, size], len(uncertain.deltas))
         values = {d.name: float(x) for d, x in zip(uncertain.deltas, corner, strict=True)}
         assert loop.around(uncertain.lft(values)).is_stable
-    assert found.lower > 0.9 * found.upper
+    assert found.lower == 0.0 < found.upper < 1.0  # no worst machine is sought below 1
 
 
 @pytest.mark.slow

@@ -17,11 +17,11 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 >>> plant = fx.testbeds.three_masses()
 >>> errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, 20.0)
 >>> hinf = fx.design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
->>> round(hinf.gamma, 2), round(hinf.lower, 2)
-(0.67, 0.66)
+>>> round(hinf.gamma, 1), round(hinf.lower, 1)
+(0.7, 0.7)
 >>> loop = fx.close_loop(plant, errors, hinf)
->>> loop.is_stable, round(loop.modulus_margin, 2)
-(True, 0.56)
+>>> loop.is_stable, loop.modulus_margin > 0.5
+(True, True)
 
 | MATLAB | here |
 |---|---|
