@@ -178,7 +178,9 @@ def run(loop: fx.ClosedLoop, move: Any, duration: float) -> dict[str, Any]:
     w = np.zeros((samples, len(plant.w)))
     at = move.at(np.arange(samples) / RATE)
     w[:, plant.w.index("die:ref")] = at.position
-    w[:, plant.w.index("die:ref:acceleration")] = at.acceleration
+    for derivative in ("velocity", "acceleration", "jerk", "snap"):
+        if (name := f"die:ref:{derivative}") in plant.w:  # what the feedforward reads
+            w[:, plant.w.index(name)] = getattr(at, derivative)
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     head, width = 16 + 8 * (len(plant.y) + len(loop.controller.outputs)), 2 + len(shown)
     memory = Path("/dev/shm") if os.access("/dev/shm", os.W_OK) else None

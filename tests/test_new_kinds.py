@@ -49,7 +49,9 @@ def plant(*sensors):
 
 
 def test_a_sensor_keeps_its_unit(tmp_path):
-    made = plant(StretchGauge("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8))
+    made = plant(
+        StretchGauge("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8)
+    )
     made = made.discretized(5e3, delay=1)
     made.save(tmp_path / "plant.npz")
     for one in (made, fx.load(tmp_path / "plant.npz")):

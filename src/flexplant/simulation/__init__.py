@@ -31,7 +31,7 @@ With the names of the README's script, one controller for machines with other ma
 ```python
 MASSES = [0.3, 0.6]  # kg
 
-def pipeline(mass, rng):
+def pipeline(mass: float, rng: object) -> dict[str, object]:
     there = fx.testbeds.wafer_stage(added_mass=mass, damping=0.01)
     tried = there.loop(ports, *loop.blocks)
     run = fx.simulate(tried, reference=move, duration=0.3, rng=rng)
