@@ -1,9 +1,8 @@
 """What runs elsewhere: C code of controllers, and functional mock-up units.
 
-- `write_c(controller, path)`: a whole loop in one C file with its header; 60 states take 0.04 us a
-  sample; of a `fx.ClosedLoop` observer and servo together, of a
-  `fx.Controller` itself.
-- `write_fmu(plant, path)`: a `fx.StandardPlant` or a controller, sampled, for FMI 2.0 and 3.0.
+- `write_c`: a controller in one C file with its header, of a `fx.ClosedLoop` observer and servo
+  together, of a `fx.Controller` itself; 60 states take 0.04 us a sample.
+- `write_fmu`: a `fx.StandardPlant` or a controller, sampled, for FMI 2.0 and 3.0.
 
 Names elsewhere: MATLAB Coder, Simulink Coder.
 
