@@ -23,7 +23,7 @@ def test_the_story_of_the_gantry(tmp_path):
         assert judged(loop.plant, *loop.blocks).serves(bandwidth)
     assert found["reach"] == pytest.approx(19.0, rel=0.02)
     none, *fed = story.errors(found).values()
-    assert none == pytest.approx(401e-6, rel=0.02)
+    assert none == pytest.approx(357e-6, rel=0.02)
     assert max(fed) < 0.02 * none
     text = story.table(found)
     assert "without feedforward" in text and "H-infinity" in text
