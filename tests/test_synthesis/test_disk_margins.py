@@ -80,3 +80,7 @@ def test_a_table_is_read_by_name_and_printed_with_units():
 def test_an_unstable_loop_has_no_margins():
     with pytest.raises(fx.FlexplantError, match="not stable"):
         margins(fx.lti.tf([1.0], [1.0, -2.0]))
+
+
+def test_a_loop_that_never_crosses_says_so():
+    assert "never" in repr(margins(fx.lti.tf([0.1], [1.0, 1.0])))

@@ -191,6 +191,7 @@ def _classical_rows(loop: LoopMargins) -> list[tuple[str, ...]]:
         (f"{freq:.4g}", f"{phase:+.1f}", f"{delay:.3g}")
         for freq, phase, delay in zip(loop.crossovers, loop.phases, delays, strict=True)
     ]
+    left = left or [("never", "", "")]
     right = [(f"{freq:.4g}", f"{factor:.3g}") for freq, factor in loop.gains]
     count = max(len(left), len(right), 1)
     left += [("", "", "")] * (count - len(left))
