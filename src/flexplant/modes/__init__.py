@@ -7,7 +7,7 @@ compliance of the truncated modes where forces act. Modes are numbered from 1.
 - `solve_modes(model, count=, damping=, compliance_at=)`: small and large models.
 - `Modes.at`: shapes at a label or a point; `Modes.freq`, ``omega``, ``zeta``, ``phi``.
 - `Modes.calibrated`: with frequency and damping of measured modes as measured.
-- `Modes.mesh_error`: from a second mesh, by what each frequency is off (`MeshError`).
+- `Modes.mesh_error`: error of each frequency of a mesh, estimated from a second mesh (`MeshError`).
 - `normal_form`: real modes of damping that is not modal.
 
 >>> import flexplant as fx

@@ -22,21 +22,22 @@ from .modes import Modes
 from .solve import damper_forces
 from .statics import StiffnessFactor, dissection_of, held_factor, static_response
 
-#: loads above which the second static response of each is left out
+#: number of loads above which the second static response of each load is left out
 _MANY = 30
-#: relative: damping between coordinates below this is rounding
+#: relative coupling of coordinates by damping below which it counts as zero
 _COUPLED = NULL
-#: relative: a rate of decay below this leaves a resonance without a finite response
+#: relative rate of decay below which the response at a resonance counts as infinite
 _UNDAMPED = SAME
-#: frequencies that are solved at once, and entries of their matrices
+#: number of frequencies solved together, and number of entries of their matrices
 _CHUNK, _ENTRIES = 256, 4_000_000
-#: relative change of a direct solution by its last refinement, wanted and at most
+#: relative change of a direct solution by its last refinement: wanted, and largest accepted
 _SETTLED, _UNSETTLED = 1e-9, 1e-6
-#: corrections of a basis before giving up: each leaves a seventh, or less, where all modes up to
-#: 1.5 times the frequency are in it
+#: number of corrections of a basis before giving up; each reduces the error to a seventh or less
+#: when the basis holds all modes up to 1.5 times the frequency
 _CORRECTIONS = 5
-#: part of what was left of the loads, as the root of energy, that is left then: what responses of
-#: a Galerkin basis are in error by is its square; or of the loads, where that is rounding
+#: fraction of the remaining loads (root of their energy) that may remain after a correction; the
+#: error of a Galerkin response is its square. Relative to the loads themselves where the remainder
+#: is rounding
 _LEFT, _NOTHING = 0.2, 1e-9
 
 
@@ -77,7 +78,7 @@ class DynamicBasis:
         shapes, squares = _diagonalise_shapes(model, beyond(model.M, phi, static))
         self.V = np.hstack([phi, shapes])
         self.squares = np.concatenate([modes.basis_squares[: modes.n_modes], squares])
-        #: shapes that a damping law by modes is of
+        #: shapes of the modes for which a damping law holds
         self._inertia = np.asarray(model.M @ self.V)
         self.losses = self._losses(damping, loss)
         self._damped()
@@ -122,7 +123,7 @@ class DynamicBasis:
         return np.abs(np.array(own)).T.reshape(freq.size, len(rows))
 
     def _answered(self, freq: FloatArray, left: FloatArray, right: FloatArray) -> ComplexArray:
-        """Return responses (n_freq, p, q), in coordinates: of rows (p, k) to forces (k, q)."""
+        """Return responses (n_freq, p, q) of rows (p, k) to forces (k, q), all in coordinates."""
         found = np.zeros((freq.size, left.shape[0], right.shape[1]), dtype=np.complex128)
         chunk = _CHUNK
         if self._coupled:
@@ -148,15 +149,15 @@ class DynamicBasis:
         return found
 
     def compliance(self, rows: FloatArray, loads: FloatArray) -> FloatArray:
-        """Return the static response (p, q), that of elastic motions; exact for the own loads."""
+        """Return the static elastic response (p, q), which is exact for the loads of the basis."""
         elastic = self.V[:, self.n_rigid :]
         return np.asarray(((rows @ elastic) / self.squares[self.n_rigid :]) @ (elastic.T @ loads))
 
     def corrected(
         self, freq: FloatArray, loads: FloatArray, factor: StiffnessFactor
     ) -> DynamicBasis | None:
-        """Return the basis with what all of the matrices add at some frequencies."""
-        # what a factor of the stiffness finds joins it, until next to nothing is left in energy
+        """Return the basis, extended by the responses of the full matrices at some frequencies."""
+        # solutions with a factor of the stiffness extend it until almost no energy is left
         n, count = self.n_modes, freq.size
         inner, basis, first = self._inertia[:, :n], self, np.zeros(0)
         forces = self.V[:, self.n_rigid :].T @ loads
@@ -174,7 +175,7 @@ class DynamicBasis:
         return None
 
     def _left(self, freq: FloatArray, loads: FloatArray) -> ComplexArray:
-        """Return what of the loads (n, f q) the motions of the basis do not take, by M, D and K."""
+        """Return the part of the loads (n, f q) that the motions do not balance."""
         at = self._answered(freq, np.eye(self.V.shape[1]), self.V.T @ loads)
         motion = self.V @ np.hstack(list(at))
         omega = np.repeat(2 * np.pi * freq, loads.shape[1])
@@ -251,7 +252,7 @@ class DynamicBasis:
         return DampingTerms(rates - a, a=a)
 
     def _damped(self) -> None:
-        """Set what the losses are in the coordinates: rates, and what couples them."""
+        """Set the losses in the coordinates: decay rates, and the coupling between coordinates."""
         law = self.losses
         C = np.diag(law.a + law.b * self.squares)
         if law.D is not None:
@@ -267,7 +268,7 @@ class DynamicBasis:
 def _couples(C: FloatArray) -> bool:
     """Return whether a matrix of losses couples coordinates."""
     own = np.diag(C)
-    # next to zeros of the diagonal
+    # diagonal entries may be zero
     size = np.sqrt(np.abs(np.outer(own, own))) + 1e-3 * np.abs(C).max(initial=0)
     return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
 
@@ -275,15 +276,16 @@ def _couples(C: FloatArray) -> bool:
 def static_shapes(
     model: FEModel, loads: FloatArray, dampers: FloatArray | None = None
 ) -> FloatArray:
-    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``."""
-    # to the forces of dampers, (n, d), only the former
+    """Return static responses ``u = G f`` to loads (n, m) and, when loads are few, ``G M u``."""
+    # for the forces of dampers (n, d) only the first of these
     if not loads.shape[1]:
         return loads
     factor = held_factor(model)
 
     def static(forces: FloatArray) -> FloatArray:
         if model.n_unstable:
-            # there is no static response: that to forces that grow faster than the motion
+            # no static response exists here; the response to forces that grow faster than the
+            # motion takes its place
             balanced = forces - np.asarray(
                 model.M @ (model.rigid_body @ (model.rigid_body.T @ forces))
             )
@@ -310,7 +312,7 @@ def _diagonalise_shapes(model: FEModel, shapes: FloatArray) -> tuple[FloatArray,
 
 
 def _with_rank(solve: Any, U: FloatArray, size: ComplexArray) -> Any:
-    """Return how ``(A + U diag(size) U^T) x = b`` is solved by solutions with A (Woodbury)."""
+    """Return a solver of ``(A + U diag(size) U^T) x = b`` that uses solutions with A (Woodbury)."""
     if not size.size:
         return solve
     moved = solve(U.astype(np.complex128))
@@ -332,25 +334,25 @@ def _dense_complex(matrix: Any) -> ComplexArray:
     return np.asarray(full, dtype=np.complex128)
 
 
-#: a channel with a peak below this fraction of the responses of its places to their own forces is
-#: silent: it consists of the rounding of modes of other directions (up to 1e-11 was found for beams
-#: of 360 DOFs, in proportion to the condition of K), far below any response that is of use
+#: fraction of the responses of its places to their own forces below which the peak of a channel
+#: counts as silent: it then consists of rounding of modes in other directions (up to 1e-11 for
+#: beams of 360 DOFs)
 SILENT = SAME
-#: relative: next to a resonance, still within its peak
+#: relative distance from a resonance that is still within its peak
 _BESIDE = SPLIT
-#: error let pass relative to the response at a frequency, at antiresonances too
+#: largest error relative to the response at a frequency, also at antiresonances
 _THERE = 1e-2
-#: of the peak: what an antiresonance has at least, undamped ones too
+#: fraction of the peak that is the lower limit of the response at an antiresonance
 _DEEPEST = 1e-7
-#: how often direct solutions join the basis, where it is not good enough
+#: number of rounds in which direct solutions extend a basis that is not accurate enough
 _ROUNDS = 3
-#: frequencies on which antiresonances are bracketed, over the band and between two resonances
+#: number of grid frequencies that bracket antiresonances, over the band and between two resonances
 _GRID, _BETWEEN = 300, 5
 
 
 @dataclass(frozen=True)
 class DirectCheck:
-    """What direct solutions said of responses."""
+    """Errors of responses found by direct solutions."""
 
     freq: FloatArray
     of_peak: FloatArray
@@ -358,7 +360,7 @@ class DirectCheck:
 
     @property
     def worst(self) -> float:
-        """The largest error, of the peaks."""
+        """The largest error relative to the peaks."""
         return float(self.of_peak.max(initial=0.0))
 
     def holds(self, tolerance: float) -> bool:
@@ -385,8 +387,8 @@ def checked_response(
     tolerance: float,
     seen: Callable[[FloatArray, ComplexArray], ComplexArray] | None = None,
 ) -> tuple[DynamicBasis, ComplexArray, DirectCheck]:
-    """Return a basis that is good to a tolerance, its responses, and the check of them."""
-    # where the error is larger, direct solutions join the basis, checked again elsewhere
+    """Return a basis that meets a tolerance, its responses, and their check."""
+    # where the error is larger, direct solutions extend the basis, which is checked again elsewhere
     view = seen or (lambda _, response: response)
 
     def find(at: FloatArray) -> ComplexArray:
@@ -414,9 +416,9 @@ def checked_response(
 def _direct_responses(
     basis: DynamicBasis, at: FloatArray, rows: FloatArray, loads: FloatArray
 ) -> tuple[ComplexArray, Callable[[], DynamicBasis]]:
-    """Return responses by all of the matrices, and the basis that has the motions too."""
-    # by corrections with the static factor; a dynamic stiffness is factored where they do not
-    # settle
+    """Return responses from the full matrices, and the basis extended by these motions."""
+    # by corrections with the static factor; a dynamic stiffness is factored where these do not
+    # converge
     factor = held_factor(basis.model)
     corrected = None if factor is None else basis.corrected(at, loads, factor)
     if corrected is not None:
@@ -452,7 +454,7 @@ def _points(
     if inside.size:
         size = np.abs(find(inside))
         share = (size / np.maximum(size.max(axis=0), TINY)).max(axis=(1, 2))
-        # beside them: repeated modes may hold one that is not damped
+        # next to them, since one of two repeated modes may be undamped
         peaks = (inside * (1 + _BESIDE))[np.argsort(-share, kind="stable")].tolist()
     deep = antiresonances(find, basis.freq, low, high).tolist() if high > low else []
     edges = [high, low] if high > low else [high]
@@ -460,7 +462,7 @@ def _points(
         for few in (peaks, deep, edges):
             if few:
                 yield few.pop(0)
-        # of three in a row one: they are independent of what the basis was made of
+        # one of three consecutive ones, which are independent of those the basis was made from
         yield low * (high / low) ** chance.random() if low > 0 else high * chance.random()
 
 
@@ -476,9 +478,9 @@ def antiresonances(
     return dips(find, np.unique(np.concatenate([np.geomspace(start, high, _GRID), between])))
 
 
-#: how deep a dip is at least, as a share of the lower one of the two maxima that it lies between
+#: least depth of a dip as a fraction of the lower of the two neighbouring maxima
 _DEPTH = 0.5
-#: how many are refined, the deepest on the grid first
+#: number of dips that are refined, the deepest on the grid first
 _MOST = 40
 
 

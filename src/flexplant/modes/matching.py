@@ -1,4 +1,4 @@
-"""Which modes are the same: likeness of shapes, clusters of close modes, pairs one to one."""
+"""Matching of modes: similarity of shapes, clusters of close modes, one-to-one pairs."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from ..tolerances import ROUNDING, SAME, TINY, divisor
 
 #: shapes below this, relative to the largest one of their span, are rounding and count as zero
 _NONE = SAME
-#: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
+#: modes with a smaller relative distance are compared as one subspace, since any change mixes their
+#: shapes
 CLUSTER = 1e-3
-#: MAC from which on two modes are the same one
+#: MAC above which two modes count as the same
 PARTNER = 0.5
-#: what is this much smaller than the largest shape, at a node of all places, is not known
+#: relative size of a shape below which it counts as unknown: all places lie at nodes of the mode
 _SEEN = 1e-3
-#: MAC beyond which two modes of one model have the same shape as far as it is known
+#: MAC above which two modes of one model cannot be distinguished by their shapes
 ALIKE = 0.9
-#: part of the MAC that a frequency ratio of e counts for: it decides where shapes do not
+#: weight of a frequency ratio of e relative to the MAC; frequency decides where shapes are alike
 _FREQUENCY = 0.1
 
 
@@ -33,7 +34,7 @@ def mac_matrix(X: Any, Y: Any) -> FloatArray:
 
 
 def in_span(X: Any, Y: Any) -> FloatArray:
-    """Return how much of each column of Y lies in the span of X (k,): of one column their MAC."""
+    """Return the fraction (k,) of each column of Y in the span of X; for one column, their MAC."""
     basis, size, _ = np.linalg.svd(X, full_matrices=False)
     inside = basis[:, size > _NONE * size[0]].conj().T @ Y
     return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / np.sum(np.abs(Y) ** 2, axis=0))
@@ -46,14 +47,14 @@ def runs(values: Any, gap: float) -> list[IntArray]:
 
 
 def clusters(values: Any, gap: float) -> list[IntArray]:
-    """Return the places of `runs` of rising size, those of one alone left out."""
+    """Return the places of `runs` with two or more members, by rising size."""
     order = np.argsort(np.abs(values), kind="stable")
     return [np.sort(order[run]) for run in runs(np.abs(values)[order], gap) if run.size > 1]
 
 
 def assigned(cost: FloatArray, most: float = np.inf) -> IntArray:
     """Return the column of each row, one to one with the least total cost."""
-    # -1 where none is left, or where the cost is above `most`
+    # -1 for rows without a partner left, or whose cost is above `most`
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(cost)
@@ -151,9 +152,9 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
 
 def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     """Return the MAC (m, m) of modes with each other, repeated ones by the span of their shapes."""
-    # two spans are as like as their nearest shapes (cosine squared of the smallest principal
-    # angle); repeated modes among themselves 1 where their shapes, as far as they are known, are
-    # nearly dependent, else 0. A mode with a node at all places is like no other
+    # the similarity of two spans is that of their nearest shapes (cosine squared of the smallest
+    # principal angle). Two repeated modes have 1 where their known shapes are nearly dependent,
+    # else 0. A mode that has a node at all places is similar to no other mode
     order = np.argsort(freq, kind="stable")
     spans = [order[run] for run in runs(freq[order], CLUSTER)]
     alike = np.eye(freq.size)

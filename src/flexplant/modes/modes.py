@@ -1,4 +1,4 @@
-"""Modes of a structure, what truncated ones leave behind, and what a mesh costs."""
+"""Modes of a structure, their static correction, and the error of their mesh."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from ..words import instance
 from .matching import pair_modes
 from .normal_forms import pole_pairs
 
-#: places at which shapes of two meshes are compared, at most
+#: largest number of places at which shapes of two meshes are compared
 _PLACES = 300
-#: least ratio of element sizes: the difference of nearer ones is not that to the limit
+#: least ratio of element sizes: from closer sizes the limit cannot be extrapolated
 _RATIO = 1.2
 
 
@@ -46,11 +46,12 @@ class MeshError(Value):
     freq : (m,) array [Hz]
         Frequencies of the coarse mesh.
     limit : (m,) array [Hz]
-        That both meshes point to, ``f_fine + (f_fine - f_coarse) / (r^p - 1)``.
+        Extrapolated frequencies of an infinitely fine mesh, ``f_fine + (f_fine - f_coarse) / (r^p -
+        1)``.
     ratio : float
-        r, of the sizes of elements.
+        Ratio r of the element sizes.
     partners : (m,) array of int
-        Places, from 0, of the same modes in the finer mesh.
+        Positions, from 0, of the same modes in the finer mesh.
 
     Examples
     --------
@@ -92,7 +93,7 @@ def require_real(modes: Any, why: str) -> None:
 
 
 def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
-    """Return the errors of Modes by those of a finer mesh, paired by their shapes."""
+    """Return the errors of Modes from the Modes of a finer mesh, paired by their shapes."""
     p = positive(order, "order")
     for modes in (coarse, finer):
         require_real(modes, "those of two meshes are not compared")
@@ -103,7 +104,7 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
     if ratio < _RATIO:
         raise ModelError(
             f"the finer model has {len(nodes[1])} nodes, this one {len(nodes[0])}: element sizes "
-            f"with a ratio of {ratio:.3g} do not show where both lead. Halve the elements."
+            f"with a ratio of {ratio:.3g} are too close for an extrapolation. Halve the elements."
         )
     shapes = _at_common_places(coarse, finer)
     X, Y = (one / np.linalg.norm(one, axis=0) for one in shapes)
@@ -118,8 +119,8 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
     found = np.flatnonzero((pairs.partner >= 0) & (np.arange(coarse.n_modes) >= coarse.n_rigid))
     if not found.size:
         raise ModelError(
-            "no elastic mode of the two meshes has a shape in common: they are not of one "
-            "structure, or its coordinates have other units."
+            "no elastic modes of the two meshes have the same shape: the meshes belong to "
+            "different structures, or their coordinates have different units."
         )
     partners = pairs.partner[found]
     f, fine = coarse.freq[found], finer.freq[partners]
@@ -136,13 +137,14 @@ def _at_common_places(coarse: Any, finer: Any) -> tuple[FloatArray, FloatArray]:
     return np.real(coarse.phi[chosen]), rows @ np.real(finer.phi)
 
 
-#: relative distance of the poles from those measured at which the search ends, and its most steps:
-#: with coupling by damping of a share c of a pole's distance from the next an error falls by c
+#: relative distance from the measured poles at which the search ends, and largest number of steps.
+#: When damping couples modes by a fraction c of the distance between poles, a step multiplies the
+#: error by c
 _REACHED, _STEPS = 1e-10, 50
 
 
 def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]:
-    """Return the places (m,) from 0 of measured modes among all, and their poles [rad/s].
+    """Return the positions (m,), from 0, of the measured modes and their poles [rad/s].
 
     Raises
     ------
@@ -163,7 +165,7 @@ def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]
 def calibrated_matrices(
     M: FloatArray, D: FloatArray, K: FloatArray, n_rigid: int, places: IntArray, poles: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return D and K with the poles of some modes as measured, and the shapes as they are.
+    """Return D and K that give some modes their measured poles and keep the shapes.
 
     With phi of (K, M), ``K + M phi diag(omega_m^2 - omega^2) phi^T M`` and the same of D; the
     coupling of modes by D stays, so that the diagonal is searched for.
@@ -176,7 +178,7 @@ def calibrated_matrices(
     phi = la.eigh(K, M)[1]
     stiff, damp = phi.T @ K @ phi, phi.T @ D @ phi
     square, rate = np.diag(stiff).copy(), np.diag(damp).copy()
-    square[:n_rigid] = 0.0  # not the rounding of K
+    square[:n_rigid] = 0.0  # exactly zero, without the rounding of K
     square[places], rate[places] = np.abs(poles) ** 2, -2.0 * poles.real
     for _ in range(_STEPS):
         now = _poles_near(square, rate, damp, poles)
@@ -199,15 +201,15 @@ def _poles_near(
     """Return the poles of ``p'' + (rate + coupling) p' + square p = 0`` next to those wanted."""
     C, scale = damp.copy(), np.sqrt(np.maximum(square, 0.0))
     np.fill_diagonal(C, rate)
-    # balanced: speeds and frequency times position, which rigid-body modes do not need
+    # balanced states: velocity, and frequency times position (not for rigid-body modes)
     A = np.block([[np.zeros_like(C), np.diag(scale)], [-np.diag(scale), -C]])
     found = np.linalg.eigvals(A)
     return np.asarray(found[np.argmin(np.abs(found[:, None] - wanted), axis=0)])
 
 
-#: relative: a frequency that rounding of K may change by more is one to know of
+#: relative change of a frequency by the rounding of K above which the text shows it
 _SOFT = 1e-4
-#: relative: what complex shapes span less than this is rounding
+#: relative singular value of complex shapes below which it counts as zero
 _TRUNCATED = SAME
 
 
@@ -215,7 +217,7 @@ def _nothing() -> FloatArray:
     return np.zeros(0)
 
 
-#: field: a number of each attachment vector
+#: field: one number for each attachment vector
 _OF_VECTORS = checked(real_array, shape=("vector_dofs",))
 
 
@@ -248,11 +250,12 @@ class Modes(Placed, Value):
     dofs : DofSet
         The n rows.
     n_rigid : int
-        How many rigid-body modes there are.
+        Number of rigid-body modes.
     vectors, vector_omega, vector_zeta : (n, m), (m,), (m,) arrays
         Residual attachment vectors.
     vector_dofs : sequence of m str
-        The places they belong to (together: they are mixed to become diagonal).
+        Places of the vectors. All vectors share all places, since they are mixed to become
+        diagonal.
     residual : (k,) array
         ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode (rigid-body ones: 0), as
         `solve_modes` found it; empty where it is not known.
@@ -261,14 +264,13 @@ class Modes(Placed, Value):
         error of its frequency when the entries of K are rounded to double precision, which no
         solver can undo; empty where it is not known.
     certificate : Certificate
-        What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I),
+        Checks made by `solve_modes`: `orthonormality` (largest entry of phi^T M phi - I),
         `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
         `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
-        rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free),
-        and for a large model the modes `counted` (Sturm) and `found` below the frequency `shift`
-        [Hz].
+        rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free), and
+        for a large model the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
     notes : sequence of str
-        What to know of modes that a file held: what was assumed, changed, and is missing.
+        Remarks on modes read from a file: assumptions, changes and missing items.
     calibration : MeasuredModes, optional
         The measured poles that `calibrated` put in.
 
@@ -350,7 +352,7 @@ class Modes(Placed, Value):
         checked = ""
         soft = self.rounding > _SOFT
         if "counted" in self.certificate:
-            # relative to the elastic forces, which are rounding themselves in soft modes
+            # relative to the elastic forces, which are themselves rounding in soft modes
             residual = self.residual[~soft] if soft.size == self.residual.size else self.residual
             checked = (
                 f",\n  {self.certificate['counted']:.0f} counted below "
@@ -443,20 +445,21 @@ class Modes(Placed, Value):
         )
 
     def calibrated(self, measured: Any) -> Modes:
-        """Return the modes with frequency and damping of those measured, and their own shapes.
+        """Return the modes with measured frequencies and damping ratios; the shapes stay.
 
-        Poles are measured to 1e-5 or 1e-4; frequencies of a meshed drawing are 1e-3 to 1e-2 off,
-        which its shapes hardly show.
+        Measured poles have relative errors of 1e-5 to 1e-4. The frequencies of a finite-element
+        model are off by 1e-3 to 1e-2, while its shapes are much less affected.
 
         Parameters
         ----------
         measured : MeasuredModes
-            With mode numbers, from 1, rigid-body modes included.
+            Measured poles with their mode numbers, which count from 1 and include rigid-body modes.
 
         Raises
         ------
         ModelError, LabelError
-            When it has no numbers, one is not of an elastic mode here, or the modes are complex.
+            When it has no numbers, a number is not that of an elastic mode, or the modes are
+            complex.
         """
         require_real(self, "a pole is not of one of them alone (a reduced model can be calibrated)")
         known = range(self.n_rigid + self.n_unstable + 1, self.n_modes + 1)
@@ -473,16 +476,16 @@ class Modes(Placed, Value):
         )
 
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
-        """Return what the mesh costs in frequency, by Richardson's rule.
+        """Return the frequency errors of the mesh by Richardson extrapolation.
 
         Errors fall with the size of the elements to the power `order`; a frequency of the limit is
-        ``f_fine + (f_fine - f) / (r^order - 1)``. What both meshes leave out (shear, a mass, the
-        material) it cannot see.
+        ``f_fine + (f_fine - f) / (r^order - 1)``. It does not show errors that both meshes share
+        (missing shear or mass, wrong material).
 
         Parameters
         ----------
         finer : Modes
-            Modes of the same structure with smaller elements: half as large, say.
+            Modes of the same structure with smaller elements, for example half as large.
         order : float
             2 for plates and for bricks of eight nodes.
 

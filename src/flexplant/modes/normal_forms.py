@@ -18,9 +18,9 @@ from ..structure.definite import elastic_modes, signed_square
 from ..tolerances import SAME, divisor
 from .matching import runs
 
-#: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
+#: coupling of modes by D, relative to the largest modal damping, below which it counts as zero
 PROPORTIONAL = SAME
-#: damping rate of a rigid-body motion, relative to the first elastic frequency, that is let pass
+#: largest accepted damping rate of a rigid-body motion, relative to the first elastic frequency
 RIGID_DRAG = 1e-4
 
 
@@ -31,8 +31,8 @@ class NormalForm(Value):
     Parameters
     ----------
     poles : (k,) complex array [rad/s]
-        In the upper half plane, by magnitude; the rigid-body ones first and exactly 0, then the
-        growing poles s1 > 0 of unstable pairs (s1, s2).
+        Poles in the upper half plane, sorted by magnitude: rigid-body poles (exactly 0) first, then
+        the growing poles s1 > 0 of unstable pairs (s1, s2), then the others.
     phi : (n, k) array
         Normalised to ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``: mass-normalised and real when
         D is proportional, complex else. Rigid-body shapes are real and M-orthonormal. The shapes
@@ -43,7 +43,7 @@ class NormalForm(Value):
     decaying : (u,) array [1/s]
         The decaying poles s2 < 0 of the unstable pairs.
     overdamped : (m,) array [1/s]
-        Negative real poles of motions that do not oscillate, by magnitude: no modes.
+        Negative real poles of motions that do not oscillate, by magnitude. They are not modes.
     overdamped_phi : (n, m) array
         Their shapes, of any length.
 
@@ -118,7 +118,7 @@ def normal_form(
     *,
     lowest: int | None = None,
 ) -> NormalForm:
-    """Return poles and shapes of a second-order model, rigid-body motions deflated.
+    """Return poles and shapes of a second-order model; rigid-body motions are deflated.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def normal_form(
     motions : function, optional
         Gives the M-orthonormal rigid-body motions (n, m), held or not: K may be negative for them.
     lowest : int, optional
-        How many of the elastic modes that oscillate, at most, overdamped motions being set apart
-        (`overdamped`). None: all modes, and overdamped ones are refused.
+        Largest number of oscillating elastic modes. Overdamped motions are then listed separately
+        (`overdamped`). None: all modes, and overdamped motions raise an error.
 
     Returns
     -------
@@ -147,8 +147,9 @@ def normal_form(
 
     Notes
     -----
-    Eigenvalues of (K, M) alone give rigid-body modes at rounding, some of them imaginary; here
-    they are taken out of the problem first. Rigid-body modes are undamped by convention.
+    An eigenvalue solver for (K, M) gives rigid-body frequencies of rounding size, some of them
+    imaginary. Here the rigid-body motions are removed from the problem first. Rigid-body modes are
+    undamped by convention.
 
     Examples
     --------
@@ -231,13 +232,13 @@ class RealForm(NamedTuple):
         return float(np.abs(self.C[: self.n_rigid, : self.n_rigid]).max(initial=0.0))
 
     def condition(self, form: NormalForm) -> float:
-        """Return the largest condition of a complex mode: how much rounding grows in its residue.
+        """Return the largest condition number of a complex mode, by which rounding grows.
 
         ``|v|^2 / (2 |lambda| |Im lambda|)`` with ``v = (Omega x, lambda x)``: 1 for real modes,
         without bound where two modes coalesce or one becomes critically damped.
         """
         r = self.n_rigid
-        swing = slice(r + form.decaying.size, None)  # real pairs +-s are always apart
+        swing = slice(r + form.decaying.size, None)  # real pairs +-s are always separate
         mix = np.linalg.lstsq(self.phi[:, r:], form.phi[:, swing], rcond=None)[0]
         poles = form.poles[swing]
         size = np.linalg.norm(self.omega[r:, None] * mix, axis=0) ** 2
@@ -295,13 +296,13 @@ def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, Compl
 
 #: eigenvalues closer than this (relative) have no separate eigenvectors
 _CLUSTER = 1e-7
-#: what modes may leave, relative
+#: largest relative residual of modes
 _RESIDUAL = 1e-10
-#: the part of damping whose rounding that is
+#: fraction of the damping whose rounding counts in that residual
 _ROUNDED = 1e-4
-#: mixing of shapes by rounding that one Newton step takes out
+#: mixing of shapes by rounding that one Newton step removes
 _MIXED = 1e-2
-#: what a plant makes of damping that modes cannot express
+#: advice for damping that modes cannot express
 PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
 
@@ -357,7 +358,7 @@ def _complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> N
 
 
 def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return which eigenvalues grow, decay, both the fastest first, or oscillate, the slowest."""
+    """Return which eigenvalues grow, decay (fastest first) or oscillate (slowest first)."""
     order = np.argsort(np.abs(values), kind="stable")
     sorted_ = values[order]
     real = np.abs(sorted_.imag) <= SAME * np.abs(sorted_)
@@ -366,7 +367,7 @@ def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
-    """Return shapes (k, u) of which growing and decaying ones are ``Re +- Im``; both are real."""
+    """Return shapes (k, u) whose ``Re + Im`` grow and whose ``Re - Im`` decay, all real."""
     both = np.hstack([grow, decay])
     if np.abs(both.imag).max() > SAME * np.abs(both).max():
         raise SolverError(
@@ -380,7 +381,7 @@ def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
 
 def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray, ComplexArray]:
     """Return all poles (2k,) and eigenvectors (2k, 2k) of the states ``(|Omega| p, p')``."""
-    # all entries are rates; low ones next to strong damping are large eigenvalues of the inverse
+    # all entries are rates; slow modes beside strong damping are large eigenvalues of the inverse
     none, size = np.zeros((omega.size, omega.size)), np.abs(omega)
     if low and np.all(omega > 0):
         soft = C / np.outer(omega, omega)
@@ -393,7 +394,7 @@ def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray
 def _relative_residual(
     poles: ComplexArray, mix: ComplexArray, omega: FloatArray, C: FloatArray
 ) -> FloatArray:
-    """Return the relative residual (k,) that modes leave."""
+    """Return the relative residual (k,) of modes."""
     rest = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
     # the rounding of stronger damping counts as well
     rate = np.abs(omega).max(initial=0.0) + _ROUNDED * np.abs(C).max(initial=0.0)

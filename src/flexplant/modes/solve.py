@@ -44,11 +44,11 @@ from .statics import (
     stiffness_factor,
 )
 
-#: elastic modes that responses are made of at least
+#: least number of elastic modes in the basis of responses
 _FEW = 6
-#: modes of models that are in use
+#: cache: modes of models that are in use
 _solved: weakref.WeakKeyDictionary[FEModel, weakref.ref[Modes]] = weakref.WeakKeyDictionary()
-#: with a larger part of all modes wanted, a dense solution of a model of this size is faster
+#: fraction of all modes above which a dense solution of a model of this size is faster
 _MANY, _DENSE_MANY = 10, 6000
 
 
@@ -69,12 +69,13 @@ def solve_modes(
     ----------
     model : FEModel
     count : int, optional
-        Number of modes, rigid-body modes included. A cut through a repeated pair keeps an
-        arbitrary half of it.
+        Number of modes, rigid-body modes included. When it cuts a repeated pair, one arbitrary
+        shape of the pair is kept.
     below : float [Hz], optional
-        Keep modes up to this frequency. With neither, all modes (of a model that is not large).
+        Highest frequency of the modes that are kept. Without `count` and `below`, all modes of a
+        small model.
     damping : ModalDamping or Rayleigh, optional
-        In place of the model's D. None: its D, and no damping when it has none.
+        Damping used in place of the model's D. None: the model's D, or no damping without D.
     compliance_at : place or sequence of places
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
         modes is kept, by residual attachment vectors.
@@ -83,29 +84,30 @@ def solve_modes(
     factor : Pardiso or Cholmod, optional
         Solver of a large sparse model in place of the library's own.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------
     Modes
-        Complex where the model's own D is not proportional. Checked: residuals,
-        M-orthonormality, and that no mode was left out. Each undamped frequency is right to 1e-8
-        of itself or to its own `rounding`, whichever is larger: soft suspensions next to stiff
-        elements, fine meshes and stiff grounding springs included. Springs of negative stiffness
-        give unstable modes, with negative frequencies (see `Modes`).
+        Complex where the model's own D is not proportional. Checked: residuals, M-orthonormality,
+        and that no mode was left out. Each undamped frequency has a relative error of at most 1e-8
+        or its `rounding`, whichever is larger: soft suspensions next to stiff elements, fine meshes
+        and stiff grounding springs included. Springs of negative stiffness give unstable modes,
+        with negative frequencies (see `Modes`).
 
     Raises
     ------
     ModelError
-        When the request does not fit the model, K is indefinite for other motions than those of a
-        rigid body, or it has a zero-energy motion that is not a rigid-body one.
+        When the request does not fit the model, K is indefinite in a motion that bends the
+        structure, or a motion without energy is not a rigid-body motion.
     SolverError
         When the answer fails its check.
 
     Warns
     -----
     FlexplantWarning
-        When overdamped motions have real poles among the modes, which no modes express.
+        When overdamped motions have real poles among the modes; modes cannot express them.
 
     References
     ----------
@@ -137,7 +139,8 @@ def solve_modes(
     if at and model.n_unstable:
         raise ModelError(
             "compliance_at needs a structure that is free or held: the static response on springs "
-            "of negative stiffness is no measure of what modes leave out. Solve the free structure "
+            "of negative stiffness does not measure what the truncated modes leave out. Solve "
+            "the free structure "
             "with compliance_at, then fx.plant.suspend(modes, springs)."
         )
     names = labels_of(at, model.dofs)
@@ -193,7 +196,7 @@ def solve_modes(
 
 def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
     """Return the undamped modes of a structure up to a frequency, and perhaps further."""
-    # those that `solve_modes` found for this model are taken while they are in use
+    # modes that `solve_modes` found for this model are used again while they are in memory
     known = _solved.get(model)
     modes = known() if known is not None else None
     least = min(least, model.n_dof)
@@ -215,13 +218,16 @@ def _mode_request(model: FEModel, count: int | None, below: float | None) -> tup
     top = np.inf if below is None else (2 * np.pi * positive(below, "below")) ** 2
     if count is None:
         if below is None and n > DENSE_LIMIT:
-            raise ModelError(f"a model of {n} DOFs needs count= or below= (Hz): not all its modes.")
+            raise ModelError(
+                f"a model of {n} DOFs is too large for all its modes. Give count= or below= (Hz)."
+            )
         return n, top
     number = isinstance(count, int | np.integer) and not isinstance(count, bool)
     if not number or not max(r, 1) <= count <= n:
         raise ModelError(
             f"count must be a whole number from {max(r, 1)} (rigid-body modes stay: {r}) "
-            f"to {n} (all modes), got {short(count)}. Choose one there, or give below= in Hz."
+            f"to {n} (all modes), got {short(count)}. Choose a number in this range, or give "
+            "below= in Hz."
         )
     return int(count), top
 
@@ -255,7 +261,7 @@ def _undamped(
     n, r = rigid.shape
     certificate = Certificate()
     if np.isfinite(top) and DENSE_LIMIT < n <= _DENSE_MANY and is_large(model):
-        # how many there are decides whether a dense solution is faster
+        # their number decides whether a dense solution is faster
         count = min(count, max(modes_below(model, top), r))
     small = n <= DENSE_LIMIT or (n <= _DENSE_MANY and _MANY * count > n)
     if small or not sp.issparse(model.K) or not sp.issparse(model.M):
@@ -287,7 +293,7 @@ def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool
     check_drag(phi[:, :r], D, omega[r:])
     forces = np.asarray(D @ phi[:, r:])
     rate = np.sum(phi[:, r:] * forces, axis=0)
-    # all of D phi, not only its part in the kept modes: D may couple to truncated ones
+    # all of D phi, not only its projection on the kept modes, since D may couple to truncated modes
     stray = forces - np.asarray(model.M @ phi[:, r:]) * rate
     coupling = np.linalg.norm(stray / np.sqrt(diagonal(model.M))[:, None], axis=0)
     largest = float(np.max(diagonal(D) / diagonal(model.M), initial=0.0))
@@ -323,11 +329,11 @@ def _coupled_modes(
     return leaving_overdamped(form, found, top)
 
 
-#: M-orthonormality that every result must have
+#: largest error of M-orthonormality of a result
 _ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
 _RESIDUAL = (1e-8, 1e-12)
-#: the part of the largest entry of a shape that counts for the rounding of each
+#: fraction of the largest entry of a shape that counts in the rounding of every entry
 _ENTRY = 1e-3
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -337,8 +343,8 @@ def check_modes(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Raise SolverError unless shapes are M-orthonormal and fulfil the eigenvalue problem.
 
-    Returned are the error of orthonormality, the residual of each mode, and the relative error of
-    its frequency that rounding of K's entries may make.
+    Returns the error of orthonormality, the residual of each mode, and the relative error of its
+    frequency from rounding of K's entries.
     """
     gram, size, limit, left, rounding = _mode_residuals(model, omega, phi)
     error = float(np.abs(gram - np.eye(omega.size)).max(initial=0.0))
@@ -367,7 +373,8 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
     """Return what `check_modes` judges, from separate products."""
     M, K = by_rows(model.M), by_rows(model.K)
     size_of_K, stiff = Absolute(K), diagonal(model.K)
-    # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more
+    # scaled by stiffness, so that displacements compare with rotations and DOFs without inertia
+    # weigh the same
     weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
     rows = size_of_K @ np.ones((stiff.size, 1))
     gram = np.eye(omega.size)
@@ -379,7 +386,7 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
         gram[at.start :, at] = phi[:, at.start :].T @ mass
         whole = size_of_K @ moved
         rounding[at] = _EPS * np.sum(moved * whole, axis=0)
-        # an entry of a shape is known to a rounding of its largest ones, which stiff springs
+        # an entry of a shape has the rounding error of the largest entries, which stiff springs
         # multiply
         whole += rows * (_ENTRY * moved.max(axis=0))
         inertia = np.linalg.norm(weight * mass, axis=0) * omega[at] ** 2
@@ -394,7 +401,7 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
 
 
 def rigid_residual(model: FEModel) -> float:
-    """Return ``||K R||``, in terms of what would be there if nothing cancelled."""
+    """Return ``||K R||`` relative to its size if nothing cancelled."""
     K, R = by_rows(model.K), model.rigid_body
     whole = np.linalg.norm(abs(K) @ np.abs(R), axis=0)
     return float(np.max(np.linalg.norm(K @ R, axis=0) / divisor(whole)))
@@ -402,25 +409,25 @@ def rigid_residual(model: FEModel) -> float:
 
 #: steps after which no further progress is expected
 _STEPS = 30
-#: part of a correction, beyond the basis, below which it is rounding
+#: fraction of a correction outside of the basis below which it counts as zero
 _NEW = 1e-7
-#: more undamped modes than wanted, as a part and at least; and how far beyond a band
+#: additional undamped modes as a fraction and at least; and factor on the end of a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
 
 def wider(count: int, top: float, n: int) -> tuple[int, float]:
-    """Return how many undamped modes, and up to which omega^2, make a basis of complex ones."""
+    """Return the number of undamped modes in a basis of complex ones, and the last omega^2."""
     return min(n, count + max(count // _MORE, _LEAST)), top * _BEYOND**2
 
 
 def damped_modes(
     model: FEModel, phi: FloatArray, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> Modes:
-    """Return the complex modes of a large model, by a basis that grows until they are right."""
+    """Return the complex modes of a large model, from a basis that grows until they converge."""
     # Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
-    # dampers, and `(K - sigma M)^-1` times what the complex modes leave in
-    # `(lambda^2 M + lambda D + K) x = 0`, again and again (Davidson's method for the quadratic
-    # problem), until they leave no more than undamped modes may [Sleijpen1996]_
+    # dampers, and `(K - sigma M)^-1` times what the complex modes leave in `(lambda^2 M + lambda D
+    # + K) x = 0`, again and again (Davidson's method for the quadratic problem), until their
+    # residuals are as small as those allowed for undamped modes [Sleijpen1996]_
     factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
     V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])
     for _ in range(_STEPS):
@@ -465,7 +472,8 @@ def _ritz(
     model: FEModel, V: FloatArray, r: int, count: int, top: float
 ) -> tuple[NormalForm, np.ndarray]:
     M, D, K = (_projected(part, V) for part in (model.M, model.D, model.K))
-    K[:r], K[:, :r] = 0.0, 0.0  # rounding of stiff shapes would hold rigid-body motions
+    # rounding of stiff shapes would act as a spring on rigid-body motions
+    K[:r], K[:, :r] = 0.0, 0.0
     rigid = np.eye(V.shape[1], r)
     body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
     form = normal_form(M, D, K, rigid, lambda: body, lowest=max(count - r, 0))
@@ -478,7 +486,7 @@ def _projected(matrix: Any, V: FloatArray) -> FloatArray:
 
 
 def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> Modes:
-    """Return modes up to omega^2 with a note of the real poles there, which are warned of."""
+    """Return modes up to omega^2 with a note of the real poles there, and warn of these."""
     note = form.overdamped_below(_range(modes.poles, top))
     if not note:
         return modes
@@ -487,12 +495,12 @@ def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> M
 
 
 def _range(poles: ComplexArray, top: float) -> float:
-    """Return up to which rate [1/s] poles are wanted: omega^2, or as far as these reach."""
+    """Return the largest rate [1/s] of wanted poles: from omega^2, or from the modes."""
     return float(np.sqrt(top) if np.isfinite(top) else np.abs(poles).max(initial=0.0))
 
 
 def _growing(form: NormalForm, shapes: Any, keep: np.ndarray) -> Any:
-    """Return shapes, those of unstable modes of the growing pole."""
+    """Return shapes; for an unstable mode, the shape of the growing pole."""
     unstable = form.omega[keep] < 0
     return np.where(unstable, shapes.real + shapes.imag, shapes) if unstable.any() else shapes
 
@@ -500,32 +508,33 @@ def _growing(form: NormalForm, shapes: Any, keep: np.ndarray) -> Any:
 def _rest(
     model: FEModel, poles: ComplexArray, x: Any, n_rigid: int
 ) -> tuple[ComplexArray, FloatArray, FloatArray]:
-    """Return what modes leave in the eigenvalue problem (n, k), its size and its limit (k,)."""
+    """Return the residuals (n, k) of modes, their size (k,) and their limit (k,)."""
     K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)
     inertia = (M @ x) * poles**2
     rest = inertia + (D @ x) * poles + K @ x
     stiff = diagonal(model.K)
     weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
     size = np.linalg.norm(weight * rest, axis=0)
-    # an entry of a shape is known to a rounding of its largest ones, as in undamped modes
+    # an entry of a shape has the rounding error of the largest entries, as in undamped modes
     moved = np.abs(x)
     moved = moved + _ENTRY * moved.max(axis=0)
     whole = Absolute(K) @ moved + np.abs(poles) * (Absolute(D) @ moved)
     limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
-    # real poles are not among what is returned: their place suffices
+    # real poles are not returned: their approximate place suffices
     part = np.where(poles.imag == 0, _RESIDUAL[0], _RESIDUAL[1])
     limit = limit + part * np.linalg.norm(weight * whole, axis=0)
-    size[:n_rigid] = 0.0  # at zero by convention: checked as undamped modes
+    size[:n_rigid] = 0.0  # zero by convention; rigid-body modes are checked as undamped modes
     return np.asarray(rest), np.asarray(size), np.asarray(limit)
 
 
-#: DOFs at which dampers act, at most, and their forces, at most: more of them are a material's
+#: largest number of DOFs at which dampers act, and of their forces; above it D is material damping
 _TOUCHED, _FORCES = 600, 200
 
 
 def damper_forces(model: FEModel) -> FloatArray:
     """Return orthonormal forces (n, m) that span those of dampers."""
-    # none where D is a multiple of K and M, or at so many DOFs that it is a material's
+    # empty where D is a combination of K and M, or acts at so large a number of DOFs that it is
+    # material damping
     none = np.zeros((model.n_dof, 0))
     if model.D is None or is_rayleigh(model):
         return none

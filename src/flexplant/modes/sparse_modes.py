@@ -1,4 +1,4 @@
-"""The lowest modes of a large sparse structure, counted: none is missing."""
+"""The lowest modes of a large sparse structure, with a count that shows that all are found."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ from .statics import (
     stiffness_factor,
 )
 
-#: modes beyond the last wanted one among which a gap is searched
+#: number of modes above the last wanted one among which a gap is searched
 _EXTRA = 4
-#: omega^2 closer than this (relative), or than this number of their roundings, belong together
+#: relative distance of omega^2, and distance in roundings, below which values form one group
 _GAP, _GAP_ROUNDINGS = SAME, 4.0
-#: more modes than this are not looked for: their shapes and the basis fill the memory
+#: largest number of modes: above it the shapes and the basis fill the memory
 _MOST = 2000
-#: multiplications for each mode that take as long, by DOFs and by entries of the factor: measured
-#: on solids and plates of 6 615 to 22 326 DOFs, which memory slows down
+#: cost of a mode in multiplications, per DOF and per entry of the factor: measured on solids and
+#: plates of 6 615 to 22 326 DOFs, where memory access limits the speed
 _EACH_DOF, _EACH_ENTRY = 5e4, 40.0
-#: searches with what is found locked, before giving up
+#: number of searches with the found modes locked, before giving up
 _SEARCHES = 8
-#: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
+#: residual relative to ||K phi|| above which Lanczos continues, unless it is rounding
 _RESIDUAL = NULL
 #: residuals below this many roundings of K phi are not reduced by more steps
 _ROUNDINGS = 10.0
-#: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at: of many
-#: copies of a mode the last ones come late, each search beginning with what the one before it left
+#: error of Ritz vectors, relative to the accepted residuals, at which Lanczos stops. The last of
+#: many copies of a mode appear late, since each search begins with the remainder of the previous
+#: one
 _PARTS = (1.0, *[0.03] * 5)
-#: shapes that are judged at a time, while the memory is at its peak
+#: number of shapes checked together, while memory use is at its peak
 _JUDGED = 8
 
 
@@ -57,8 +58,8 @@ def counted_modes(
     model: FEModel, count: int, top: float = np.inf, method: Pardiso | Cholmod | None = None
 ) -> tuple[FloatArray, FloatArray, Certificate]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
-    # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
-    # beside
+    # Lanczos finds them and a Sturm count in a gap above gives their number; missing modes are
+    # searched with the found ones locked
     n, r = model.rigid_body.shape
     new = search_factor
     factor: StiffnessFactor | CountingFactor | None = None
@@ -71,7 +72,7 @@ def counted_modes(
         if below <= 0:
             return np.zeros(0), np.zeros((n, 0)), _certificate(top, r, r)
         if count < below:
-            factor = None  # its shift is far above the last mode that is wanted
+            factor = None  # its shift is far above the last wanted mode
         count = min(count, below)
         if count > _MOST:
             raise ModelError(
@@ -98,7 +99,7 @@ def counted_modes(
             found = _search(model, factor, locked, missing, search)
         squares, phi = _merge_modes(model, phi, *found)
         rounding = rounding_of(model.K, phi)
-        # a motion of the geometry that is not free has springs, which rounding does not hide
+        # a rigid-body motion that is not free is held by springs, which rounding does not hide
         suspended = are_rigid(model.M, model.body_motions, phi)
         least = np.where(suspended, 0.0, rounding)
         expected = model.body_motions.shape[1]
@@ -112,7 +113,7 @@ def counted_modes(
             if not sure and squares.size == n - r:
                 sure, shift = squares.size, 2 * float(squares[-1])
             if not sure:
-                # more copies of one mode than were found: none of another may be below them
+                # more copies of one mode than were found: no other mode may lie below them
                 sure, shift = _gap_below(squares, count, rounding)
                 if not shift:
                     missing = min(squares.size, n - r - squares.size)
@@ -168,7 +169,7 @@ def _search(
     squares, found = _search_once(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
         beside, missing = np.hstack([locked, found]), want - found.shape[1]
-        # of a repeated mode, a block sees no more copies than it has vectors
+        # a block of vectors finds at most as many copies of a repeated mode as it has vectors
         block = min(2 * block, max(block, missing))
         more = _search_once(model, factor, beside, missing, rng, None, block)
         if not more[0].size:
@@ -211,7 +212,7 @@ def _search_once(
         iterated(factor.solve, mass, locked, phi)
         values, phi = rayleigh_ritz(stiffness, mass, phi)
         kept = values[: values.size - extra] if values.size == want else values
-        # what the rounding of the largest 1 / (omega^2 - sigma) lets be reached
+        # accuracy limit from the rounding of the largest 1 / (omega^2 - sigma)
         reached = 2 * REACHED * (kept - factor.sigma) / (values[0] - factor.sigma)
         left = _excess(stiffness, mass, kept, phi, reached)
         if left < best:
@@ -224,7 +225,7 @@ def _search_once(
 def _excess(
     K: Any, M: Any, squares: FloatArray, phi: FloatArray, least: FloatArray | float
 ) -> float:
-    """Return the largest residual of the first shapes, relative to what is let pass or `least`."""
+    """Return the largest residual of the first shapes, relative to its limit or `least`."""
     left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), Absolute(K)
     for at in column_groups(squares.size, _JUDGED):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
@@ -235,7 +236,7 @@ def _excess(
 
 
 def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
-    """Return the relative error of each shape at which `part` of its residual is let pass."""
+    """Return the relative error of each shape at which its residual is `part` of the limit."""
     size_of_K, limit = Absolute(K), np.zeros(phi.shape[1])
     for at in column_groups(limit.size, _JUDGED):
         limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
@@ -243,7 +244,7 @@ def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
 
 
 def _let_pass(K: Any, size_of_K: Absolute, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return forces ``K phi`` and, relative to each, the residual that is let pass."""
+    """Return forces ``K phi`` and the residual limit relative to each."""
     force = np.asarray(K @ phi)
     rounding = np.finfo(np.float64).eps * np.linalg.norm(size_of_K @ np.abs(phi), axis=0)
     return force, np.maximum(_RESIDUAL, _ROUNDINGS * rounding / np.linalg.norm(force, axis=0))
@@ -257,8 +258,8 @@ def _is_gap(squares: FloatArray, count: int, top: float, rounding: FloatArray) -
 
 
 def _widest_gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
-    """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
-    # gaps narrower than some roundings of the modes beside them, or than 1e-8, are none
+    """Return the number of modes below the widest gap above the last wanted one, and its middle."""
+    # gaps narrower than 1e-8 or than some roundings of the neighbouring modes do not count
     above, least = squares[count - 1 :], _GAP_ROUNDINGS * rounding[count - 1 :]
     wide = np.diff(above)
     real = (wide > _GAP * above[1:]) & (wide > least[1:]) & (wide > least[:-1])
@@ -271,8 +272,8 @@ def _widest_gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[
 def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
     """Return how many modes lie below all copies of the last wanted one, and the middle of the gap.
 
-    Copies are equal to 1e-8 or to some roundings, the first and the last too. A shift of 0: they
-    are no copies.
+    Copies agree to 1e-8 or to some roundings, the first with the last as well. The shift is 0 when
+    the modes are not copies.
     """
     closest = np.maximum(_GAP * squares[-1], _GAP_ROUNDINGS * float(rounding[-1]))
     first = int(np.searchsorted(squares, squares[-1] - closest))
@@ -281,18 +282,18 @@ def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[i
     return first, 0.5 * (before + float(squares[first])) if apart else 0.0
 
 
-#: steps with M times the last block in place of residuals
+#: number of steps that use M times the last block in place of residuals
 _FIRST = 10
-#: residual, relative to ||K phi||, at which a value is known: its error is of the second order
+#: residual relative to ||K phi|| at which an eigenvalue is accepted: its error is of second order
 _VALUE = 1e-5
 #: residual below which the limit of a shape is computed
 _NEAR = 1e-8
-#: shapes that are improved at a time: a pass over the factor costs little more for more of them
+#: number of shapes improved together: one pass over the factor serves all of them
 _IMPROVED = 24
-#: steps before giving up, beyond one for each mode
+#: number of steps before giving up, in addition to one for each mode
 _STEPS = 40
-#: after this number of steps modes must not be lower than this fraction of -sigma (where it is
-#: below zero), to converge fast
+#: number of steps after which, for fast convergence, modes must lie above this fraction of -sigma
+#: (where sigma is below zero)
 _EARLY, _FAR = 12, 0.1
 
 
@@ -313,7 +314,7 @@ class BlockDavidson(BlockLanczos):
     ) -> None:
         super().__init__(solve, M, locked, want=want, rng=rng, start=start)
         self._K, self._sigma = by_rows(K), sigma
-        # until errors of P show, the steps of Lanczos do as well and cost less
+        # as long as the errors of P do not matter, Lanczos steps converge as fast and cost less
         for _ in range(_FIRST):
             if self._loaded.shape[1]:
                 self._extend(self._loaded)
@@ -322,7 +323,8 @@ class BlockDavidson(BlockLanczos):
         self, count: int, extra: int, needed: Callable[[FloatArray], FloatArray]
     ) -> FloatArray:
         """Return the lowest shapes (n, count), the last `extra` of them for their values only."""
-        # the last `extra` for their values only; `needed` gives the residuals shapes may leave
+        # only the values of the last `extra` are needed; `needed` gives the residual limits of
+        # shapes
         found = np.zeros(count, dtype=bool)
         self._limit, self._left = np.zeros(count), np.full(count, np.inf)
         for _ in range(_STEPS + count):
@@ -331,11 +333,11 @@ class BlockDavidson(BlockLanczos):
                 break
             at = np.flatnonzero(~found[: self._m])[:_IMPROVED]
             residual, found[at] = self._residuals(squares, mix, at, needed)
-            # a shape is as good as those of the same value: they may be mixed
+            # shapes of equal values have the same accuracy, since they may be mixed
             last = squares[:count][-extra - 1] * (1 + SPREAD)
             shapes = int(np.searchsorted(squares[:count], last, side="right"))
             if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
-                # all of them once more: a mode found late moves those above it
+                # check all again: a mode found late changes those above it
                 at = np.arange(count)
                 self._limit[:], self._left[:] = 0.0, np.inf
                 residual, found = self._residuals(squares, mix, at, needed)
@@ -358,7 +360,7 @@ class BlockDavidson(BlockLanczos):
         block, self._loaded, _ = self._orthonormal(moved / np.linalg.norm(moved, axis=0))
         width = block.shape[1]
         if not width:
-            raise SolverError("the corrections of a Davidson iteration bring nothing new.")
+            raise SolverError("the corrections of a Davidson iteration add no new direction.")
         self._append(block)
         along = along_basis(self._V[self._r : self._r + self._m], np.asarray(self._K @ block))
         grown = np.zeros((self._m, self._m))

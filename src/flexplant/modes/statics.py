@@ -1,4 +1,4 @@
-"""The factor of K - sigma M, for modes and statics; what kept modes leave of static responses."""
+"""The factor of K - sigma M for modes and statics; static correction of kept modes."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from ..structure import FEModel
 from ..structure.definite import signed, unstable_stiffness
 from ..tolerances import ROUNDING, SAME, TINY, divisor
 
-#: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
-#: of nearly all models, yet K - sigma M is well away from singular
+#: shift in units of the rounding of rigid-body energies: far below the first elastic mode of nearly
+#: all models, and K - sigma M is still well-conditioned
 _SHIFT = -3e3
-#: the same in single precision: the lowest elastic modes of a bulky structure are higher, or not
-#: much lower, and rounding leaves K - sigma M definite
+#: the same in single precision: the lowest elastic modes of a bulky structure lie above it, or not
+#: far below, and K - sigma M stays definite in spite of rounding
 _SINGLE_SHIFT = -30.0
-#: of models that are in use
+#: cache of the factors of models that are in use
 _held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]] = (
     weakref.WeakKeyDictionary()
 )
@@ -38,7 +38,7 @@ _dissected: weakref.WeakKeyDictionary[FEModel, Dissection] = weakref.WeakKeyDict
 class StiffnessFactor:
     """``K - sigma M = L L^T`` of a sparse model, with sigma just below zero.
 
-    Get it from `stiffness_factor`, which returns the same one as long as it is in use.
+    Made by `stiffness_factor`, which returns the same object as long as it is in use.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class StiffnessFactor:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
         self.rigid = model.rigid_body
-        # of motions, not of single DOFs: next to no inertia in some of these says nothing
+        # use motions, not single DOFs: a DOF may have almost no inertia
         near = self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
         self.single = single
         if single:
@@ -107,16 +107,18 @@ class StiffnessFactor:
             u += step
             residual -= force * length
             residual -= inertia @ (R.T @ residual)
-            # measured in energy: in forces, rounding of stiff directions would hide the rest
+            # error measured as energy: among forces, the rounding of stiff directions would hide
+            # the rest
             part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), TINY))
             if np.all((part <= ROUNDING) | (wanted == 0)) or np.all(part >= best):
                 break
             best, old = part, divisor(new)
-        # an energy: the shapes that are made of it keep ten digits and more
+        # tolerance in energy: shapes built from the response keep at least ten digits
         if not np.all((part <= 1e-7) | (wanted == 0)):
             raise SolverError(
-                f"a static response is not found (the last step is {part.max():.1g} of it): K is "
-                f"singular beyond the {counted(R.shape[1], 'rigid-body motion')} of the geometry. "
+                f"a static response did not converge (relative last step {part.max():.1g}): K is "
+                f"singular beyond the {counted(R.shape[1], 'rigid-body motion')} of the "
+                "geometry. "
                 "Look for a mechanism, a DOF without stiffness, or wrong coordinates."
             )
         return u - R @ (inertia.T @ u)
@@ -140,7 +142,7 @@ class CountingFactor:
 
 
 def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
-    """Return the factor at omega^2 = `square` of a bulky stable model; None: it saves nothing."""
+    """Return the factor at omega^2 = `square` of a bulky stable model, else None."""
     order = dissection_of(model)
     if not order.is_costly or model.n_unstable:
         return None
@@ -184,7 +186,7 @@ def dissection_of(model: FEModel) -> Dissection:
     found = _dissected.get(model)
     if found is None:
         M, K = sp.csc_array(model.M), sp.csc_array(model.K)
-        # of both matrices: entries that cancel in one stay in the other
+        # the pattern of both matrices: entries that cancel in one stay in the other
         pattern = K if same_pattern(K, M) else sp.csc_array(abs(K) + abs(M))
         found = dissect(pattern, model.dofs.node_index, model.dofs.xyz)
         _dissected[model] = found
@@ -193,7 +195,7 @@ def dissection_of(model: FEModel) -> Dissection:
 
 def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
     """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm)."""
-    # without `single`, single precision is not tried: it was refused before
+    # without `single`, single precision is skipped, since it failed before
     shifted = _shift_matrix(model.K, model.M, square)
     return multifrontal_inertia(shifted, dissection_of(model), single=single)
 
@@ -205,7 +207,7 @@ def _shift_matrix(K: Any, M: Any, square: float) -> Any:
     return sp.csc_array((K.data - square * M.data, K.indices, K.indptr), shape=K.shape)
 
 
-#: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
+#: fraction of the elastic compliance of a place below which the truncated part counts as zero
 _NEGLIGIBLE = SAME
 
 
@@ -269,7 +271,7 @@ def attachment_vectors(
     gram = response.T @ np.asarray(M @ response)
     size = np.sqrt(np.diag(gram))
     lowest = la.eigvalsh(gram / np.outer(size, size))[0]
-    # squares: vectors whose angle is below 1e-5 are one
+    # squared: vectors with an angle below 1e-5 count as one
     if lowest < 1e-10:
         raise ModelError(
             f"the attachment vectors of {', '.join(place_of(place) for place in at)} depend on "
@@ -284,14 +286,14 @@ def attachment_vectors(
 def static_response(model: Any, loads: FloatArray) -> FloatArray:
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
-    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes. Of
-    a large model by its factor; else held at the r DOFs that distinguish rigid-body motions best,
-    which in balance carry no force.
+    ``K u = f - M R R^T f``: the load minus the inertia of the rigid-body acceleration it causes. A
+    large model is solved with its factor. A small one is held at the r DOFs that distinguish
+    rigid-body motions best, which carry no force in equilibrium.
 
     Parameters
     ----------
     model : FEModel
-        Anything with M, K and rigid_body.
+        Model, or any object with M, K and rigid_body.
     loads : (n, m) array
         Forces on the DOFs [N, N m], a column for each case.
 
@@ -341,7 +343,7 @@ def static_response(model: Any, loads: FloatArray) -> FloatArray:
 
 
 def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> FloatArray:
-    """Return the damping ratios (m,) that a matrix D gives to vectors, taken one by one."""
+    """Return the damping ratio (m,) of each vector for a damping matrix D."""
     if D is None or not omega.size:
         return np.zeros(omega.size)
     rate = np.sum(vectors * np.asarray(D @ vectors), axis=0)
