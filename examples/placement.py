@@ -52,7 +52,7 @@ AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 def plants(case: dict[str, Any], rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
     """Return the sampled plant of the measured model, and three machines that it could be too."""
     small = plant_of(case, "measured").replace(evaluation=None)  # scored on its own modes
-    return small, small.uncertain(frequency=case["off"]).sample(rng, 3)
+    return small, small.uncertain(frequency=case["off"]).machines.drawn(3, rng=rng)
 
 
 def on_machine(case: dict[str, Any], plant: fx.StandardPlant) -> tuple[float, float]:

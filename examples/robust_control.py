@@ -66,7 +66,7 @@ def study() -> dict[str, Any]:
     return {
         "uncertain": uncertain, "loop": fx.close_loop(plant, *blocks),
         "robust": robust, "worst": worst, "bad": fx.close_loop(worst.machine, *blocks),
-        "gains": [peak(fx.close_loop(one, *blocks)) for one in uncertain.sample(5, 10)],
+        "gains": [peak(fx.close_loop(one, *blocks)) for one in uncertain.machines.drawn(10, rng=5)],
         "machine": machine.loop(ports(), *blocks), "weighted": weighted, "hinf": hinf,
         "few": robust_stability(alone, errors, hinf),
         "sharp": robust_stability(uncertain, errors, hinf),

@@ -218,7 +218,7 @@ class Warm(fx.plant.Uncertainty):
 
 def test_an_uncertainty_is_drawn_as_machines():
     made = plant().discretized(5e3, delay=1)
-    drawn = made.uncertain(Warm()).sample(0, 3)
+    drawn = made.uncertain(Warm()).machines.drawn(3, rng=0)
     first = fx.frequency_response(made.Gyu, [20.0]).data[0, 0, 0]
     ratios = [fx.frequency_response(one.Gyu, [20.0]).data[0, 0, 0] / first for one in drawn]
     assert all(abs(ratio.imag) < 1e-9 and 0.9 < ratio.real < 1.1 for ratio in ratios)

@@ -10,7 +10,6 @@ from flexplant.plant import gravity_axes, reference_errors
 from stages import CORNERS, L, ports, reduced, sampled, some_modes
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
 WHOLE = some_modes(count=40, attached=False)
 

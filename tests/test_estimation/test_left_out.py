@@ -21,7 +21,6 @@ from stages import CORNERS, INSET, fitted, ports, sampled
 from stages import reduced as stage_model
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
 LEVELS = (1e-4, 1e-3, 1e-2)
 DAMPINGS = (0.01, 0.001)

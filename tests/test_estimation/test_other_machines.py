@@ -4,11 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from test_kalman import modes, plate_plant
+from test_kalman import plate_plant
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
-from flexplant.estimation import design_static, errors_on_machines
+from flexplant.estimation import design_static
 from oracles_estimation import error_covariance, mean_square_and_its_error
 
 
@@ -109,51 +109,16 @@ def test_an_observer_beside_a_loop_and_what_is_refused():
         kalman.rms("die", on=wild)
 
 
-@cache
-def light():
+@pytest.mark.slow
+def test_half_a_percent_of_frequency_doubles_the_error_of_a_filter_not_of_geometry():
     """A light plate whose filter leans on its model: 0.1 % damping, quiet sensors."""
-    return plate_plant(1e-3, count=14, sensor_asd=1e-13)
-
-
-def scattered(part, count=12):
-    """Machines whose frequencies scatter by a standard deviation of this part."""
-    omega = 2 * np.pi * modes(1e-3, 14).freq[3:]
-    spread = np.concatenate([1e-5 * omega, part * omega])
-    measured = fx.MeasuredModes(
-        omega * (-1e-3 + 1j), modes=range(4, 15), covariance=np.diag(spread**2)
-    )
-    return light().uncertain(measured).sample(1, count)
-
-
-@pytest.mark.slow
-def test_half_a_percent_of_frequency_doubles_the_error_and_the_table_shows_it():
-    kalman = fx.design_kalman(light().replace(evaluation=None))
-    named = {"Kalman": kalman, "static": design_static(light().replace(evaluation=None))}
-    table = errors_on_machines(named, scattered(5e-3), "die:rx")
-    assert np.median(table["Kalman"]) > 2 * table.nominal[0]
-    assert table["static"].max() < 1.1 * table.nominal[1]
-    for k, other in enumerate(scattered(5e-3, 2)):
-        assert table["Kalman"][k] == pytest.approx(kalman.rms("die:rx", on=other), rel=1e-12, abs=0)
-    text = repr(table)
-    assert "on 12 machines" in text
-    assert "worst / own" in text
-    fine = errors_on_machines(kalman, scattered(5e-5), "die:rx")
-    assert fine.values.max() < 1.1 * fine.nominal[0]
-
-
-@pytest.mark.slow
-def test_the_table_in_a_closed_loop():
-    kalman, law = observer(), servo()
-    stiffer = plate_plant(1e-2, count=10, sensor_asd=1e-11)
-    machines = [kalman.plant, stiffer, machine()]
-    table = errors_on_machines({"a": kalman}, machines, "die", blocks=[law])
-    assert table.values[0, 0] == pytest.approx(kalman.rms("die"), rel=1e-6, abs=0)
-    loop = fx.close_loop(machine(), kalman, law)
-    assert table.values[0, 2] == pytest.approx(kalman.rms("die", on=loop), rel=1e-12, abs=0)
-    for wrong in ([], machine(), [1.0]):
-        with pytest.raises(ModelError, match="StandardPlant"):
-            errors_on_machines(kalman, wrong, "die")
-    with pytest.raises(ModelError, match="by name"):
-        errors_on_machines({"a": 1.0}, [machine()], "die")
-    with pytest.raises(LabelError, match="no POI channel"):
-        errors_on_machines(kalman, [machine()], "dye")
+    light = plate_plant(1e-3, count=14, sensor_asd=1e-13).replace(evaluation=None)
+    known = light.uncertain(frequency=0.01).nominal
+    kalman, static = fx.design_kalman(known), design_static(known)
+    each = [kalman.rms("die:rx", on=one) for one in known.machines.plants]
+    assert np.median(each) > 1.5 * kalman.rms("die:rx")
+    low, high, sentence = kalman.interval("die:rx")
+    assert low < np.median(each) < high and "95 % of such machines" in sentence
+    assert static.interval("die:rx").high < 1.2 * static.rms("die:rx")
+    fine = fx.design_kalman(light.uncertain(frequency=1e-4).nominal)
+    assert fine.interval("die:rx").high < 1.1 * fine.rms("die:rx")

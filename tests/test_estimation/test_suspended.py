@@ -29,7 +29,6 @@ from stages import ports as square_ports
 from stages import sampled as square_sampled
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
 WIDE, DEEP, THICK = 0.4, 0.3, 0.02
 EDGES = [(x, y, 0.0) for x in (0.0, WIDE) for y in (0.0, DEEP)]

@@ -41,7 +41,6 @@ ANSWERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ANSWERS)
-@pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 @pytest.mark.filterwarnings("ignore:with the modes that the plant left out")
 def test_an_answer_accounts_for_the_modes_left_out_or_says_that_it_does_not(name):
     alone, judged = (repr(ANSWERS[name](plant)) for plant in (FEW, JUDGED))
@@ -52,7 +51,6 @@ def test_an_answer_accounts_for_the_modes_left_out_or_says_that_it_does_not(name
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 def test_scores_are_those_of_the_filters_that_are_judged():
     for plant in (FEW, JUDGED):
         scores = fx.score_sensors(plant, [YS], fx.PoiVariance("die"))

@@ -195,7 +195,7 @@ def test_machines_that_are_drawn_have_the_property_at_some_value(name):
     kind, _, change, matrices = KINDS[name]
     uncertain = own.plant(reduced=matrices).uncertain(kind(own))
     base, found = own.response(), []
-    for machine in uncertain.sample(3, 120):
+    for machine in uncertain.machines.drawn(120, rng=3):
         made, x = responses(machine.system), 0.0
         for _ in range(12):  # Newton's steps to the number at which the plant by hand is the same
             now, near = (own.response(**change(own, at)) for at in (x, x + 1e-5))
@@ -218,7 +218,7 @@ def test_a_delay_is_the_plant_that_was_sampled_with_it():
             g = system.select(["y1", "y2"], ["u1", "u2"])
             gap.append([g.C @ np.linalg.solve(p * np.eye(len(g.A)) - g.A, g.B) + g.D for p in z])
         assert_same(np.array(gap[0]), np.array(gap[1]), 1e-10)
-    late = np.array([machine.delay for machine in uncertain.sample(1, 200)])
+    late = np.array([machine.delay for machine in uncertain.machines.drawn(200, rng=1)])
     assert late.std() == pytest.approx(0.15, rel=0.15)
 
 
@@ -253,7 +253,7 @@ def test_kinds_combine_in_any_order(others):
         assert_same(by_channels(uncertain, values), wanted)
         assert_same(responses(uncertain.lft(values).system), wanted)
         listed = [delta.name for delta in uncertain.deltas]
-        drawn = responses(uncertain.sample(5, 1)[0].system)
+        drawn = responses(uncertain.machines.drawn(1, rng=5)[0].system)
         first = first or (listed, drawn)
         assert listed == first[0]
         assert_same(drawn, first[1], 1e-12)
@@ -275,7 +275,7 @@ def test_neglected_modes_are_bounded_and_drawn(rate):
     uncertain = plant.uncertain(Neglected(whole()), frequency={2: 0.01})
     bound = uncertain.neglected if not rate else uncertain.neglected.sampled
     assert bound.tightest <= 1.0
-    for machine in uncertain.sample(2, 3):
+    for machine in uncertain.machines.drawn(3, rng=2):
         assert machine.system.n_states == big.system.n_states
         poles, own = (np.linalg.eigvals(one.continuous.system.A) for one in (machine, big))
         poles, own = (np.sort(np.abs(p[p.imag > 1.0])) for p in (poles, own))
@@ -288,7 +288,7 @@ def test_neglected_modes_are_bounded_and_drawn(rate):
     judged = plant.replace(evaluation=whole()).uncertain(Neglected(), frequency={2: 0.01})
     assert judged.neglected.tightest == uncertain.neglected.tightest
     np.testing.assert_array_equal(
-        judged.sample(2, 1)[0].system.A, uncertain.sample(2, 1)[0].system.A
+        judged.machines.drawn(1, rng=2)[0].system.A, uncertain.machines.drawn(1, rng=2)[0].system.A
     )
     with pytest.raises(ModelError, match="neglected twice"):
         plant.uncertain(Neglected(whole()), Neglected(whole()), frequency=0.01)
@@ -329,7 +329,7 @@ def test_a_kind_of_ones_own(rate):
     wanted = own.response(K=K, D=D)
     assert_same(by_channels(uncertain, values), wanted)
     assert_same(responses(uncertain.lft(values).continuous.system), wanted)
-    assert len({machine.system.A[1, 0] for machine in uncertain.sample(1, 5)}) == 1
+    assert len({machine.system.A[1, 0] for machine in uncertain.machines.drawn(5, rng=1)}) == 1
     assert "temperature +- 4 %" in repr(uncertain)
 
 

@@ -413,8 +413,8 @@ def test_other_densities_are_those_of_ports(held):
     pairs = [
         (found.with_ports(own.replace(y=own.y[:1])), plant.with_ports(some)),
         (found.at({own.z[0].name: there}), wanted.at({own.z[0].name: there})),
-        (found.uncertain(frequency=0.01).sample(0, 1)[0],
-         wanted.uncertain(frequency=0.01).sample(0, 1)[0]),
+        (found.uncertain(frequency=0.01).machines.drawn(1, rng=0)[0],
+         wanted.uncertain(frequency=0.01).machines.drawn(1, rng=0)[0]),
         (found.continuous.replace(asd=found.asd).discretized(RATE, delay=1.3), wanted),
     ]  # fmt: skip
     for one, other in pairs:

@@ -49,7 +49,7 @@ def test_one_number_is_for_all_elastic_modes_and_an_array_for_some():
 def test_draws_spread_as_stated():
     """At delta = 1 two standard deviations: nearly all draws lie within."""
     omega = swing(plant())[0]
-    draws = plant().uncertain(frequency=0.005).sample(3, n=200)
+    draws = plant().uncertain(frequency=0.005).machines.drawn(200, rng=3)
     spread = np.array([swing(one)[0] for one in draws]) / omega - 1.0
     assert spread.std(axis=0) == pytest.approx(np.full(5, 0.0025), rel=0.2)
     # modes 7 and 8 are a pair, which the order of their poles makes alike
@@ -106,7 +106,7 @@ def test_gains_and_delay_go_beside_a_source():
     uncertain = plant().uncertain(measured, Gains({"u1": 0.1}), Delay(0.2))
     names = [delta.name for delta in uncertain.deltas]
     assert names[-2:] == ["u1:gain", "delay"] and "mode4:freq" in names
-    assert len({one.delay for one in uncertain.sample(2, 3)}) == 3
+    assert len({one.delay for one in uncertain.machines.drawn(3, rng=2)}) == 3
 
 
 def response(system, freq):
@@ -151,7 +151,7 @@ def test_the_delay():
     wanted = plant().continuous.discretized(1.0 / plant().dt, delay=plant().delay - 0.1)
     found = response(machine.system, 130.0)
     np.testing.assert_allclose(found, response(wanted.system, 130.0), rtol=1e-9, atol=1e-20)
-    assert len({one.delay for one in uncertain.sample(1, 4)}) == 4
+    assert len({one.delay for one in uncertain.machines.drawn(4, rng=1)}) == 4
 
 
 def spring_of_masses(extra=0.0):
@@ -175,7 +175,7 @@ def test_a_parameter_of_the_model():
     wanted = response(found.continuous.system, 130.0)
     made = closed_deltas(uncertain, {"mass at 3:x": 1.0})
     np.testing.assert_allclose(made, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
-    masses = np.array([swing(one)[0][0] for one in uncertain.sample(1, 100)])
+    masses = np.array([swing(one)[0][0] for one in uncertain.machines.drawn(100, rng=1)])
     slope = (swing(found)[0][0] - swing(spring_of_masses())[0][0]) / 2.0
     assert masses.std() == pytest.approx(abs(slope), rel=0.25)  # two deviations at delta = 1
 
@@ -216,7 +216,7 @@ def test_a_parameter_beside_modes_and_gains():
     )
     made, wanted = closed_deltas(uncertain, BESIDE), response(found.continuous.system, 130.0)
     np.testing.assert_allclose(made, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
-    draws = every_kind(Delay(0.1)).sample(1, 20)
+    draws = every_kind(Delay(0.1)).machines.drawn(20, rng=1)
     assert len({one.delay for one in draws}) == 20
     assert len({swing(one)[0][0] for one in draws}) == 20
     with pytest.raises(ModelError, match="become negative"):

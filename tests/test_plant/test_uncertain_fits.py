@@ -77,7 +77,7 @@ def test_a_calibrated_plant_is_as_uncertain_as_its_poles_were_measured(seed, kin
         known = fx.solve_modes(fit.model, count=COUNT, damping=ratio)
     plant = fx.assemble_plant(known.calibrated(data), PORTS)
     uncertain = plant.uncertain(fit)
-    assert len(uncertain.sample(1, 5)) == 5
+    assert len(uncertain.machines.drawn(5, rng=1)) == 5
     if uncertain.of_matrices:  # a damper to the ground couples the modes: its parameters are
         assert [d.name for d in uncertain.deltas] == list(fit.parameters)
         return

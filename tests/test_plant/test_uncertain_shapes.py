@@ -83,7 +83,9 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
         size[size == 0] = 1.0
         assert np.abs((found.data - exact.data) / size).max() < 1e-9
     # drawn machines have independent directions of the stated deviations
-    drawn = [m.assembled.realisation.inputs[:, 3] - phi[:, 1] for m in uncertain.sample(1, 400)]
+    alone = plant.uncertain(Shapes(shapes, measured.modes, deviations=3.0))
+    machines = alone.machines.drawn(400, rng=1)
+    drawn = [m.assembled.realisation.inputs[:, 3] - phi[:, 1] for m in machines]
     wanted = shapes[0] @ shapes[0].T
     np.testing.assert_allclose(np.cov(np.array(drawn).T), wanted, atol=0.2 * np.trace(wanted))
     # sampled: of positions as good as affine, with the channels of each Delta side by side

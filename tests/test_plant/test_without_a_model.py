@@ -130,7 +130,7 @@ def test_a_plant_from_measured_modes(machine):
     wanted = 3.0 * 2 * std.imag / np.abs(truth)
     got = [d.scale for d in uncertain.deltas if d.kind == "freq"]
     np.testing.assert_allclose(got, wanted, rtol=0.05)
-    assert len(uncertain.sample(1, 2)) == 2
+    assert len(uncertain.machines.drawn(2, rng=1)) == 2
 
 
 @pytest.mark.slow

@@ -175,7 +175,7 @@ def test_plants_are_as_uncertain_as_the_fit_says():
     assert joint.frequencies[9] == pytest.approx(1e-3)
     np.testing.assert_allclose(np.diag(joint.covariance), 0.25)
     assert abs(joint.covariance[0, 4]) > 1e-3
-    drawn = joint.sample(1, 3)
+    drawn = joint.machines.drawn(3, rng=1)
     assert len(drawn) == 3
     with pytest.raises(ModelError, match="not of the same model"):
         plant.uncertain(fit.uncertainty(data))

@@ -5,10 +5,7 @@ The model of its design is not used.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,18 +13,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
-from ..errors import (
-    AssumptionError,
-    CertificateError,
-    FlexplantWarning,
-    ModelError,
-    SolverError,
-    aligned,
-    counted,
-    require_known,
-    short,
-    warn,
-)
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.blocks_of_states import equal_matrices
@@ -36,11 +22,11 @@ from ..lti.lyapunov import difference_of, dual_variances, solve_stein, stein_roo
 from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
-from ..plant import AnyPlant, StandardPlant
+from ..plant import AnyPlant
 from ..plant.machine_plants import LEVEL, FigureInterval, interval, interval_text
 from ..store import Value
 from ..tolerances import ROUNDING, SAME, TINY, TYPED, divisor
-from ..words import in_unit, instance, members, sizes_of
+from ..words import sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
@@ -371,34 +357,11 @@ def loop_variances(plant: AnyPlant, estimator: StateSpace, loop: ClosedLoop) -> 
     return np.array([source_variances(error, row, noises)[0].sum() for row in range(len(hats))])
 
 
-class PoiFilter(Value):
-    """What stationary filters of the motions at the POIs have in common."""
+class PoiEstimator(Value):
+    """What estimators of the motions at the POIs have in common: intervals of their errors."""
 
     system: StateSpace
     plant: AnyPlant
-    variances: FloatArray
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """The sensors, in the order of the columns of the gains."""
-        return sensors(self.plant)
-
-    @property
-    def rms_text(self) -> str:
-        """The predicted rms errors in words, with their intervals or what is missing for them."""
-        channels, units = poi_channels(self.plant), self.plant.units
-        known = self.plant.machine.machines if self.plant.dt else None
-        if known is None or known.missing:
-            rms = sizes_of({name: self.rms(name) for name in channels}, units)
-            return rms if known is None else f"{rms}\n  (no interval: {known.missing})"
-        said: list[str] = []
-        for name in channels[:_SHOWN]:
-            low, high, _ = self.interval(name)
-            ends = interval_text(float(low or 0.0), float(high or 0.0), units.get(name, ""))
-            on = f" on {100 * LEVEL:.3g} % of such machines" if not said else ""
-            said.append(f"{sizes_of({name: self.rms(name)}, units)} ({ends}{on})")
-        more = [f"... ({len(channels) - _SHOWN} more)"] if len(channels) > _SHOWN else []
-        return ",\n    ".join(said + more)
 
     def interval(self, channel: str, level: float = LEVEL) -> FigureInterval:
         """Return where the rms error lies on a share of the machines measured as this one.
@@ -434,6 +397,34 @@ class PoiFilter(Value):
             error_variances(same_pois(self.plant, one), self.system).values for one in plants
         ])  # fmt: skip
 
+
+class PoiFilter(PoiEstimator):
+    """What stationary filters of the motions at the POIs have in common."""
+
+    variances: FloatArray
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors, in the order of the columns of the gains."""
+        return sensors(self.plant)
+
+    @property
+    def rms_text(self) -> str:
+        """The predicted rms errors in words, with their intervals or what is missing for them."""
+        channels, units = poi_channels(self.plant), self.plant.units
+        if not self.plant.dt or self.plant.machine.machines is None:
+            return sizes_of({name: self.rms(name) for name in channels}, units)
+        said: list[str] = []
+        for name in channels[:_SHOWN]:
+            low, high, sentence = self.interval(name)
+            if low is None or high is None:
+                return f"{sizes_of({n: self.rms(n) for n in channels}, units)}\n  ({sentence})"
+            ends = interval_text(low, high, units.get(name, ""))
+            on = f" on {100 * LEVEL:.3g} % of such machines" if not said else ""
+            said.append(f"{sizes_of({name: self.rms(name)}, units)} ({ends}{on})")
+        more = [f"... ({len(channels) - _SHOWN} more)"] if len(channels) > _SHOWN else []
+        return ",\n    ".join(said + more)
+
     def rms(self, channel: str, *, on: AnyPlant | ClosedLoop | System | None = None) -> float:
         """Return the rms of the estimation error at the sample instants.
 
@@ -468,122 +459,3 @@ class PoiFilter(Value):
         elif on is not None:
             variances = error_variances(same_pois(self.plant, on), self.system).values
         return float(np.sqrt(max(variances[row], 0.0)))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MachineTable(Value):
-    """The rms error of estimators of one POI motion on several machines; prints as a table.
-
-    Parameters
-    ----------
-    channel : str
-        The motion.
-    names : sequence of str
-    nominal : (k,) array [m or rad]
-        Each on its own model, as the machines run: in a closed loop where they are in one.
-    values : (k, n) array
-        On each machine; infinite where the closed loop is unstable.
-    unit : str
-        Of the motion.
-    """
-
-    channel: str
-    names: Sequence[str]
-    nominal: FloatArray
-    values: FloatArray
-    unit: str = ""
-
-    def __getitem__(self, name: str) -> FloatArray:
-        """Return the rms errors (n,) of one estimator."""
-        require_known("estimator", [name], self.names)
-        return np.asarray(self.values[list(self.names).index(name)])
-
-    def __repr__(self) -> str:
-        finite = self.nominal[np.isfinite(self.nominal)]
-        factor, unit = in_unit(float(np.max(finite, initial=0.0)), self.unit)
-        head = ("", "own model", "median", "95 %", "worst", "worst / own", "")
-        title = f"rms error of {self.channel} [{unit or '?'}]"
-        rows = []
-        for name, own, row in zip(self.names, self.nominal, self.values, strict=True):
-            ordered, unstable = np.sort(row), int(np.count_nonzero(np.isinf(row)))
-            cells = [own, np.median(row), ordered[int(np.ceil(0.95 * row.size)) - 1], ordered[-1]]
-            said = f"the loop is unstable on {unstable} of them" if unstable else ""
-            text = [f"{value / factor:.4g}" for value in cells]
-            rows.append((name, *text, f"{ordered[-1] / own:.3g}", said))
-        on = counted(self.values.shape[1], "machine")
-        return "\n".join([f"{title} on {on}", *aligned(head, rows)])
-
-
-def errors_on_machines(
-    estimators: Mapping[str, Any] | Any,
-    machines: Sequence[StandardPlant],
-    channel: str,
-    *,
-    blocks: Sequence[Any] = (),
-) -> MachineTable:
-    """Return the rms errors of estimators on machines that differ from their model.
-
-    In closed form. A filter that trusts its model doubles its error when frequencies of light modes
-    are half a percent off; how much is lost on the machines that a fit allows is what this says.
-
-    Parameters
-    ----------
-    estimators : KalmanEstimator or StaticEstimator, or mapping {name: estimator}
-        All of the same POIs.
-    machines : sequence of StandardPlant
-        Sampled alike: `plant.uncertain(fit).sample(rng, 20)`.
-    channel : str
-        A POI's motion.
-    blocks : sequence of Controller or StateSpace
-        Controllers that close the loop on the estimates (or on y): each estimator runs in
-        `close_loop(machine, estimator, *blocks)`. None: u is at rest.
-
-    Returns
-    -------
-    MachineTable
-
-    Raises
-    ------
-    LabelError
-        When the motion is none of a POI, or a machine lacks a channel.
-    AssumptionError
-        When the error contains a rigid-body motion of a machine, or the nominal loop is not stable.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> estimators = {"filter": fx.design_kalman(plant)}
-    >>> table = fx.estimation.errors_on_machines(estimators, [plant], "die")
-    >>> bool(abs(table["filter"][0] / estimators["filter"].rms("die") - 1) < 1e-9)
-    True
-    """
-    instance(blocks, Iterable, "blocks", "Pass controllers in [...].")
-    given = estimators if isinstance(estimators, Mapping) else {"estimator": estimators}
-    listed = members(
-        machines, StandardPlant, "machines", "Pass plant.uncertain(fit).sample(rng, 20)."
-    )
-    if not given or not all(hasattr(one, "rms") for one in given.values()):
-        raise ModelError(
-            f"estimators must be estimators by name, got {short(estimators)}. Pass "
-            "{'Kalman': design_kalman(plant)}."
-        )
-    first = next(iter(given.values())).plant
-    name = poi_channels(first)[row_of(poi_channels(first), channel)]
-    nominal = [_rms(one, one.plant, name, blocks) for one in given.values()]
-    values = np.full((len(given), len(listed)), np.inf)
-    for row, one in zip(values, given.values(), strict=True):
-        for i, machine in enumerate(listed):
-            with suppress(*([AssumptionError] if blocks else [])):  # an unstable loop
-                row[i] = _rms(one, machine, name, blocks)
-    return MachineTable(name, tuple(given), np.array(nominal), values, first.units.get(name, ""))
-
-
-def _rms(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[Any]) -> float:
-    if not blocks:
-        return float(estimator.rms(channel, on=machine))
-    with warnings.catch_warnings():  # the table itself says which loops are unstable
-        warnings.simplefilter("ignore", FlexplantWarning)
-        loop = close_loop(machine.replace(evaluation=None), estimator, *blocks)
-    row = row_of(poi_channels(estimator.plant), channel)
-    return float(np.sqrt(loop_variances(estimator.plant, estimator.system, loop)[row]))

@@ -19,9 +19,9 @@ from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
-from .filter_models import LEFT_OUT, UNRESOLVED, FilterModel, Sight, filter_model
+from .filter_models import LEFT_OUT, FilterModel, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
-from .left_out_modes import NODES, NOTED, LeftOut, beyond_text, left_out
+from .left_out_modes import LeftOut, beyond_text, left_out
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,12 +74,6 @@ class KalmanEstimator(PoiFilter):
     def __repr__(self) -> str:
         count = self.certificate.get(LEFT_OUT)
         beyond = beyond_text(self.plant, None if count is None else int(count))
-        share = self.certificate.get(UNRESOLVED)
-        if share is not None and share > NOTED:
-            beyond += (
-                f";\n  up to {share:.0%} of a variance is from modes with fewer than {NODES:g} "
-                "nodes of the mesh a wavelength:\n  a finer evaluation model would change it"
-            )
         if self.certificate["difference"] > TYPED:
             beyond += f";\n  variances hold to {self.certificate['difference']:.0e}"
         return (

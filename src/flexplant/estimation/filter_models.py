@@ -317,9 +317,8 @@ class Steady:
 AGREEMENT, ROUNDED = 1e-6, 1e-2
 
 
-#: what a certificate says of modes left out: how many there are, and the share of a variance from
-#: those with fewer than 4 nodes of the mesh per wavelength
-LEFT_OUT, UNRESOLVED = "modes left out", "unresolved share"
+#: what a certificate says of modes left out: how many there are
+LEFT_OUT = "modes left out"
 #: the route of a residual
 RICCATI = "the Riccati equation, relative, in states of unit variance"
 

@@ -24,7 +24,6 @@ from .filter_models import (
     LEFT_OUT,
     RICCATI,
     ROUNDED,
-    UNRESOLVED,
     FilterModel,
     agreement,
     check_noises,
@@ -36,7 +35,7 @@ from .filter_models import (
     stable_radius,
     weigh,
 )
-from .left_out_modes import LeftOut, left_out, unresolved_share
+from .left_out_modes import LeftOut, left_out
 
 #: least part of R that is the sensors' own: of less, six digits and more are lost in covariances
 _OWN = 1e-10
@@ -80,11 +79,6 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     CertificateError
         When the check by the other route fails.
 
-    Warns
-    -----
-    FlexplantWarning
-        When more than half of a predicted variance is from modes that the mesh of the evaluation
-        model resolves badly.
 
     References
     ----------
@@ -110,9 +104,6 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
         return observer.replace(certificate=observer.certificate | {LEFT_OUT: 0.0})
     complete = error_variances(read_alike(plant, whole), observer.system)
     counted = {LEFT_OUT: float(found.modes.size)}
-    share = unresolved_share(plant, whole, found.modes, observer.system, complete.values)
-    if share is not None:
-        counted[UNRESOLVED] = share
     certificate = observer.certificate | counted
     if complete.difference > certificate["difference"]:
         certificate |= Certificate((difference_check(complete.difference, ROUNDED),))

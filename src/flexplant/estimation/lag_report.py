@@ -22,7 +22,7 @@ from ..plant.partitioned import require_sampled
 from ..plant.rest_expansion import moved_at_rest
 from ..store import Value, checked
 from ..tolerances import SAME
-from .error import error_variances
+from .error import PoiEstimator, error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .filter_models import Sight, Steady
 
@@ -229,7 +229,7 @@ Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StaticEstimator(Value):
+class StaticEstimator(PoiEstimator):
     """The least-squares estimate of the motions at the POIs near rest, a matrix of gains.
 
     Parameters

@@ -6,17 +6,13 @@ And which of them the mesh of the evaluation model resolves badly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from ..arrays import ComplexArray, FloatArray, IntArray
-from ..errors import ModelError, counted, warn
-from ..labels import DofSet
+from ..errors import ModelError, counted
 from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
-from ..modes import Modes
 from ..modes.matching import assigned
 from ..plant import AnyPlant, StandardPlant
 from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
@@ -27,10 +23,8 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..store import Value
-from ..structure import FEModel
-from ..tolerances import SAME, TINY, divisor
-from .error import error_variances
-from .estimator_channels import poi_channels, read_alike, sensors
+from ..tolerances import TINY, divisor
+from .estimator_channels import read_alike, sensors
 
 #: a mode of the plant is one of the evaluation model's within this relative difference of frequency
 _SAME = 0.15
@@ -270,130 +264,3 @@ def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> Stand
     factor = np.array(plant.noise_factor)
     factor[plant.modal_states.reshape(-1, 2)[modes].reshape(-1)] = 0.0
     return fresh.replace(origin=fresh.assembled.replace(noise_factor=factor))
-
-
-#: nodes per wavelength below which a mode is badly resolved: frequencies are off by some 5 %
-NODES = 4.0
-#: share of a variance up to which errors stay within about 10 % (5 % at 1 % damping), and from
-#: which they were up to 65 %: plates of four shapes on 6 x 6 to 16 x 16 elements beside 24 x 24
-NOTED, WARNED = 0.15, 0.5
-#: translations
-_MOVES = ("x", "y", "z")
-_NONE = np.zeros(0, dtype=np.int64)
-#: where a realisation keeps the nodes per wavelength of its modes
-_KEPT = "_nodes"
-#: an edge is of the mesh up to this length beside the mean at its ends: elements of 1 to 3
-_LONG = 2.0
-
-
-def nodes_per_wavelength(
-    model: FEModel | Modes | ReducedModel, shapes: FloatArray
-) -> FloatArray | None:
-    """Return how many nodes of a mesh there are per wavelength of each shape; None: no mesh."""
-    # neighbours i, j are translations in one direction that the mass matrix couples; of modes,
-    # whose matrices are not known, those of nodes side by side. In a wave of wave number k and
-    # nodes h apart `mean (p_i - p_j)^2 / mean (p_i^2 + p_j^2) = 1 - cos(k h)`, and `2 pi / (k h)`
-    # nodes make a wavelength. Diagonals of elements count as neighbours, so that this is a mean
-    # over all directions. Both kinds of neighbours differ by 2 % to 7 % on plates and blocks. A
-    # full mass matrix has no mesh
-    dofs = model.full_dofs if isinstance(model, ReducedModel) else model.dofs
-    count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
-    i, j = _mass_coupling(model) if isinstance(model, FEModel) else (_NONE, _NONE)
-    if not i.size:  # masses are lumped, or not known
-        i, j = _neighbouring_translations(dofs)
-    if not i.size or 4 * i.size > count * (count - 1):
-        return None
-    apart = np.sum((shapes[i] - shapes[j]) ** 2, axis=(0, 2))
-    size = np.sum(shapes[i] ** 2 + shapes[j] ** 2, axis=(0, 2))
-    turn = np.arccos(np.clip(1.0 - apart / divisor(size), -1.0, 1.0))
-    # a rigid-body motion has no wave: any large number of nodes will do
-    return np.asarray(2.0 * np.pi / np.maximum(turn, 1e-9))
-
-
-def _nodes_of(model: Any, outputs: FloatArray) -> FloatArray | None:
-    """Return the nodes per wavelength of modes, from the outputs of their pairs of states."""
-    if not isinstance(model, FEModel | Modes | ReducedModel):
-        return None
-    if isinstance(model, ReducedModel):
-        outputs = model.T @ outputs
-    return nodes_per_wavelength(model, outputs.reshape(len(outputs), -1, 2))
-
-
-def _mass_coupling(model: FEModel) -> tuple[IntArray, IntArray]:
-    """Return the translations that the mass matrix couples."""
-    M, directions = sp.coo_matrix(model.M), np.array(model.dofs.directions)
-    alike = np.isin(directions, _MOVES)[M.row] & (directions[M.row] == directions[M.col])
-    pair = (M.row < M.col) & (M.data != 0.0) & alike
-    return M.row[pair].astype(np.int64), M.col[pair].astype(np.int64)
-
-
-def _neighbouring_translations(dofs: DofSet) -> tuple[IntArray, IntArray]:
-    """Return the translations of nodes that a Delaunay triangulation joins, of one component."""
-    owner = np.zeros(len(dofs), np.int64) if dofs.component_of is None else dofs.component_of
-    kinds, found = np.array(dofs.directions), [np.zeros((2, 0), np.int64)]
-    for direction in _MOVES:
-        for part in np.unique(owner):
-            rows = np.flatnonzero((kinds == direction) & (owner == part))
-            found.append(rows[_neighbours(dofs.xyz[rows])])
-    i, j = np.hstack(found)
-    return i, j
-
-
-def _neighbours(xyz: FloatArray) -> IntArray:
-    """Return pairs (2, e) of nodes side by side on a line, in a plane or in space."""
-    offset = xyz - xyz.mean(axis=0) if len(xyz) else xyz
-    _, size, axes = np.linalg.svd(offset, full_matrices=False)
-    flat = offset @ axes[size > SAME * np.max(size, initial=0.0)].T
-    if len(flat) <= flat.shape[1] + 1 or not flat.size:
-        return np.zeros((2, 0), np.int64)
-    if flat.shape[1] == 1:
-        order = np.argsort(flat[:, 0])
-        pairs = np.vstack([order[:-1], order[1:]])
-    else:
-        from scipy.spatial import Delaunay
-
-        simplices = Delaunay(flat).simplices
-        first, second = np.triu_indices(simplices.shape[1], 1)
-        both = np.hstack([simplices[:, [a, b]].T for a, b in zip(first, second, strict=True)])
-        pairs = np.unique(np.sort(both, axis=0), axis=1)
-    # across a notch or a hole an edge is longer than those of the mesh at both its ends
-    length = np.linalg.norm(flat[pairs[0]] - flat[pairs[1]], axis=1)
-    total, count = (
-        np.bincount(pairs.reshape(-1), weights, len(flat))
-        for weights in (np.tile(length, 2), np.ones(2 * length.size))
-    )
-    usual = total / np.maximum(count, 1)
-    near = length <= _LONG * np.minimum(usual[pairs[0]], usual[pairs[1]])
-    return np.asarray(pairs[:, near], dtype=np.int64)
-
-
-def unresolved_share(
-    plant: AnyPlant, whole: AnyPlant, modes: IntArray, observer: StateSpace, variances: FloatArray
-) -> float | None:
-    """Return the largest share of POI variances from modes left out that the mesh resolves badly.
-
-    Their disturbances are taken away, and the error is computed once more.
-    """
-    realisation = whole.realisation
-    if not realisation.n_modes:
-        return None
-    if _KEPT not in realisation.__dict__:  # many plants are made of one
-        realisation.__dict__[_KEPT] = _nodes_of(whole.model, realisation.outputs)
-    nodes = realisation.__dict__[_KEPT]
-    if nodes is None:
-        return None
-    coarse = modes[nodes[modes - 1] < NODES] - 1
-    if not coarse.size:
-        return 0.0
-    still = read_alike(plant, _quiet(whole.machine, whole.machine, coarse))
-    rest = error_variances(still, observer).values
-    shares = 1.0 - rest / divisor(variances)
-    share = float(np.max(shares))
-    if share > WARNED:
-        named = [c for c, part in zip(poi_channels(plant), shares, strict=True) if part > WARNED]
-        warn(
-            f"{share:.0%} of the predicted variance of {', '.join(named)} is from modes "
-            f"that the mesh of the evaluation model resolves with fewer than {NODES:g} nodes a "
-            "wavelength: these errors may be off by as much. Pass evaluation= of a finer mesh."
-        )
-    return max(share, 0.0)

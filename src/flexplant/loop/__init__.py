@@ -33,7 +33,6 @@ from .budget import Spectrum as Spectrum
 from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop
 from .measured_loop import in_axes as in_axes
-from .other_machines import MachineDraws as MachineDraws
 from .other_machines import ModeTolerances as ModeTolerances
 from .other_machines import SpillOver as SpillOver
 from .report import LoopComparison as LoopComparison

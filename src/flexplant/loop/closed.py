@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, whole
+from ..arrays import ComplexArray, FloatArray
 from ..certificates import one_line
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
@@ -43,7 +43,6 @@ from .other_machines import (
     SpillOver,
     growing_modes,
     high,
-    machine_draws,
     mode_tolerances,
     reported_tolerances,
 )
@@ -344,8 +343,9 @@ class ClosedLoop(Value):
     def tolerances(self) -> ModeTolerances | None:
         """What modes hold to; None where these are not each its own, or the loop is unstable.
 
-        Where frequencies are stated as uncertain with 20 machines drawn, and with the modes left
-        out, where they are known. Frequencies are followed to 1 %, or to 2.5 times what is known.
+        Where frequencies are stated as uncertain with the modes left out, where they are known;
+        `interval` says what happens when all is off at once. Frequencies are followed to 1 %, or to
+        2.5 times what is known.
         """
         return reported_tolerances(self)
 
@@ -353,9 +353,7 @@ class ClosedLoop(Value):
         """Return the loop of the same controller around a machine with the same u, y and rate."""
         return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
 
-    def mode_tolerances(
-        self, *, margin: float = MARGIN, known: Any = None, draws: int = 0, rng: Any = 0
-    ) -> ModeTolerances:
+    def mode_tolerances(self, *, margin: float = MARGIN, known: Any = None) -> ModeTolerances:
         """Return by how much each mode's frequency and damping may be off before the loop fails.
 
         One mode at a time, the others as they are, exactly: the change at which a pole crosses the
@@ -370,10 +368,6 @@ class ClosedLoop(Value):
         known : UncertainPlant, float, (m,) array or {mode: float}, optional
             By what share each elastic mode's frequency may be off; what the plant says itself when
             not given.
-        draws : int
-            Machines drawn from that uncertain plant, everything off at once; none by default.
-        rng : int, SeedSequence, Generator or None
-            Of the draws.
 
         Raises
         ------
@@ -389,8 +383,6 @@ class ClosedLoop(Value):
         """
         known = self.plant.uncertainty if known is None else known
         found = mode_tolerances(self.plant, self.broken, margin=margin, known=known)
-        if whole(draws, "draws", minimum=0):
-            found = found.replace(draws=machine_draws(self, known, margin, draws, rng))
         found.warn_of_critical()
         return found
 

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray, floats, positive, real_array, whole
+from ..arrays import FloatArray, IntArray, positive, real_array
 from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
 from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
-from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
-from ..seeds import generator
-from ..store import Value, checked
+from ..store import Value
 from ..tolerances import TINY
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
@@ -182,54 +180,6 @@ def growing_modes(
     return tuple(found), tuple(found.values())
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MachineDraws(Value):
-    """The modulus margins of one controller on machines drawn from an uncertainty.
-
-    Everything that is uncertain is off at once: at delta = 1 two standard deviations unless the
-    uncertain plant says otherwise.
-
-    Parameters
-    ----------
-    margins : (n,) array
-        Modulus margin at u on each machine, 0 where the loop is unstable there.
-    margin : float
-        The one that shall be kept.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.loop.MachineDraws([0.5, 0.4, 0.3, 0.0], margin=0.35)
-    <MachineDraws: 3 of 4 stable, 2 keep a modulus margin of 0.35, the least is 0>
-    """
-
-    margins: FloatArray = field(metadata=checked(floats))
-    margin: float
-
-    @property
-    def stable(self) -> float:
-        """The share of machines on which the loop is stable."""
-        return float(np.mean(self.margins > 0))
-
-    @property
-    def kept(self) -> float:
-        """The share of machines on which it keeps the margin."""
-        return float(np.mean(self.margins >= self.margin))
-
-    @property
-    def summary(self) -> str:
-        """The counts in words."""
-        n = self.margins.size
-        stable, kept = (np.count_nonzero(self.margins > 0), round(n * self.kept))
-        return (
-            f"{stable} of {n} stable, {kept} keep a modulus margin of {self.margin:.3g}, the least "
-            f"is {self.margins.min():.3g}"
-        )
-
-    def __repr__(self) -> str:
-        return f"<MachineDraws: {self.summary}>"
-
-
 #: points of the grid around a mode to a half-width of its resonance, and how many at most aside
 _TO_A_WIDTH, _ASIDE = 2, 400
 #: times the largest change about a mode where its resonance passes, with its skirts
@@ -241,9 +191,9 @@ _DAMPINGS = (-0.999, 2.0)
 _SAFE = 2.0
 #: modulus margin to which tolerances are stated: |S| at u of 2.9, 9 dB
 MARGIN = 0.35
-#: relative change of a frequency to which a report follows a mode (a model that was updated is
-#: seldom further off), and machines that it draws: a second of work at most
-_FOLLOWED, _DRAWS = 0.01, 20
+#: relative change of a frequency to which a report follows a mode: a model that was updated is
+#: seldom further off
+_FOLLOWED = 0.01
 #: times the change that is asked for, up to which one is looked for: a crossing lies within
 BEYOND = 1.25
 #: rows of the table
@@ -275,8 +225,6 @@ class ModeTolerances(Value):
         Largest relative change of frequency examined.
     known : (m,) array, optional
         Relative uncertainty of each frequency.
-    draws : MachineDraws, optional
-        Machines on which all that is uncertain is off at once.
 
     Examples
     --------
@@ -299,7 +247,6 @@ class ModeTolerances(Value):
     margin: float
     limit: FloatArray
     known: FloatArray | None = None
-    draws: MachineDraws | None = None
 
     @property
     def least(self) -> FloatArray:
@@ -334,7 +281,7 @@ class ModeTolerances(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """What the mode that is nearest to what is known of it holds to, and the draws."""
+        """What the mode that is nearest to what is known of it holds to."""
         found: dict[str, float] = {}
         if self.modes.size:
             known = np.ones_like(self.least) if self.known is None else self.known
@@ -345,8 +292,6 @@ class ModeTolerances(Value):
                 found[f"{name} holds to"] = float(self.least[worst])
                 if self.known is not None:
                     found[f"{name} known to"] = float(self.known[worst])
-        if self.draws is not None:
-            found |= {"stable of draws": self.draws.stable, "margin kept of draws": self.draws.kept}
         return Certificate.of(found, route="the loop closed on changed machines")
 
     def warn_of_critical(self) -> None:
@@ -362,10 +307,9 @@ class ModeTolerances(Value):
             if mode in self.critical
         ]
         more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN else ""
-        drawn = "" if self.draws is None else f" Of machines drawn {self.draws.summary}."
         warn(
             "the loop hangs on frequencies that are not known well enough: "
-            f"{'; '.join(said[:_SHOWN])}{more}.{drawn} Measure these modes, or design for their "
+            f"{'; '.join(said[:_SHOWN])}{more}. Measure these modes, or design for their "
             "uncertainty: design_stage(plant.uncertain(...))."
         )
 
@@ -381,8 +325,6 @@ class ModeTolerances(Value):
         lines += [f"  {line}" for line in aligned(head, rows)]
         if self.modes.size > _SHOWN:
             lines.append(f"  ... and {self.modes.size - _SHOWN} more")
-        if self.draws is not None:
-            lines.append(f"  all at once: {self.draws.summary}")
         return "\n".join(lines) + ">"
 
 
@@ -445,26 +387,6 @@ def mode_tolerances(
     return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
 
 
-def machine_draws(
-    loop: Any, uncertain: object, margin: float, count: int, rng: Any = 0
-) -> MachineDraws:
-    """Return the margins of a closed loop's controller on machines of an uncertain plant."""
-    # with the modes left out, whose frequencies are off too, where these are known
-    if not isinstance(uncertain, UncertainPlant):
-        raise ModelError(
-            "machines are drawn from an UncertainPlant: close the loop on "
-            "plant.uncertain(frequency=...), or pass it as known=."
-        )
-    number, chance = whole(count, "draws"), generator(rng)
-    around = loop.completed or loop
-    machines = draws_with_left_out(uncertain, around.plant, chance, number)
-    if machines is None:  # what is uncertain is no property of the evaluation model's modes
-        around, machines = loop, iter(uncertain.sample(chance, number))
-    loops = map(around.around, machines)
-    margins = [one.modulus_margin if one.is_stable else 0.0 for one in loops]
-    return MachineDraws(np.array(margins), margin)
-
-
 def reported_tolerances(loop: Any) -> ModeTolerances | None:
     """Return what the modes of a closed loop hold to, beside what its plant says of them."""
     # with the modes left out, where these are known and frequencies are uncertain; of a sure plant
@@ -476,8 +398,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
     whole_loop = loop.completed or loop
     if not uncertain.frequencies or not whole_loop.is_stable:
         return None
-    found = _tolerances(whole_loop, uncertain.frequencies)
-    return found and found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
+    return _tolerances(whole_loop, uncertain.frequencies)
 
 
 def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:

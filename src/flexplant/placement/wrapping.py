@@ -285,7 +285,7 @@ def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
     if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
         raise ModelError(
             f"{name} are a list of at least one plant, got {short(machines)}. Pass "
-            "plant.uncertain(fit).sample(rng, 20), say."
+            "plant.uncertain(fit).machines.plants, say."
         )
     return tuple(sampled_plant(machine) for machine in machines)
 
@@ -299,7 +299,7 @@ class OverMachines(Several):
     criterion : Criterion or callable
         From plant to float.
     machines : sequence of StandardPlant
-        Such as `plant.uncertain(fit).sample(rng, 20)`, or one plant for each machine of a fleet;
+        Such as `plant.uncertain(fit).machines.plants`, or one plant for each machine of a fleet;
         sampled, each gets the devices of the plant that is scored.
     measure : {"worst", "mean"}
         Over the machines.

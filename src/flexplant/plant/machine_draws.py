@@ -1,8 +1,8 @@
-"""Whole machines that a measurement allows, drawn in modal coordinates of an evaluation model."""
+"""Whole machines, drawn in modal coordinates of an evaluation model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,13 +10,15 @@ import scipy.linalg as la
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
-from ..labels import Place
 from ..modes.matching import assigned
 from ..sparse.symmetric import dense
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.residuals.modal_residuals import ZETA
-from .realisation import MODAL, ModalRealisation, modes_as_states, natural
+from .drawn_modes import DrawnModes, ModeSpace
+from .realisation import MODAL, ModalRealisation
+from .uncertainty.delta import Delta
+from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, changed_pairs
 
 #: places at which shapes of two meshes are compared, at most
 _PLACES = 300
@@ -24,17 +26,6 @@ _PLACES = 300
 _REFUSED = 50
 #: a drawn mode swings
 _MOST_DAMPING = 0.9
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class DrawnModes(ModalRealisation):
-    """Modes of a drawn machine over the modes (n, b) of the evaluation model, in place of DOFs."""
-
-    over: FloatArray = None  # type: ignore[assignment]
-
-    def row(self, at: Place, direction: str) -> FloatArray:
-        """Return the row (b,) over the evaluation model's modes for a place."""
-        return np.asarray(super().row(at, direction) @ self.over)
 
 
 class _Change(NamedTuple):
@@ -45,7 +36,7 @@ class _Change(NamedTuple):
 
 
 class MachineFamily:
-    """What all machines drawn from one evaluation model share."""
+    """The machines of an update, in the modes of one evaluation model; see `Machines`."""
 
     def __init__(self, whole: ModalRealisation, machines: Machines) -> None:
         if whole.form != MODAL or whole.coupling is not None or np.any(whole.inputs[:, ::2]):
@@ -54,9 +45,9 @@ class MachineFamily:
                 "model. Pass Modes with ModalDamping as evaluation=."
             )
         self.whole, self.machines = whole, machines
-        self.omega, self.zeta = natural(whole.pairs)
-        self.omega[: whole.n_rigid] = 0.0
-        self.over: FloatArray = np.ascontiguousarray(whole.inputs[:, 1::2])
+        self.space = ModeSpace(whole)
+        self.omega, self.zeta = self.space.omega, self.space.zeta
+        self.over = self.space.shapes
         located = zip(machines.located(), machines.fit.values.tolist(), strict=True)
         self.changes = [self._change(q, value) for q, value in located]
         self.measured = self._measured_places()
@@ -131,42 +122,30 @@ class MachineFamily:
     def _modes(self, draw: Draw) -> DrawnModes | None:
         """Return modes of one machine, None where it has negative mass or stiffness."""
         r, b = self.whole.n_rigid, self.omega.size
-        M, K = self._matrices(draw)
-        rigid = M[:r, :r]
-        try:
-            values, V = la.eigh(K, M)
-            V[:, :r] = 0.0
-            V[:r, :r] = la.inv(la.cholesky(rigid)) if r else 0.0
-        except la.LinAlgError:
+        mixed = self.space.mixed(*self._matrices(draw))
+        if mixed is None:
             return None
-        if b > r and values[r] <= 0.0:
-            return None
-        omega, zeta = np.zeros(b), np.zeros(b)
-        omega[r:] = np.sqrt(values[r:])
+        omega, V = mixed
         parent = np.argmax(np.abs(V), axis=0)
-        reference = np.where(self.zeta > ZETA, self.zeta, 1.0)[parent[r:]]
-        mean, size = draw.damping
-        log = mean + size * draw.rng.standard_normal(b - r)
+        zeta = np.zeros(b)
         if self.machines.damping_changes.size > 1:
+            reference = np.where(self.zeta > ZETA, self.zeta, 1.0)[parent[r:]]
+            mean, size = draw.damping
+            log = mean + size * draw.rng.standard_normal(b - r)
             zeta[r:] = np.minimum(reference * np.exp(log), _MOST_DAMPING)
         else:
             zeta[r:] = self.zeta[parent[r:]]
         own = r + assigned(-(V[self.measured, r:] ** 2))
         omega[own] = np.abs(draw.poles)
         zeta[own] = -draw.poles.real / np.abs(draw.poles)
-        order = np.argsort(omega, kind="stable")
-        found = modes_as_states(
-            self.whole.model, omega[order], zeta[order], V[:, order], r, self.whole.n_modes
-        )
-        return DrawnModes(**found._fields(), over=self.over)
+        return self.space.realisation(omega, zeta, V, np.zeros((0, 2, 2)))
 
     def _matrices(self, draw: Draw) -> tuple[FloatArray, FloatArray]:
         """Return M' and K' of one machine."""
         r, b, rng = self.whole.n_rigid, self.omega.size, draw.rng
         g = self.omega / (2.0 * np.pi * self.machines.trend.highest)
         trend = 0.5 * np.sign(draw.slope) * np.log1p(2.0 * abs(draw.slope) * g)
-        E = rng.standard_normal((b, b)) * draw.deviation
-        E = E + E.T
+        E = draw.deviation * _symmetric(rng, b)
         mass = np.eye(b)
         mass[:r, :r] = la.expm(E[:r, :r])
         E[:r], E[:, :r] = 0.0, 0.0
@@ -180,12 +159,58 @@ class MachineFamily:
         return 0.5 * (M + M.T), 0.5 * (K + K.T)
 
 
-def drawn_modes(whole: ModalRealisation, machines: Machines) -> list[DrawnModes]:
-    """Return the machines drawn from an evaluation model's modes: once, shared by all plants."""
+def _symmetric(rng: np.random.Generator, b: int) -> FloatArray:
+    """Return N + N' (b, b) of standard normal N: deviations 2 on the diagonal, sqrt(2) off it."""
+    N = rng.standard_normal((b, b))
+    return np.asarray(N + N.T)
 
-    def drawn() -> list[DrawnModes]:
-        family = MachineFamily(whole, machines)
-        seeds = np.random.default_rng(machines.seed).spawn(machines.count)
-        return [family.machine(rng) for rng in seeds]
 
-    return whole.once(machines, drawn)
+class StatedFamily:
+    """Machines whose modes are off by stated Deltas: frequencies, shapes with them, and dampings.
+
+    ``K' = Omega exp(E) Omega``, E symmetric with the drawn relative changes of stiffness on its
+    diagonal and deviations ``sqrt(2 s_i s_j)`` off it, s the deviations of the frequencies. A
+    mode that the plant leaves out is known as well as the mode that is known least.
+    """
+
+    def __init__(self, whole: ModalRealisation, uncertain: Any) -> None:
+        self.space = ModeSpace(whole)
+        std = np.sqrt(np.diag(uncertain.covariance))
+        self.scatter: dict[type[ModeDelta], FloatArray] = {}
+        for kind in (FrequencyDelta, DampingDelta):
+            known = {
+                delta.mode - 1: delta.scale * x
+                for delta, x in zip(uncertain.deltas, std, strict=True)
+                if isinstance(delta, kind)
+            }
+            size = np.zeros(whole.pairs.shape[0])
+            size[uncertain.plant.realisation.n_modes :] = max(known.values(), default=0.0)
+            size[list(known)] = list(known.values())
+            self.scatter[kind] = size
+
+    def machine(self, rng: np.random.Generator, drawn: Sequence[tuple[Delta, float]]) -> DrawnModes:
+        """Return the modes of one machine at drawn values of the Deltas."""
+        logs = {kind: size * rng.standard_normal(size.size) for kind, size in self.scatter.items()}
+        for delta, x in drawn:
+            logs[type(delta)][delta.mode - 1] = delta.scale * x  # type: ignore[index]
+        space, (stiffer, damped) = self.space, logs.values()
+        root = np.sqrt(0.5 * self.scatter[FrequencyDelta][space.own])
+        E = root[:, None] * _symmetric(rng, root.size) * root
+        np.fill_diagonal(E, stiffer[space.own])
+        K = space.omega[:, None] * la.expm(E) * space.omega
+        mixed = space.mixed(np.eye(root.size), 0.5 * (K + K.T))
+        if mixed is None:
+            raise ModelError("what is stated of the frequencies leaves no stiffness.")
+        omega, V = mixed
+        # the damping force of a mode stays where its stiffness changes
+        force = (space.zeta * space.omega * np.exp(damped[space.own]))[np.argmax(np.abs(V), axis=0)]
+        zeta = np.divide(force, omega, out=np.zeros_like(omega), where=omega > 0.0)
+        pairs = changed_pairs(
+            space.whole,
+            [
+                (kind.of(i + 1, 1.0), float(np.expm1(log[i])))
+                for kind, log in logs.items()
+                for i in space.rest.tolist()
+            ],
+        )
+        return space.realisation(omega, zeta, V, pairs[space.rest])

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, between
-from ..errors import ModelError
-from ..updating.machines import Machines
+from ..arrays import FloatArray, between, whole
+from ..errors import AssumptionError, ModelError
+from ..seeds import MOST_DRAWS, Rng, generator
+from ..updating.machines import COUNT, Machines
 from ..words import in_unit
-from .building import continuous_plant, loud_like, sampled_like
-from .machine_draws import drawn_modes
+from .drawn_modes import DrawnModes
+from .machine_draws import MachineFamily, StatedFamily
+from .uncertainty.delta import MachineParts, with_changes
+from .uncertainty.mode_delta import ModeDelta
+from .uncertainty.parameter_amounts import ParameterDelta
 
 #: share of machines that a printed interval holds
 LEVEL = 0.95
@@ -40,8 +45,10 @@ class FigureInterval(NamedTuple):
     sentence: str
 
 
-def known_machines(plant: Any) -> Machines | None:
-    """Return what is not known of a plant's machine: stated, or of the fit that its model is of."""
+def fitted_machines(plant: Any) -> Machines | None:
+    """Return the machines of a plant's fit, stated or that of its model; None without any."""
+    if plant.evaluation is None:
+        return None
     for kind in () if plant.uncertainty is None else plant.uncertainty.kinds:
         if isinstance(source := getattr(kind, "source", None), Machines):
             return source
@@ -50,35 +57,108 @@ def known_machines(plant: Any) -> Machines | None:
 
 
 class PlantMachines:
-    """The machines that a plant may be, sampled like it: drawn once and kept.
+    """The machines that a plant may be, with its channels and sampled like it.
+
+    Their modes come from the fit (`flexplant.updating.Machines`) where the plant has one and an
+    evaluation model, else from what is stated: frequencies with the shapes that move with them, and
+    dampings. Gains, delays and other stated Deltas are drawn as well. Machines have the modes of
+    the evaluation model, except where parameters or shapes of the plant's own model are stated.
 
     Parameters
     ----------
     plant : StandardPlant
-        The plant, with an evaluation model.
-    machines : Machines
-        What is not known of it.
+        The plant.
+    fit : Machines, optional
+        The machines of the fit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> known = fx.testbeds.three_masses().uncertain(frequency=0.01, damping=0.3)
+    >>> len(known.machines.drawn(5, rng=1))
+    5
     """
 
-    def __init__(self, plant: Any, machines: Machines) -> None:
-        self.plant, self.machines = plant, machines
-        self._plants: list[Any] = []
-        self._values: dict[Any, FloatArray] = {}
+    def __init__(self, plant: Any, fit: Machines | None = None) -> None:
+        self.plant, self.fit = plant, fit
 
     @property
     def missing(self) -> str:
         """What is missing for an interval; empty where nothing is."""
-        return self.machines.missing
+        return "" if self.fit is None else self.fit.missing
 
-    @property
+    @cached_property
     def plants(self) -> list[Any]:
-        """The machines with the channels of the plant."""
-        if not self._plants:
-            before = self.plant.continuous
-            for modes in drawn_modes(before.evaluation_plant.assembled.realisation, self.machines):
-                own = continuous_plant(type(before), modes, before.assembled.ports, None)
-                self._plants.append(sampled_like(self.plant, loud_like(self.plant, own)))
-        return self._plants
+        """The machines of which intervals are made, drawn once."""
+        if self.fit is None:
+            return self.drawn()
+        return self.drawn(self.fit.count, rng=self.fit.seed)
+
+    def drawn(self, count: int = COUNT, *, rng: Rng = 0) -> list[Any]:
+        """Return machines; machine i is the same for every count.
+
+        Parameters
+        ----------
+        count : int
+            Number of machines.
+        rng : int, SeedSequence, Generator or None
+            What seeds them.
+
+        Raises
+        ------
+        ModelError
+            When a machine is not physical: what is known reaches beyond what the structure allows.
+        """
+        machines = []
+        seeds = generator(rng).spawn(whole(count, "count", maximum=MOST_DRAWS))
+        for i, own in enumerate(seeds, 1):
+            try:
+                machines.append(self._machine(own))
+            except ModelError as error:
+                raise ModelError(
+                    f"machine {i} of those drawn is not physical: {error} The uncertainty reaches "
+                    "beyond what the structure allows; measure more modes, or scale the covariance."
+                ) from None
+        return machines
+
+    def _machine(self, rng: np.random.Generator) -> Any:
+        """Return one machine: its modes drawn together, then all else that is stated."""
+        uncertain, (apart,) = self.plant.uncertainty, rng.spawn(1)
+        drawn = [] if uncertain is None else uncertain.values(apart)
+        if self.fit is None and any(isinstance(delta, ParameterDelta) for delta, _ in drawn):
+            changes = [(delta.of_matrices(self.plant), delta.amount(x)) for delta, x in drawn]
+            return with_changes(self.plant, changes)
+        of_modes = [one for one in drawn if isinstance(one[0], ModeDelta)]
+        others = [one for one in drawn if not isinstance(one[0], ModeDelta | ParameterDelta)]
+        machine = MachineParts.of(self._base)
+        for delta, x in sorted(others, key=lambda one: one[0].stage):
+            machine = delta.changed(machine, delta.amount(x))
+        if self.fit is not None:
+            modes = self._of_fit(rng)
+        elif of_modes:
+            modes = StatedFamily(machine.realisation, uncertain).machine(rng, of_modes)
+        else:
+            return machine.assembled()
+        return machine.replace(realisation=modes, pairs=modes.pairs).assembled()
+
+    @cached_property
+    def _base(self) -> Any:
+        """The plant whose modes are drawn: the larger one where nothing is of the own model."""
+        uncertain, own = self.plant.uncertainty, self.plant
+        if uncertain is not None and any(delta.of_own_model for delta in uncertain.deltas):
+            return own
+        found = own.evaluation_plant if uncertain is None else uncertain.larger
+        return found if found is not None and found.has_own_modes else own
+
+    def _of_fit(self, rng: np.random.Generator) -> DrawnModes:
+        """Return the modes of one machine of the fit, shared by plants of one evaluation model."""
+        realisation = self._base.assembled.realisation
+        fit: Any = self.fit
+        seed: Any = rng.bit_generator.seed_seq
+        family = realisation.once(fit, lambda: MachineFamily(realisation, fit))
+        key = (fit, str(seed.entropy), seed.spawn_key)
+        found: DrawnModes = realisation.once(key, lambda: family.machine(rng))
+        return found
 
 
 def interval_of(values: FloatArray, level: float = LEVEL) -> tuple[float, float]:
@@ -111,7 +191,10 @@ def interval(
         )
     if machines.missing:
         return FigureInterval(None, None, f"no interval: {machines.missing}")
-    low, high = interval_of(figures(), level)
+    try:
+        low, high = interval_of(figures(), level)
+    except AssumptionError as error:  # a machine on which the figure has no value
+        return FigureInterval(None, None, f"no interval: {error}")
     return FigureInterval(
         low, high, f"{interval_text(low, high, unit)} on {100 * level:.3g} % of such machines"
     )

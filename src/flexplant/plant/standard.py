@@ -16,7 +16,7 @@ from .assumptions import AssumptionReport
 from .building import continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
-from .machine_plants import PlantMachines, known_machines
+from .machine_plants import PlantMachines, fitted_machines
 from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partitioned import Partition
 from .ports import Ports
@@ -299,8 +299,8 @@ class StandardPlant(Partition):
         Returns
         -------
         UncertainPlant
-            `.system`, `.deltas`, `.lft(values)`, `.sample(rng, n)`. Functions that take a plant
-            take it too: designs and loops then say by what each mode may be off.
+            `.system`, `.deltas`, `.lft(values)`, `.machines`. Functions that take a plant take it
+            too: designs and loops then say by what each mode may be off.
 
         Raises
         ------
@@ -328,13 +328,16 @@ class StandardPlant(Partition):
 
     @cached_property
     def machines(self) -> PlantMachines | None:
-        """The machines that the measurement allows, drawn once; None where none are known.
+        """The machines that this plant may be, drawn once; None where nothing says which.
 
-        They are known of a plant of ``fit.calibrated(measured)``, or of ``plant.uncertain(
-        fit.machines(measured))``, that has an evaluation model.
+        Those that the measurement allows, of a plant of ``fit.calibrated(measured)`` or of
+        ``plant.uncertain(fit.machines(measured))`` with an evaluation model; else those of what is
+        stated by ``plant.uncertain(...)``.
         """
-        known = None if self.evaluation is None else known_machines(self)
-        return None if known is None else PlantMachines(self, known)
+        fit = fitted_machines(self)
+        if fit is None and self.uncertainty is None:
+            return None
+        return PlantMachines(self, fit)
 
     @cached_property
     def evaluation_plant(self) -> StandardPlant | None:

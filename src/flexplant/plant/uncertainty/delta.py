@@ -127,6 +127,8 @@ class Delta(Value):
     kind: ClassVar[str] = ""
     #: Deltas of a lower stage are opened, and change the machine, first
     stage: ClassVar[int] = 1
+    #: whether it changes the matrices or shapes of the plant's own model, not of a larger one
+    of_own_model: ClassVar[bool] = False
     #: whether its channels act on what those of all others do, exactly: of a sampled plant too
     outermost: ClassVar[bool] = False
 

@@ -82,6 +82,6 @@ class Uncertainty(Value):
         """Return the `NeglectedModes` of a plant, None of a kind that bounds nothing."""
         return None
 
-    def completion(self, plant: Partition) -> Delta | None:
-        """Return what every machine that is drawn has besides, None without any."""
+    def larger(self, plant: Partition) -> Any:
+        """Return the plant with more modes that machines of a plant have, None where not known."""
         return None

@@ -8,23 +8,8 @@ from typing import Any
 from ...arrays import whole
 from ...errors import ModelError
 from ..partitioned import Partition, is_plant
-from .delta import Delta, MachineParts
 from .kind import Uncertainty
 from .neglected_dynamics import NeglectedModes, neglected_modes
-
-
-@dataclass(frozen=True, eq=False)
-class _Completed(Delta):
-    """Not a number but the modes that a plant lacks, which every machine drawn has."""
-
-    whole: Any = None
-
-    stage = -1
-
-    def changed(self, machine: MachineParts, amount: float) -> MachineParts:
-        """Return a machine with all modes."""
-        realisation = self.whole.assembled.realisation
-        return machine.replace(realisation=realisation, pairs=realisation.pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +57,9 @@ class Neglected(Uncertainty):
             return self.model
         return neglected_modes(plant, self._whole(plant), resonances=self.resonances)
 
-    def completion(self, plant: Partition) -> Delta | None:
-        """Return the change that gives a machine these modes, None where only a bound is known."""
-        if isinstance(self.model, NeglectedModes):
-            return None
-        whole_plant: Any = self._whole(plant)
-        own = getattr(whole_plant, "has_own_modes", False)
-        return _Completed("neglected", 0.0, whole=whole_plant) if own else None
+    def larger(self, plant: Partition) -> Any:
+        """Return the plant with these modes, None where only a bound is known."""
+        return None if isinstance(self.model, NeglectedModes) else self._whole(plant)
 
     def _whole(self, plant: Any) -> Any:
         """Return the plant with the modes."""

@@ -34,6 +34,7 @@ class ParameterDelta(Delta):
 
     kind: ClassVar[str] = "parameter"
     stage: ClassVar[int] = 0
+    of_own_model: ClassVar[bool] = True
 
     def changed(self, machine: MachineParts, amount: float) -> MachineParts:
         """Return a machine of other matrices."""

@@ -125,7 +125,7 @@ def _sampled_channels(uncertain: UncertainPlant[Any]) -> Opened:
                 f"the delay of {uncertain.plant.delay:g} +- {delta.scale:g} samples passes a whole "
                 "number of samples, where what it does is not affine in it, so that no Delta "
                 "expresses it. Bound it on each side (1.1 +- 0.1 beside 0.9 +- 0.1), or draw "
-                "machines: uncertain.sample(rng, n)."
+                "machines: uncertain.machines.plants."
             )
     slow = bilinear(base, rate)
     direct, mapped = EvenUnits.of(base), EvenUnits.of(slow)

@@ -28,6 +28,7 @@ class ShapeDelta(Delta):
 
     kind: ClassVar[str] = "shape"
     stage: ClassVar[int] = 2
+    of_own_model: ClassVar[bool] = True
 
     def changed(self, machine: MachineParts, amount: float) -> MachineParts:
         """Return a machine with another shape of the mode."""

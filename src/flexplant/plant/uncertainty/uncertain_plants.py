@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, Self
@@ -10,11 +10,10 @@ from typing import Any, Generic, Self
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, number, whole
+from ...arrays import FloatArray, number
 from ...errors import ModelError, counted, require_known
 from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
-from ...seeds import MOST_DRAWS, generator
 from ...store import Value
 from ...updating import Machines, ModalUncertainty, UpdateResult
 from ...words import mapping
@@ -57,7 +56,7 @@ class UncertainPlant(Value, Generic[P]):
     --------
     >>> import flexplant as fx
     >>> known = fx.testbeds.three_masses().uncertain(frequency=0.01, damping=0.3)
-    >>> len(known.sample(1, 5))  # machines that it may be
+    >>> len(known.machines.drawn(5))  # machines that it may be
     5
     """
 
@@ -185,13 +184,6 @@ class UncertainPlant(Value, Generic[P]):
         """Whether nothing but frequencies of modes is uncertain."""
         return self.neglected is None and len(self.frequencies) == len(self.deltas)
 
-    @property
-    def is_modal(self) -> bool:
-        """Whether machines are off by frequencies and dampings of their modes alone."""
-        kinds = FrequencyDelta | DampingDelta
-        by_modes = all(known.drawn is None for known in self._known)
-        return by_modes and all(isinstance(delta, kinds) for delta in self.deltas)
-
     @cached_property
     def of_matrices(self) -> bool:
         """Whether Deltas are changes of M, D and K: of parameters, and of modes with these."""
@@ -249,51 +241,32 @@ class UncertainPlant(Value, Generic[P]):
             ],
         )
 
-    def sample(self, rng: Any, n: int = 1) -> list[P]:
-        """Return machines within the uncertainty, ports and sampling those of the nominal plant.
+    @property
+    def machines(self) -> Any:
+        """The machines that the plant may be (`plant.PlantMachines`), drawn from all kinds."""
+        nominal: Any = self.nominal
+        return nominal.machines
 
-        Each kind is drawn from its own covariance. From a fit: its parameters, so that each
-        machine's matrices are rebuilt and shapes and all modes differ too.
+    def values(self, rng: np.random.Generator) -> list[tuple[Delta, float]]:
+        """Return drawn values of the Deltas, each kind from its covariance.
 
-        Parameters
-        ----------
-        rng : int, SeedSequence, Generator or None
-            Seeds are spawned: machine i is the same whatever n is.
-        n : int
-
-        Raises
-        ------
-        ModelError
-            When a machine drawn is not physical: too uncertain for a normal distribution.
+        The parameters of a fit in place of the Deltas of its modes: they move all modes and shapes.
         """
-        machines = []
-        for i, own in enumerate(generator(rng).spawn(whole(n, "n", maximum=MOST_DRAWS)), 1):
-            try:
-                machines.append(with_changes(self.plant, list(self._drawn(own))))
-            except ModelError as error:
-                raise ModelError(
-                    f"machine {i} of the sample is not physical: {error} The uncertainty reaches "
-                    "beyond what the structure allows; measure more modes, or scale the covariance."
-                ) from None
-        return machines
-
-    def _drawn(self, rng: np.random.Generator) -> Iterator[tuple[Delta, float]]:
-        """Draw the changes of a machine."""
-        every = [known.deltas if known.drawn is None else known.drawn for known in self._known]
-        rebuilt = any(isinstance(delta, ParameterDelta) for deltas in every for delta in deltas)
-        for known, deltas in zip(self._known, every, strict=True):
-            covariance = known.covariance if known.drawn is None else known.drawn_covariance
-            for delta, x in zip(deltas, _normal(rng, np.asarray(covariance)), strict=True):
-                acting = delta.of_matrices(self.plant) if rebuilt else delta
-                yield acting, delta.amount(float(x))
-        if not rebuilt:
-            yield from ((one, 1.0) for one in self._completions)
+        found: list[tuple[Delta, float]] = []
+        for known in self._known:
+            deltas, covariance = known.deltas, known.covariance
+            if known.drawn is not None:
+                deltas, covariance = known.drawn, np.asarray(known.drawn_covariance)
+            found += zip(deltas, _normal(rng, covariance).tolist(), strict=True)
+        return found
 
     @cached_property
-    def _completions(self) -> list[Delta]:
-        """What every machine that is drawn has besides."""
-        found = (kind.completion(self.plant) for kind in self.kinds)
-        return [one for one in found if one is not None]
+    def larger(self) -> Any:
+        """The plant with more modes that its machines have; None where none is known."""
+        given = (kind.larger(self.plant) for kind in self.kinds)
+        found = [one for one in given if one is not None]
+        plant: Any = self.plant
+        return found[0] if found else plant.evaluation_plant
 
     def on(self, plant: P) -> UncertainPlant[P]:
         """Return what is not known, of another plant of the same machine.
