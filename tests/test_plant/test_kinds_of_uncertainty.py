@@ -281,7 +281,9 @@ def test_neglected_modes_are_bounded_and_drawn(rate):
         poles, own = (np.sort(np.abs(p[p.imag > 1.0])) for p in (poles, own))
         moved = np.abs(poles / own - 1.0)
         assert 1e-6 < moved[0] < 0.02
-        np.testing.assert_allclose(moved[1:], 0.0, atol=1e-9)
+        assert moved[1] < 1e-9
+        # those that the plant leaves out are known as well as mode 2
+        assert np.all((moved[2:] > 1e-6) & (moved[2:] < 0.02))
     assert plant.uncertain(uncertain.neglected, frequency={2: 0.01}).neglected.tightest <= 1.0
     with pytest.raises(ModelError, match="no evaluation model"):
         plant.uncertain(Neglected(), frequency=0.01)
