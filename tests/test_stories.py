@@ -150,7 +150,7 @@ def test_from_nastran(example, tmp_path, monkeypatch):
     assert result["modes"].n_rigid == 6
     assert 0.05 < result["printed"].freq[5] < 0.5
     said = story.table(result)
-    assert "as if all is in mm, t and s" in said
+    assert "as if all values are in mm, t and s" in said
     assert "rounding of K's entries to 10 digits" in said.replace("\n", " ")
     assert "then 1289.15 Hz" in said
     # files of one's own are taken as they are

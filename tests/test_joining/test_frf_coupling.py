@@ -167,14 +167,14 @@ def test_a_difference_below_its_errors_is_warned_of():
         fx.joining.Joint("stage/1:x", "frame/1:x"),
     )
     with pytest.warns(
-        FlexplantWarning, match="of 1 % in each response exceed the answer at 4 of 4"
+        FlexplantWarning, match="of 1 % in each response exceed the result at 4 of 4"
     ):
         found = fx.joining.uncoupled(machine, {"frame": frame}, joint)
     assert found.variance is None
     for part in (0.01, 1e-6):
         known = frame.replace(variance=(part * frame.mag) ** 2)
         if part == 0.01:
-            with pytest.warns(FlexplantWarning, match="by their variances exceed the answer"):
+            with pytest.warns(FlexplantWarning, match="by their variances exceed the result"):
                 found = fx.joining.uncoupled(machine, {"frame": known}, joint)
         else:
             found = fx.joining.uncoupled(machine, {"frame": known}, joint)
@@ -267,7 +267,7 @@ def test_what_responses_cannot_say_is_refused():
         fx.joined(frfs, fx.joining.Joint("stage/2:z", "frame/1:z"))
     with pytest.raises(LabelError, match="no component 'base'"):
         fx.joined(frfs, fx.joining.Joint("base/2:z", "frame/1:z"))
-    with pytest.raises(ModelError, match="between points, whose motion no channel is"):
+    with pytest.raises(ModelError, match="between points, but no channel measures"):
         fx.joined(frfs, fx.joining.Joint(("stage", (0, 0, 0)), "frame/1:z"))
     patch = fx.joining.Joint(fx.joining.Patch("stage", [1, 4, 9]), "frame/1:z", axes=["z"])
     with pytest.raises(LabelError, match=r"has nodes \[2\] that are not measured"):
@@ -284,11 +284,11 @@ def test_what_responses_cannot_say_is_refused():
         fx.joined(frfs, patch, dofs={"base": models()["frame"].dofs})
     with pytest.raises(ModelError, match="models have their DOFs"):
         fx.joined(models(), JOINTS, dofs={"stage": models()["stage"].dofs})
-    with pytest.raises(ModelError, match="are one channel"):
+    with pytest.raises(ModelError, match="are the same channel"):
         fx.joined(frfs, fx.joining.Joint("stage/1:z", "stage/1:z"))
     with pytest.raises(LabelError, match="has no axis 'x': it moves along z"):
         fx.joined(frfs, fx.joining.Joint("stage/1:z", "frame/1:z", axes=["x"]))
-    with pytest.raises(ModelError, match="no place and no name"):
+    with pytest.raises(ModelError, match="do not apply to measured"):
         fx.joined(frfs, JOINTS, name="machine")
     with pytest.raises(ModelError, match="responses by component"):
         fx.joining.uncoupled(machine(), frfs["frame"], JOINTS)
@@ -300,7 +300,7 @@ def test_what_responses_cannot_say_is_refused():
         fx.joined({name: frf.replace(quantity=None) for name, frf in frfs.items()}, JOINTS)
     with pytest.raises(ModelError, match="an Frf each"):
         fx.joined(frfs | {"frame": models()["frame"]}, JOINTS)
-    with pytest.raises(LabelError, match="no joint holds"):
+    with pytest.raises(LabelError, match="no joint connects"):
         fx.joining.uncoupled(machine(), {"frame": frfs["frame"]}, ())
     double = frfs["stage"].replace(data=np.ones_like(frfs["stage"].data))
     both = [fx.joining.Joint(f"stage/{n}:z", f"frame/{n}:z") for n in (1, 4)]

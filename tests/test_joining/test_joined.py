@@ -476,7 +476,7 @@ def test_what_is_refused(monkeypatch):
         join(fx.joining.Joint("stage/1", "frame/1", axes=["rx"]))
     with pytest.raises(LabelError, match=r"no component 'stag'.*Close matches: 'stage'"):
         join(fx.joining.Joint("stag/1:z", "frame/1:z"))
-    with pytest.raises(LabelError, match="nowhere"):
+    with pytest.raises(LabelError, match="the place of the joint"):
         join(fx.joining.Joint(("stage", (5.0, 5.0, 5.0)), "frame/1"))
     with pytest.raises(LabelError, match="not clear what is joined"):
         fx.joined({"a": plate(2), "b": models["frame"]}, fx.joining.Joint("a/1", "b/1"))
@@ -494,15 +494,15 @@ def test_what_is_refused(monkeypatch):
     monkeypatch.setattr(join_module, "_LARGEST", 20)
     with pytest.raises(ModelError, match=r"are too many .* Reduce the large components first"):
         join(models=models | {"stage": rom})
-    with pytest.raises(ModelError, match=r"times as stiff as its components .* joint is rigid"):
+    with pytest.raises(ModelError, match=r"times as stiff as its components .* for a rigid joint"):
         join(*at_feet(("x", "y", "z"), stiffness=1e21))
     with pytest.raises(LabelError, match="the end of a joint must be a DOF"):
         fx.joining.Joint("stage/", "frame/1")
-    with pytest.raises(ModelError, match="it is in radians"):
+    with pytest.raises(ModelError, match="angles are in radians"):
         fx.joining.Pose(rotation=(0, 0, 90))
     with pytest.raises(LabelError, match="node numbers must be whole"):
         fx.joining.Patch("stage", ["a", "b"])
-    with pytest.raises(LabelError, match="must be different ones"):
+    with pytest.raises(LabelError, match="must be different"):
         fx.joining.Patch("stage", [1, 2, 1], weights=[1.0, 2.0, 3.0])
     damped = {"stage": models["stage"].with_damping(fx.structure.Rayleigh(0.0, 1e-6))}
     with pytest.warns(FlexplantWarning, match=re.escape("components ['frame'] have no D")):

@@ -53,7 +53,7 @@ def test_ratios_beyond_the_list():
     np.testing.assert_array_equal(law.zeta([0, 1, 2, 3, 4]), [0, 0.02, 0.03, 0.01, 0.01])
     np.testing.assert_array_equal(law.zeta([0, 1]), [0, 0.02])
     assert repr(law) == "ModalDamping(ratio=[0, 0.02, 0.03], others=0.01, rigid=0)"
-    with pytest.raises(ModelError, match="others goes with"):
+    with pytest.raises(ModelError, match="others needs an array"):
         ModalDamping(0.01, others=0.02)
     with pytest.raises(ModelError, match="others"):
         ModalDamping([0.01], others=1.5)

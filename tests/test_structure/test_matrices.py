@@ -158,7 +158,7 @@ def test_an_indefinite_mass_is_refused():
 
 @pytest.mark.parametrize(
     ("change", "match"),
-    [({"M": None}, "there is no M"), ({"dofs": None}, "what the 3 rows stand for")],
+    [({"M": None}, "needs M, which is missing"), ({"dofs": None}, "what the 3 rows stand for")],
 )
 def test_what_is_missing_is_said(change, match):
     K, M, dofs = chain(3)

@@ -1,9 +1,9 @@
-"""Components joined: placed, coupled by joints and patches, certified; measured FRFs too.
+"""Joining of components by joints and patches, with certificates; also of measured FRFs.
 
 - `joined(components, joints)`: models and reduced models become one; labels are ``"stage/41:z"``.
 - `Joint`: rigid, or springs and dampers, between places of two components.
 - `Patch`: surfaces whose meshes do not match; `coincident_joints` for meshes that do.
-- `Pose`: where a component stands, and how it is turned.
+- `Pose`: position and orientation of a component.
 - `uncoupled`: takes a component out of a measured machine's responses.
 
 >>> import flexplant as fx
@@ -17,7 +17,8 @@ array([ 0. , 10. , 62. , 87.4])
 ('stage/1:x', 'stage/2:x', 'frame/1:x', 'frame/2:x')
 
 Names elsewhere: component-mode synthesis, substructuring, LM-FBS (pyFBS), CONTACT and CEINTF
-(Ansys), RBE2 and CBUSH (Nastran). ``examples/joined_machine.py`` joins, reduces and takes apart.
+(Ansys), RBE2 and CBUSH (Nastran). ``examples/joined_machine.py`` joins, reduces and separates a
+machine.
 """
 
 from ..rooms import public_names as _public_names

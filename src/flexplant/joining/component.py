@@ -1,4 +1,4 @@
-"""A model where it stands in the machine, with the matrices that joining needs."""
+"""A component at its place in the machine, with the matrices that joining needs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..structure import FEModel
 from ..tolerances import ROUNDING, SAME
 from ..words import instance
 
-#: either kind of model that can be joined
+#: types of models that can be joined
 Model = FEModel | ReducedModel
 
 
@@ -50,13 +50,13 @@ class Component(NamedTuple):
 
     @property
     def is_damped(self) -> bool:
-        """Whether its own matrices have damping."""
+        """Whether it has a damping matrix."""
         D: Any = self.model.D
         return D is not None and bool(abs(D).max() > 0)
 
     @property
     def T(self) -> Any:
-        """All its DOFs by its coordinates (n_full, n)."""
+        """Matrix (n_full, n) that gives all its DOFs from its coordinates."""
         return self.model.T if self.is_reduced else sp.eye_array(self.n, format="csc")
 
     @property
@@ -67,10 +67,10 @@ class Component(NamedTuple):
 
 
 def components_of(models: Any, placed: Any) -> list[Component]:
-    """Return the components of a machine where they stand."""
+    """Return the components at their places in the machine."""
     instance(models, Mapping, "components", "Pass {'stage': model, 'frame': model}.")
     if not models:
-        raise ModelError("there is no component to join. Pass {'stage': model, 'frame': model}.")
+        raise ModelError("components is empty. Pass {'stage': model, 'frame': model}.")
     names = list(models)
     component_columns(names, np.zeros(0, np.int64), 0)
     poses = {} if placed is None else dict(instance(placed, Mapping, "placed", "Pass {name: Pose}"))
@@ -85,7 +85,7 @@ def components_of(models: Any, placed: Any) -> list[Component]:
 
 
 def _static_rows(model: Model, pose: Pose) -> FloatArray:
-    """Return the loads (s, n_full) whose static shapes a reduced model has, turned as it is."""
+    """Return the loads (s, n_full) whose static shapes a reduced model has, in its orientation."""
     rows = []
     for name in model.static_at if isinstance(model, ReducedModel) else ():
         at: Any = name
@@ -98,8 +98,8 @@ def _static_rows(model: Model, pose: Pose) -> FloatArray:
 
 
 def placed_model(model: Model, pose: Pose) -> Model:
-    """Return a model where it stands, its DOFs in the directions of the machine."""
-    # coordinates of a reduced model that the rotation makes oblique stay, as generalised ones
+    """Return a model at its place, with its DOFs in the directions of the machine."""
+    # coordinates of a reduced model that become oblique are kept as generalised coordinates
     if np.array_equal(pose.rotation, np.eye(3)) and not np.any(pose.shift):
         return model
     full = model.full_dofs
@@ -129,7 +129,7 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
     changes: dict[str, Any] = {"T": T, "full_dofs": full, "truncated": None}
     try:
         own, turn = turned_dofs(model.dofs, pose)
-    except ModelError:  # oblique: the motions stay, their names do not
+    except ModelError:  # oblique: the motions are kept, but get new names
         names = [f"own {name}" for name in model.coordinates]
         return model.replace(dofs=full.select(()), coordinates=names, **changes)
     wide = np.eye(k)
@@ -150,14 +150,14 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlacedShape(Interpolation):
-    """The shapes of a component that was turned and shifted.
+    """The shapes of a component that was rotated and shifted.
 
     Parameters
     ----------
     own, pose : Interpolation, Pose
-        Interpolation of the component where it was made, and the pose where it stands.
+        Interpolation of the component in its own coordinates, and its pose.
     C : (n, n) sparse array
-        Its DOFs in the directions of the machine from those in its own directions, ``q = C q_own``.
+        Map of its DOFs from its own directions to those of the machine, ``q = C q_own``.
 
     Examples
     --------
@@ -188,7 +188,7 @@ class PlacedShape(Interpolation):
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        Turned, it is a mixture of the directions of its node, which must all be known.
+        After rotation it combines the directions of its node, which must all be known.
         """
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
@@ -202,7 +202,7 @@ class PlacedShape(Interpolation):
         return np.asarray(self.C @ row), self.pose.points(place[None])[0]
 
     def _shares(self, direction: str) -> list[tuple[str, float]]:
-        """Return the own directions in one of the machine, and their shares."""
+        """Return the own directions that a direction of the machine combines, and their weights."""
         first, axis = divmod(DIRECTIONS.index(direction), 3)
         shares = np.asarray(self.pose.rotation)[axis].tolist()
         own = DIRECTIONS[3 * first : 3 * first + 3]
@@ -218,11 +218,11 @@ class JoinedShape(Interpolation):
     names : sequence of str
         Names of the components.
     parts : sequence of DofSet
-        Their DOFs with their shapes, where they are placed.
+        DOFs of the placed components with their shapes.
     expansion : (n_all, n) sparse array, optional
-        All DOFs of all components, one after the other, by those that are left. None: all are.
+        Matrix that gives all DOFs of all components from the remaining ones. None: all remain.
     motions : (n_all, k) array, optional
-        All motions of a reduced machine: by these, places of two components move alike or not.
+        All motions of a reduced machine, which show whether places of two components move together.
 
     Examples
     --------
@@ -244,7 +244,7 @@ class JoinedShape(Interpolation):
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs in the motion `direction` at a point.
 
-        It must be on a component with this motion, and on no other that moves independently.
+        It must be on a component with this motion, and not on another one that moves independently.
         """
         found: dict[str, FloatArray] = {}
         failed: list[str] = []
@@ -264,7 +264,7 @@ class JoinedShape(Interpolation):
             one, other = list(found)[:2]
             raise LabelError(
                 f"the point {tuple(np.asarray(xyz).tolist())} is on {one!r} and on {other!r}, "
-                "which have a motion of their own there. Name a DOF: "
+                "which move differently there. Name a DOF: "
                 f"dofs.nearest(point, {direction!r}, component={one!r})."
             )
         return rows[0]
@@ -293,27 +293,28 @@ class JoinedShape(Interpolation):
         return sp.csr_array(every if self.expansion is None else self.expansion)
 
 
-#: entries of a rotation below this are zero: cos(pi/2) is 6e-17
+#: entries of a rotation below this count as zero: cos(pi/2) is 6e-17
 _ZERO = ROUNDING
-#: how far a rotation matrix may be from orthogonal
+#: largest departure of a rotation matrix from orthogonality
 _ORTHOGONAL = SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pose(Value):
-    """Where a component stands: its point p comes to ``R p + shift``.
+    """Position and orientation of a component: its point p moves to ``R p + shift``.
 
     Parameters
     ----------
     shift : (3,) array [m]
-        Where its origin comes to.
+        New position of its origin.
     rotation : (3,) array [rad] or (3, 3) array
-        A turn about this axis by its length, about the origin of the component; or R itself.
+        Rotation vector about the origin of the component: its direction is the axis, its length the
+        angle. Or the matrix R.
 
     Raises
     ------
     ShapeError, ModelError
-        When R is not a rotation: not orthogonal, or a mirror image; or a turn is beyond 2 pi.
+        When R is not orthogonal or contains a mirror image, or the angle is above 2 pi.
 
     Examples
     --------
@@ -331,8 +332,8 @@ class Pose(Value):
             x, y, z = real_array(turn, "rotation", (3,))
             if la.norm(turn) > 2 * np.pi:
                 raise ModelError(
-                    f"rotation {turn.tolist()} is more than a whole turn: it is in radians. For "
-                    "degrees, pass numpy.radians([0, 0, 90])."
+                    f"rotation {turn.tolist()} is more than a full turn: angles are in radians. "
+                    "For degrees, pass numpy.radians([0, 0, 90])."
                 )
             turn = la.expm(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
             turn[np.abs(turn) < _ZERO] = 0.0
@@ -351,11 +352,11 @@ class Pose(Value):
         return f"<Pose at ({place}) m, turned by {angle:.4g} degrees>"
 
     def points(self, xyz: Any) -> FloatArray:
-        """Return where points (n, 3) [m] of the component are in the machine."""
+        """Return the coordinates in the machine of points (n, 3) [m] of the component."""
         return np.asarray(real_array(xyz, "xyz", (None, 3)) @ self.rotation.T + self.shift)
 
     def own_points(self, xyz: FloatArray) -> FloatArray:
-        """Return where points (n, 3) [m] of the machine are in the component."""
+        """Return the coordinates in the component of points (n, 3) [m] of the machine."""
         return np.asarray((xyz - self.shift) @ self.rotation)
 
     def own_ground(self) -> FloatArray:
@@ -371,8 +372,8 @@ class Pose(Value):
 
 def turned_dofs(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
     """Return DOFs in the directions and places of the machine, and C with ``q = C q_own``."""
-    # the interpolation is left out. C is orthogonal: it turns each node's displacements, and its
-    # rotations
+    # without the interpolation. C is orthogonal: it rotates the displacements and the rotations of
+    # each node
     kinds, n = np.array(dofs.kinds), len(dofs)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
     for first in (0, 3):
@@ -386,9 +387,9 @@ def turned_dofs(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
                 has = ", ".join(DIRECTIONS[k] for k in own + first)
                 raise ModelError(
                     f"node {dofs.nodes[group[0][0]]} has only the directions {has}, which this "
-                    "rotation turns out of x, y and z: its motion would be oblique. Turn by "
-                    "quarter turns, or about the axis that keeps them, or use a component with all "
-                    "directions (place those of a machine before they are joined)."
+                    "rotation turns away from x, y and z: its motion would be oblique. Rotate by "
+                    "quarter turns, or about the axis that keeps them, or use a component with "
+                    "all directions (place the components of a machine before they are joined)."
                 )
             kinds[group] = first + made
             rows.append(np.repeat(group, own.size, axis=1).ravel())

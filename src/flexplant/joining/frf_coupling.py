@@ -1,4 +1,4 @@
-"""Measured frequency responses coupled by joints, known components taken out, and their errors."""
+"""Coupling of measured frequency responses, removal of known components, and errors."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from .frf_joints import (
 )
 from .joint import Joint, joint_list
 
-#: part of each response that is taken for its error where none is known: of a good measurement
+#: relative error of each response where it is not known: typical of a good measurement
 _USUAL = 0.01
 
 
 class MeasuredParts(NamedTuple):
-    """Responses side by side, block-diagonal: with their signs, errors and names of channels."""
+    """Block-diagonal responses with their signs, errors and names of channels."""
 
     data: ComplexArray
     variance: FloatArray | None
-    correlation: ComplexArray | None  # (n_out, n_out, n_freq), None where all are independent
+    # (n_out, n_out, n_freq), None where all errors are independent
+    correlation: ComplexArray | None
     outputs: list[str]
     inputs: list[str]
 
 
 def joined_parts(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> MeasuredParts:
-    """Return responses in one matrix, channels behind the prefixes that name them."""
-    # a response without a variance has none: computed ones have no errors
+    """Return responses in one matrix, with prefixes of the components in channel names."""
+    # a response without a variance counts as exact: computed ones have no errors
     outputs = [f"{name}{channel}" for name, frf in frfs.items() for channel in frf.outputs]
     inputs = [f"{name}{channel}" for name, frf in frfs.items() for channel in frf.inputs]
     n_freq = next(iter(frfs.values())).freq.size
@@ -84,9 +85,9 @@ def variance_of(
 def warn_of_errors(
     data: ComplexArray, error: FloatArray, freq: FloatArray, *, known: bool, done: str
 ) -> None:
-    """Warn of lines at which the error of all answers together exceeds these."""
-    # `error` is the variance, or, where none is `known`, what errors of the size of all responses
-    # would add up to
+    """Warn of lines at which the total error of all results exceeds the results."""
+    # `error` is the variance or, where it is not `known`, the sum of errors as large as the
+    # responses
     answer, part = np.sum(np.abs(data) ** 2, axis=(0, 1)), 1.0 if known else _USUAL**2
     hidden = part * np.sum(error, axis=(0, 1)) > answer
     if not hidden.any():
@@ -94,19 +95,19 @@ def warn_of_errors(
     whose = "by their variances" if known else f"of {100 * _USUAL:.0f} % in each response"
     where = f"{freq[hidden][0]:.5g} to {freq[hidden][-1]:.5g} Hz"
     warn(
-        f"errors {whose} exceed the answer at {np.count_nonzero(hidden)} of {freq.size} lines "
+        f"errors {whose} exceed the result at {np.count_nonzero(hidden)} of {freq.size} lines "
         f"({where}): {done}. Leave these lines out, average more, or take channels at which the "
         "responses differ more."
     )
 
 
-#: condition of the interface beyond which errors of a measurement hide the answer
+#: condition number of the interface above which measurement errors hide the result
 _CONDITION = 1e8
-#: condition of the interface beyond which there is no answer
+#: condition number of the interface above which an error is raised
 _SINGULAR = 1e14
-#: largest gap in a joint of the answer, relative
+#: largest relative gap in a joint of the result
 _GAP = SAME
-#: before the names of components that are taken out
+#: prefix of the names of removed components
 _KNOWN = "known "
 
 
@@ -116,8 +117,8 @@ def joined_frfs(
     dofs: Mapping[str, DofSet] | None = None,
 ) -> Frf:
     """Return the responses of a machine from those of its components; see `joined`."""
-    # `Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`, Y being block-diagonal, B the stretches of the joints by
-    # outputs, B_f their forces by inputs and Z what they give way: dual coupling by Lagrange
+    # `Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`, Y being block-diagonal, B the stretches of the joints
+    # from outputs, B_f their forces at inputs and Z their compliance: dual coupling by Lagrange
     # multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_
     _same_lines(frfs)
     places, listed = known_places(dofs, frfs), joint_list(joints)
@@ -131,7 +132,7 @@ def joined_frfs(
     data, error = _coupled_response(Y, links, first.freq, first.quantity, every)
     variance = None if Y.variance is None else error
     if variance is not None:
-        done = "the joints take nearly all of a component's motion away"
+        done = "the joints block nearly all motion of a component"
         warn_of_errors(data, variance, first.freq, known=True, done=done)
     units = {f"{name}{x}": unit for name, frf in prefixed.items() for x, unit in frf.units.items()}
     inputs, outputs = Y.inputs, Y.outputs
@@ -148,51 +149,52 @@ def uncoupled(
 ) -> Frf:
     """Return the responses of a machine without some of its components.
 
-    The negative of a known component is coupled to the machine where its joints are: what is left
-    answers as if it had never been joined (LM-FBS decoupling). Of a component on springs, the
-    springs stay at the rest, with loose ends.
+    The negative of a known component is coupled to the machine at its joints, so that the remainder
+    responds as if the component had never been joined (LM-FBS decoupling). Springs of such a
+    component stay at the remainder, with free ends.
 
-    What is left is a difference: where the component rules the machine, errors of 1 % in the
-    responses may be larger than the answer. Variances of the responses, whose errors are taken to
-    be independent of each other, give the variance of the answer to first order; without any, an
-    error of 1 % in each is what is warned of (state ``variance`` 0 of exact responses).
+    The result is a difference: where the component dominates the machine, errors of 1 % in the
+    responses may be larger than the result. Variances of the responses give the variance of the
+    result to first order, with errors that are assumed independent. Without variances the warning
+    assumes an error of 1 % in each response (state ``variance`` 0 for exact responses).
 
     Parameters
     ----------
     machine : Frf
-        Responses of the whole, with channels named "stage/41:z", as those of `joined` are. At the
-        joints of what is taken out, channels that are both outputs and inputs: its own, or those
-        of the other end of a rigid joint.
+        Responses of the whole machine, with channels named "stage/41:z" as by `joined`. At the
+        joints of the removed component it needs channels that are both outputs and inputs: those of
+        the component, or of the other end of a rigid joint.
     known : mapping {str: Frf}
-        The components that are taken out, on the same frequencies.
+        Components to remove, at the same frequencies.
     joints : Joint or sequence of Joint
-        How they are joined to the rest.
+        Joints between these components and the rest.
     dofs : mapping {str: DofSet}, optional
-        Where the channels of components are, known or not: for patches and lever arms.
+        Places of the channels of components, for patches and lever arms.
     extended : bool
-        Extend the interface to all channels of the known components that the machine has too, as
-        outputs or inputs: more equations, solved by least squares of the rank of the joints. They
-        help where the joints alone hardly say what goes through them, and need no matched pairs.
+        Whether to extend the interface to all channels of the known components that the machine has
+        too, as outputs or inputs. This gives more equations, solved by least squares with the rank
+        of the joints. It helps where the joints alone hardly determine their forces, and needs no
+        matched pairs.
 
     Returns
     -------
     Frf
-        The channels of the machine that belong to no known component.
+        Responses between the channels that do not belong to a known component.
 
     Raises
     ------
     ModelError
-        When frequencies or quantities differ, or nothing is left.
+        When frequencies or quantities differ, or no channel remains.
 
     Warns
     -----
     FlexplantWarning
-        When the interface is so badly conditioned that errors of a measurement would hide the
-        answer, or errors exceed the answer at some lines.
+        When the interface is so badly conditioned that measurement errors would hide the result, or
+        errors exceed the result at some lines.
 
     References
     ----------
-    [VoormeerenRixen2012]_, extended interfaces too.
+    [VoormeerenRixen2012]_ (with extended interfaces).
 
     Examples
     --------
@@ -213,8 +215,8 @@ def uncoupled(
     kept_in = [i for i, name in enumerate(machine.inputs) if name.partition("/")[0] not in known]
     if not kept_out or not kept_in:
         raise ModelError(
-            f"no channel is left without {', '.join(known)}: name those of the rest 'stage/41:z', "
-            "outputs and inputs."
+            f"no channel remains without {', '.join(known)}: name the channels of the rest like "
+            "'stage/41:z', outputs and inputs."
         )
     flag(extended, "extended")
     rest_in = [machine.inputs[i] for i in kept_in]
@@ -226,7 +228,7 @@ def uncoupled(
     more = _shared_rows(Y, known) if extended else None
     data, error = _coupled_response(Y, links, machine.freq, machine.quantity, kept, more)
     variance = None if Y.variance is None else error
-    done = "the answer is a small difference of the machine and what is taken out"
+    done = "the result is a small difference between the machine and the removed component"
     warn_of_errors(data, error, machine.freq, known=variance is not None, done=done)
     quantity = machine.quantity
     return Frf(machine.freq, data, rest_in, rest_out, quantity, variance=variance, units=units)
@@ -263,7 +265,7 @@ def _taken_out(
                     continue
                 at = same.ends[i]
                 if missing is not None:
-                    # both ends of a rigid joint move alike
+                    # both ends of a rigid joint have the same motion
                     if link.stiffness is not None or len(link.ends) == 1:
                         raise missing
                     at = link.ends[1 - i].turned()
@@ -273,8 +275,8 @@ def _taken_out(
                 found.append(FrfLink(link.name, (at, own), None, 0.0))
     if not found:
         raise LabelError(
-            f"no joint holds {', '.join(known)}: the machine without it would be the machine. Pass "
-            "the joints between it and the rest."
+            f"no joint connects {', '.join(known)} to the rest, so that removing it changes "
+            "nothing. Pass the joints between it and the rest."
         )
     return found
 
@@ -288,8 +290,8 @@ def _coupled_response(
     more: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
     """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` between kept channels, and its variance."""
-    # with `more` rows of B and B_f, of rigid joints alone, the inverse is that of the rank of these
-    # to first order an error dY of the parts becomes `(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)`
+    # with `more` rows of B and B_f, for rigid joints only, the inverse has the rank of the joints.
+    # To first order an error dY of the parts becomes `(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)`
     # with S the inverted matrix. Where no variance is known, |dY| is as large as Y
     Y, outputs, inputs = parts.data, parts.outputs, parts.inputs
     size_of_error = np.abs(Y) ** 2 if parts.variance is None else parts.variance
@@ -310,10 +312,10 @@ def _coupled_response(
     lines = np.moveaxis(Y, 2, 0)
     gap, load = B_out @ lines, lines @ B_in.T
     stretch = gap @ B_in.T + give
-    # of unlike units: displacements and rotations
+    # the units differ: displacements and rotations
     if more is None:
         above = below = np.sqrt(np.abs(np.einsum("fii->fi", stretch)))
-    else:  # a channel that the joints hardly move is rounding, relative to its own motion
+    else:  # relative to its own motion, since a channel that the joints hardly move is rounding
         own = np.abs(B_out) @ np.abs(lines) @ np.abs(B_in.T)
         most_of = np.sqrt(own.max(axis=(1, 2)))[:, None]
         above, below = own.max(axis=2) / most_of, own.max(axis=1) / most_of
@@ -349,7 +351,7 @@ def _coupled_response(
 def _check_gap(
     B_out: FloatArray, lines: Any, load: Any, found: Any, forces: Any, Z: ComplexArray
 ) -> None:
-    """Refuse joints that stay open: what opens is what springs and dampers give way."""
+    """Refuse joints with a gap beyond the deformation of springs and dampers."""
     left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
     most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
     if not np.all(left <= _GAP * most):
@@ -360,7 +362,7 @@ def _check_gap(
 
 
 def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
-    """Return rows over outputs and over inputs for channels that the machine and its parts have."""
+    """Return rows over outputs and inputs for channels that the machine and its parts share."""
 
     def rows(names: list[str]) -> FloatArray:
         both = [name for name in names if name.partition("/")[0] in known]
@@ -373,7 +375,7 @@ def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray
 
 
 def _same_lines(frfs: Mapping[str, Any]) -> None:
-    """Refuse responses that were not measured alike."""
+    """Refuse responses with different frequencies or quantities."""
     for name, frf in frfs.items():
         instance(frf, Frf, f"component {name!r}", "Join responses with responses, an Frf each.")
     first = next(iter(frfs.values()))

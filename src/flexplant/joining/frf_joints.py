@@ -19,15 +19,15 @@ from ..tolerances import SAME
 from ..words import instance
 from .joint import Joint, JointEnd, Patch, joint_axes
 
-#: a joint that adds less than this fraction to the others repeats them
+#: fraction below which a joint counts as a repetition of other joints
 _RANK = SAME
-#: fraction of the motion of a patch that differs from its mean, at the median frequency, from which
-#: a warning is given
+#: fraction of the motion of a patch that differs from its mean, at the median frequency, above
+#: which a warning is given
 _BENDS = 0.1
 
 
 class FrfEnd(NamedTuple):
-    """What one end of a joint feels, and how its force is spread."""
+    """Motion that one end of a joint sees, and distribution of its force."""
 
     owner: str
     outputs: Mapping[str, float]
@@ -55,7 +55,8 @@ def frf_links(joint: Joint, parts: Sequence[Channels]) -> list[FrfLink]:
     for end, owner in zip(given, owners, strict=True):
         if isinstance(end, tuple):
             raise ModelError(
-                f"{joint!r} is between points, whose motion no channel is. Join channels, "
+                f"{joint!r} is between points, but no channel measures their motion. Join "
+                "channels, "
                 "fx.joining.Joint('stage/41:z', 'frame/7:z'), or a Patch of nodes around the point."
             )
         if (isinstance(end, Patch) or joint.point is not None) and not owner.is_placed:
@@ -78,7 +79,10 @@ def frf_links(joint: Joint, parts: Sequence[Channels]) -> list[FrfLink]:
             for sign, owner, out, into in zip((1.0, -1.0), owners, seen, pushed, strict=False)
         )
         if len(ends) > 1 and ends[0].owner == ends[1].owner and not _weights_of(ends, "outputs"):
-            raise ModelError(f"both ends of {joint!r} are one channel: it would do nothing.")
+            raise ModelError(
+                f"both ends of {joint!r} are the same channel, so that it has no effect. Name "
+                "two channels."
+            )
         stiffness = None if joint.is_rigid else float(k)
         found.append(FrfLink(f"{joint!r} along {axis}", ends, stiffness, float(c)))
     return found
@@ -111,7 +115,7 @@ def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
 
 
 def _measured_patch(patch: Patch, owner: Channels, side: str) -> Patch:
-    """Return the part of a patch that is measured: sensors may be at other nodes than hammers."""
+    """Return the measured part of a patch: sensors and hammers may be at different nodes."""
     if patch.nodes is None:
         return patch
     both = {*owner.outputs.dofs.nodes.tolist(), *owner.inputs.dofs.nodes.tolist()}
@@ -127,7 +131,7 @@ def _measured_patch(patch: Patch, owner: Channels, side: str) -> Patch:
 
 
 def _weights_of(ends: Sequence[FrfEnd], side: str) -> dict[str, float]:
-    """Return the weights of machine's channels in a stretch, those that are not zero."""
+    """Return the non-zero weights of the machine's channels in a stretch."""
     total: dict[str, float] = {}
     for end in ends:
         for channel, weight in getattr(end, side).items():
@@ -137,7 +141,7 @@ def _weights_of(ends: Sequence[FrfEnd], side: str) -> dict[str, float]:
 
 
 def channel_rows(links: Sequence[FrfLink], names: Sequence[str], side: str) -> FloatArray:
-    """Return the stretches (m, n) of links by named outputs, or their forces by inputs."""
+    """Return the stretches (m, n) of links from named outputs, or their forces at inputs."""
     place = {name: i for i, name in enumerate(names)}
     B = np.zeros((len(links), len(names)))
     for row, link in zip(B, links, strict=True):
@@ -164,15 +168,15 @@ def warn_of_bending(
             part = np.linalg.norm(beside, axis=(0, 1)) / np.linalg.norm(moved, axis=(0, 1))
             if np.median(part) > _BENDS:
                 warn(
-                    f"{end!r} bends: {100 * np.median(part):.0f} % of its measured motion, at the "
-                    "median frequency, is beside its mean, which alone is joined. Take nodes "
-                    "nearer to each other, or look for a wrong direction of a channel."
+                    f"{end!r} bends: {100 * np.median(part):.0f} % of its measured motion at the "
+                    "median frequency differs from its mean, and only the mean is joined. Use "
+                    "nodes closer to each other, or look for a wrong direction of a channel."
                 )
 
 
 def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -> ComplexArray:
-    """Return what links give way (m, n_freq) per force: ``(2 pi i f)^p / (k + 2 pi i f c)``."""
-    # p is 0, 1 or 2 where displacements, velocities or accelerations are measured
+    """Return the compliance (m, n_freq) of links: ``(2 pi i f)^p / (k + 2 pi i f c)``."""
+    # p is 0, 1 or 2 for measured displacements, velocities or accelerations
     s = 2j * np.pi * freq
     found = np.zeros((len(links), freq.size), dtype=np.complex128)
     for row, link in zip(found, links, strict=True):
@@ -194,7 +198,7 @@ def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -
 
 
 def independent(B: FloatArray, links: Sequence[FrfLink]) -> list[int]:
-    """Return the rows that are left when rigid joints that repeat others are taken out."""
+    """Return the rows without rigid joints that repeat others."""
     rigid = [i for i, link in enumerate(links) if link.stiffness is None]
     others = [i for i, link in enumerate(links) if link.stiffness is not None]
     if not rigid:
@@ -206,7 +210,7 @@ def independent(B: FloatArray, links: Sequence[FrfLink]) -> list[int]:
 
 
 class Side(NamedTuple):
-    """The outputs, or the inputs, of a component that are DOFs."""
+    """Outputs or inputs of a component that are DOFs."""
 
     dofs: DofSet
     channels: tuple[str, ...]
@@ -225,7 +229,7 @@ class Channels(NamedTuple):
         return self.outputs if which == "outputs" else self.inputs
 
     def named(self, row: FloatArray, which: str) -> dict[str, float]:
-        """Return the weights of a row by the names of the channels, zeros left out."""
+        """Return the non-zero weights of a row by the names of the channels."""
         side = self.side(which)
         return {side.channels[i]: float(row[i]) for i in np.flatnonzero(row)}
 
@@ -260,8 +264,8 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
         return Side(plain, tuple(channels))
     if "" in listed:
         raise LabelError(
-            f"some channels of {name!r} are of components ({', '.join(filter(None, listed))}), "
-            "others are not: name all alike."
+            f"some channels of {name!r} name a component ({', '.join(filter(None, listed))}), "
+            "others do not: name all in the same way."
         )
     numbers = [listed.index(component) for component in owners]
     found = plain.replace(components=tuple(listed), component_of=np.array(numbers, dtype=np.int64))

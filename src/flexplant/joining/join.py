@@ -29,9 +29,9 @@ from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
 from .links import Link, eliminated, links_of, machine_size, stretch_rows, warn_of_missing_statics
 
-#: more coordinates of a machine with reduced components would not fit the memory comfortably
+#: largest number of coordinates of a machine with reduced components, limited by memory
 _LARGEST = 5000
-#: a spring above this many times the stiffness of its components leaves these less than six digits
+#: ratio of a spring to the stiffness of its components above which these keep less than six digits
 _STIFFEST = 1e10
 
 
@@ -62,47 +62,47 @@ def joined(
     name: str | None = None,
     dofs: Mapping[str, DofSet] | None = None,
 ) -> FEModel | ReducedModel | Frf:
-    """Return a machine of components, held together by joints.
+    """Return a machine of components that are connected by joints.
 
     ``q = T q_k`` fulfils the rigid joints, ``B q = 0``; the machine has ``T^T M T``,
-    ``T^T (K + b k b^T) T`` and ``T^T (D + b c b^T) T``, M, K and D being those of all components
-    and b the stretch of a spring or damper. Which coordinates follow is found by QR with column
-    pivoting, of constraints that share coordinates; joints that repeat others do no harm.
+    ``T^T (K + b k b^T) T`` and ``T^T (D + b c b^T) T``, where M, K and D are those of all
+    components and b is the stretch of a spring or damper. The dependent coordinates are found by QR
+    with column pivoting, separately for groups of constraints that share coordinates. Joints that
+    repeat others are allowed.
 
     Parameters
     ----------
     components : mapping {str: FEModel or ReducedModel}, or {str: Frf}
-        Labels of the machine begin with their names: "stage/41:z". Of measured responses, all
-        must be; their joints are between channels that are outputs "41:z" and inputs "41:z" or
-        "u 41:z".
+        Components by name. Labels of the machine begin with the name: "stage/41:z". Either all or
+        none are measured responses; these have joints between channels that are outputs "41:z" and
+        inputs "41:z" or "u 41:z".
     joints : Joint or sequence of Joint
-        What holds them together. The second end of a rigid joint follows the first.
+        Joints between the components. The second end of a rigid joint follows the first.
     placed : mapping {str: Pose}, optional
-        Where components stand; None: where they were made. Labels and coordinates are those of the
-        machine after that.
+        Poses of components. None: no component is moved. Labels and coordinates of the result are
+        those of the machine.
     name : str, optional
         Name of an FEModel, for display.
     dofs : mapping {str: DofSet}, optional
-        For measured responses: where the nodes of components are, in the coordinates of the
-        machine, for joints with lever arms and of patches. The mean motion of a `Patch` is that of
-        its outputs, and its force acts on its inputs, which may be other channels (virtual point
-        transformation).
+        Positions of the nodes of measured components in the coordinates of the machine, for joints
+        with lever arms and patches. The mean motion of a `Patch` is that of its outputs, and its
+        force acts on its inputs, which may be other channels (virtual point transformation).
 
     Returns
     -------
     FEModel, ReducedModel or Frf
-        An FEModel of FEModels, sparse; a ReducedModel when one of them is reduced. DOFs that
-        follow others stay known by their labels, as places. `joining` holds the checks: gaps,
-        balance of forces, inertia, rigid-body motions, errors of patches. The modes that a
-        reduction of a component left out are not kept. Of responses, ``Y - Y B^T (B Y B^T +
-        Z)^-1 B Y``, Z being what springs and dampers give way (LM-FBS); variances of independent
-        responses give those of the machine to first order.
+        A sparse FEModel from FEModels; a ReducedModel when a component is reduced. Dependent DOFs
+        stay known by their labels, as places. `joining` holds the checks: gaps, balance of forces,
+        inertia, rigid-body motions, errors of patches. Modes that the reduction of a component left
+        out are lost. From responses the result is ``Y - Y B^T (B Y B^T + Z)^-1 B Y``, where Z is
+        the compliance of springs and dampers (LM-FBS); variances of independent responses give
+        those of the machine to first order.
 
     Raises
     ------
     ModelError
-        When a rigid joint would hold the machine against the ground, a component is no model, a
-        spring is so stiff that the digits of its components are lost, or full matrices would be
+        When a rigid joint would hold the machine against the ground, a component has a wrong type,
+        a spring is so stiff that the digits of its components are lost, or full matrices would be
         too large.
     CertificateError
         When the machine fails its checks.
@@ -111,8 +111,8 @@ def joined(
     -----
     FlexplantWarning
         When springs and dampers hold the machine against the ground, a reduced component has no
-        static shape for the load of a joint, joints nearly repeat each other, a component has no
-        damping where others have, or errors of responses exceed those of the machine.
+        static shape for the load of a joint, joints nearly repeat each other, only some components
+        have damping, or errors exceed the responses of the machine.
 
     References
     ----------
@@ -132,7 +132,7 @@ def joined(
     if any(isinstance(component, Frf) for component in listed):
         if placed is not None or name is not None:
             raise ModelError(
-                "measured responses have no place and no name: leave placed= and name= out."
+                "placed= and name= do not apply to measured responses: leave them out."
             )
         return joined_frfs(components, joints, dofs)
     if dofs is not None:
@@ -146,7 +146,7 @@ def joined(
     every = sp.vstack([machine.B, machine.S[springs]], format="csr")
     rigid = machine.motions(every, free=True)
     expected = rigid.shape[1]
-    if not machine.is_reduced:  # by energy, as the model finds them
+    if not machine.is_reduced:  # by energy, as the model finds the motions
         xyz = machine.all_dofs.xyz[machine.done.kept]
         rigid = rigid_body_basis(machine.matrices["M"], machine.matrices["K"], motions, xyz)
     certificate = machine.certified(rigid, expected, patch_errors(links, parts))
@@ -155,16 +155,16 @@ def joined(
     return machine.model(motions, certificate, name)
 
 
-#: largest gap, imbalance and error of the inertia, relative
+#: largest relative gap, imbalance and error of the inertia
 _LIMIT = 1e-7
-#: a rigid-body motion that a reduced component misses by less is one that it has
+#: relative error up to which a reduced component contains a rigid-body motion
 _MADE = 1e-8
-#: the part of the largest entry of a motion that counts for the rounding of each
+#: fraction of the largest entry of a motion that counts in the rounding of every entry
 _ENTRY = 1e-3
 
 
 class JoinedMachine:
-    """Components and the axes of their joints: what is left when the rigid ones are fulfilled."""
+    """Components and the axes of their joints, with the motions that satisfy the rigid ones."""
 
     def __init__(self, parts: Sequence[Component], links: Sequence[Link]) -> None:
         self.parts, self.links = parts, links
@@ -194,11 +194,11 @@ class JoinedMachine:
             raise ModelError(
                 f"the spring {self.soft[stiffest].joint!r} is {ratio[stiffest]:.2g} times as stiff "
                 f"as its components there (limit {_STIFFEST:g}): the digits of their K would be "
-                "lost beside it. Leave stiffness= out: the joint is rigid."
+                "lost. Leave out stiffness= for a rigid joint."
             )
 
     def _reach(self) -> FloatArray:
-        """Return how far each coordinate moves its component at most, rotations times its size."""
+        """Return the largest motion of a component by each coordinate, rotations times its size."""
         length, found = machine_size(self.parts), []
         for part in self.parts:
             weight = np.where(part.dofs.kinds < 3, 1.0, length)
@@ -219,8 +219,9 @@ class JoinedMachine:
         damped = len(bare) < len(self.parts)
         if damped and bare:
             warn(
-                f"components {bare} have no D, others have: they are undamped in the machine. Give "
-                "them one first, model.with_damping(ModalDamping(...)), or damp the machine's "
+                f"components {bare} have no D but others do: they are undamped in the machine. "
+                "Give them damping first, model.with_damping(ModalDamping(...)), or damp the "
+                "machine's "
                 "modes."
             )
         soft, T = self.soft, self.done.T
@@ -239,7 +240,7 @@ class JoinedMachine:
 
     @cached_property
     def all_dofs(self) -> DofSet:
-        """All DOFs of all components; a machine in a machine brings its own names."""
+        """All DOFs of all components; a machine as a component keeps its own names."""
         names: list[str] = []
         owners = []
         for name, dofs in ((part.name, part.dofs) for part in self.parts):
@@ -261,13 +262,13 @@ class JoinedMachine:
         return JoinedShape(names, dofs, expansion, motions)
 
     def model(self, motions: FloatArray, certificate: JoiningReport, name: str | None) -> FEModel:
-        """Return the machine of models."""
+        """Return the machine from FEModels."""
         T, held = self.done.T, None
         if any(part.model.held_inertia is not None for part in self.parts):
             own = [(part.n, part.model.held_inertia) for part in self.parts]
             loads = [np.zeros((n, 6)) if load is None else load for n, load in own]
             held = np.asarray(T.T @ np.vstack(loads))
-        # sums of definite matrices are definite, and T has full rank: nothing to check again
+        # sums of definite matrices are definite and T has full rank, so that no new check is needed
         return FEModel._proven(
             **{key: frozen(value) for key, value in self.matrices.items()},
             joint_motions=frozen(motions),
@@ -280,7 +281,7 @@ class JoinedMachine:
     def reduced_model(
         self, motions: FloatArray, rigid: FloatArray, certificate: JoiningReport
     ) -> ReducedModel:
-        """Return the machine of which some components are reduced."""
+        """Return the machine with some reduced components."""
         kept, reduced = self.done.kept, [part for part in self.parts if part.is_reduced]
         names = np.array([x for part in self.parts for x in part.coordinates], dtype=object)[kept]
         of_dofs = [np.arange(part.n) < len(part.model.dofs) for part in self.parts]
@@ -324,9 +325,9 @@ class JoinedMachine:
 
     def motions(self, rows: Any, *, free: bool) -> FloatArray:
         """Return the M-orthonormal motions (k, m) of components as rigid bodies along joints."""
-        # they stretch none of the rows. For each part of the machine first those of the whole, then
-        # those of one component against others (a slide, a hinge): all are combinations of the
-        # components' own motions, those without energy or, unless `free`, the held ones too
+        # they stretch no joint. For each part of the machine, motions of the whole come first, then
+        # those of one component relative to others (a slide, a hinge). All are combinations of the
+        # components' motions without energy and, unless `free`, also of held motions
         found = []
         for group in self.groups:
             several = [part.model for part in (self.parts[i] for i in group)]
@@ -343,7 +344,7 @@ class JoinedMachine:
             whole = np.vstack(mixes) * scale[:, None]
             stretch = np.asarray(rows @ motions)
             most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
-            stretch[np.abs(stretch) <= SAME * most[:, None]] = 0.0  # rounding of what cancels
+            stretch[np.abs(stretch) <= SAME * most[:, None]] = 0.0  # rounding of terms that cancel
             size = np.linalg.norm(stretch, axis=1)
             allowed = la.null_space(stretch / divisor(size)[:, None], rcond=SAME)
             beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
@@ -382,7 +383,7 @@ class JoinedMachine:
             rigid_force=_force(self.matrices["K"], rigid),
             patches=patches,
         )
-        # springs may carry a resultant, rigid joints may not
+        # springs may have a resultant force, rigid joints may not
         if balance > _LIMIT or not found.certificate.holds:
             raise CertificateError(
                 f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer "
@@ -390,15 +391,16 @@ class JoinedMachine:
             )
         if found.n_rigid != expected:
             raise CertificateError(
-                f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} of "
-                "its components' stretch no joint: a joint is too soft or too stiff for the digits "
+                f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} "
+                "motions of its components stretch no joint: a joint is too soft or too stiff "
+                "for the digits "
                 "of the matrices. Look for a wrong unit of a stiffness, or leave the joint out."
             )
         return found
 
     def _inertia(self) -> tuple[FloatArray, float]:
-        """Return the inertia (6, 6) of all components, and how far that of the machine is off."""
-        # motions that a reduced component cannot make (it is held, say) have no inertia of the
+        """Return the inertia (6, 6) of all components, and the error of that of the machine."""
+        # motions that a reduced component cannot make (because it is held) have no inertia of the
         # whole
         own = [part.model.rigid_motions() for part in self.parts]
         apart, missed = np.zeros((6, 6)), np.zeros(6)
@@ -417,36 +419,36 @@ def _body_motions(model: Any) -> FloatArray:
     """Return the rigid-body motions (n, r) of a component, held ones too."""
     rigid: FloatArray = model.rigid_body
     every: FloatArray = model.body_motions
-    # those of a reduced model are known better than from its shapes
+    # a reduced model knows its motions more accurately than its shapes do
     return rigid if rigid.shape[1] == every.shape[1] else every
 
 
 def _force(K: Any, motions: FloatArray) -> float:
-    """Return the largest elastic force of motions (k, r), relative to what cancels in it."""
+    """Return the largest elastic force of motions (k, r), relative to the terms that cancel."""
     force = np.linalg.norm(np.asarray(K @ motions), axis=0)
-    # a motion that no spring feels has nothing but rounding of its largest entries there
+    # a motion without spring forces has only rounding of its largest entries there
     moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
     most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
     return float(np.max(force / divisor(most), initial=0.0))
 
 
-#: patches of more displacements are not examined: each is a load of the component
+#: largest number of displacements of an examined patch: each is a load case of the component
 _MOST = 1000
 #: singular values of the compliance of a patch below this, relative to the largest, count as zero
 _RANK = NULL
 
 
 def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str, float]:
-    """Return, for each patch of a joint, how far apart its bounds of the compliance are."""
+    """Return, for each patch of a joint, the distance between the bounds of its compliance."""
     # with u the displacements of the nodes, C their elastic compliance on the component alone, A
-    # the rigid motions of the patch and W the mean, `W A = I`: a load on the mean motion meets
-    # `W C W^T`, on a patch that stays rigid `(A^T C^-1 A)^-1`, which is less (Gauss and Markov).
-    # What is returned is the largest of 1 - rigid / mean over the axes joined; NaN for a patch of
-    # more than 1000 displacements, or of a component that is unstable or has no elastic modes
+    # the rigid motions of the patch and W the mean, `W A = I`: a load on the mean motion sees `W C
+    # W^T`, on a rigid patch `(A^T C^-1 A)^-1`, which is smaller (Gauss and Markov). The function
+    # returns the largest 1 - rigid / mean over the joined axes; NaN for a patch of more than 1000
+    # displacements, or of a component that is unstable or has no elastic modes
     found: dict[str, float] = {}
     joints = list({id(link.joint): link.joint for link in links}.values())
     for number, joint in enumerate(joints, 1):
-        # a joint that is listed twice is one
+        # a joint that is listed twice counts once
         axes = sorted({DIRECTIONS.index(link.axis) for link in links if link.joint is joint})
         for end in (joint.first, joint.second):
             if isinstance(end, Patch):
@@ -464,7 +466,7 @@ def compliances(
     rows, point = patch.rows(part.dofs), patch.point(part.dofs)
     W, A, _ = patch.mean(part.dofs, point)
     model = part.model
-    # a component of rigid-body modes alone (all others truncated) has no elastic compliance
+    # a component with rigid-body modes only has no elastic compliance
     if rows.size > _MOST or model.n_unstable or model.rigid_body.shape[1] == model.K.shape[0]:
         return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
     loads = dense(part.T[rows].T)
@@ -472,7 +474,7 @@ def compliances(
     C = 0.5 * (C + C.T)
     W, A = W[list(axes)], A[:, list(axes)]
     mean = np.diag(W @ C @ W.T)
-    # motions of A cost no energy here, so that C is invertible where the patch can move at all
+    # motions of A cost no energy here, so that C is invertible where the patch can move
     beside = float(np.trace(C)) / max(float(np.sum(A**2)), TINY)
     stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
     rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
@@ -481,36 +483,37 @@ def compliances(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JoiningReport(Value):
-    """What `joined` checked.
+    """Checks made by `joined`.
 
     Parameters
     ----------
     gap : float
-        Largest opening of a rigid joint over all motions of what is left, relative to what cancels
-        there.
+        Largest opening of a rigid joint over all motions of the machine, relative to the terms that
+        cancel there.
     balance : float
-        Largest resultant of the forces of a joint between two components, relative: what a motion
-        of the whole machine stretches it. Springs may have one (they are warned of), rigid joints
-        have none.
+        Largest relative resultant of the forces of a joint between two components. It is not zero
+        when a motion of the whole machine stretches the joint. Springs with a resultant lead to a
+        warning; rigid joints have no resultant.
     mass : float [kg]
         Mass of the machine; NaN without displacements.
     inertia_error : float
-        Largest difference between the machine's inertia against the six rigid-body motions and the
-        sum of its components', relative.
+        Largest relative difference between the inertia of the machine in the six rigid-body motions
+        and the sum over its components.
     constraints, rank : int
-        Axes of rigid joints, and how many of them are independent.
+        Number of axes of rigid joints, and number of independent ones.
     rigid : mapping {str: int}
-        Rigid-body motions of each component before it was joined.
+        Number of rigid-body motions of each component before joining.
     pieces : mapping {str: int}
-        Rigid-body motions of each part of the machine that joints hold together, by the names of
-        its components, "stage, frame".
+        Number of rigid-body motions of each connected part of the machine, by the names of its
+        components, "stage, frame".
     n_rigid : int
-        Rigid-body motions of the machine.
+        Number of rigid-body motions of the machine.
     rigid_force : float
-        Largest elastic force of these motions, relative to what cancels.
+        Largest elastic force of these motions, relative to the terms that cancel.
     patches : mapping {str: float}
-        For each joint of a patch, by how much of the compliance of its mean motion a patch that
-        stays rigid would be stiffer, at most over its axes: the error of either is below.
+        For each joint of a patch, the largest relative difference over its axes between the
+        compliance of its mean motion and that of a rigid patch. The error of either assumption is
+        smaller.
 
     Examples
     --------
@@ -535,7 +538,7 @@ class JoiningReport(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """What the machine keeps, each relative to what cancels."""
+        """Invariants of the machine, each relative to the terms that cancel."""
         return Certificate(
             (
                 Verified("gap", self.gap, "opening of the rigid joints", _LIMIT),

@@ -1,4 +1,4 @@
-"""What holds two components together, and its ends: motions of places, with lever arms."""
+"""Joints between components and their ends: motions of places, with lever arms."""
 
 from __future__ import annotations
 
@@ -26,26 +26,27 @@ End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"
 class Joint(Value):
     """A joint between two places of components, or between one and the ground.
 
-    Rigid unless it has a stiffness or a rate: along each of its axes both sides move alike at the
-    point of the joint, or are held together by a spring and a damper there.
+    A joint is rigid unless it has a stiffness or a rate. Along each axis, both sides have the same
+    motion at the point of the joint, or are connected by a spring and a damper.
 
     Parameters
     ----------
     first, second : str, (str, (3,) array [m]) or Patch
-        A DOF ``"stage/41:z"``, a node ``"stage/41"`` with the directions it has, a point
-        ``("stage", (x, y, z))`` of its shapes in the coordinates of the machine, or a patch of
-        nodes. No second: the ground, for a spring or a damper.
+        Ends of the joint: a DOF ``"stage/41:z"``, a node ``"stage/41"`` with its directions, a
+        point ``("stage", (x, y, z))`` in the coordinates of the machine, or a patch of nodes.
+        Without `second`, a spring or damper acts against the ground.
     axes : sequence of str, optional
-        Which of x, y, z, rx, ry, rz are joined, in the directions of the machine. None: that of a
-        DOF, or those that both ends have where these are the same.
+        Joined axes among x, y, z, rx, ry, rz, in the directions of the machine. None: the axis of a
+        DOF, or the axes of both ends where these are the same.
     stiffness : float or one for each axis [N/m, N m/rad], optional
         Stiffness of springs; negative ones attract, as magnets do.
     rate : float or one for each axis [N s/m, N m s/rad], optional
         Damping of dampers.
     point : (3,) array [m], optional
-        Where the joint acts: both ends reach there with lever arms, by their rotations. None: at
-        the first end. DOFs have no lever arm; a node without rotations turns with its neighbours,
-        for arms up to 1e-4 of the machine's size, such as few digits of coordinates leave.
+        Point where the joint acts; both ends reach it with lever arms, by their rotations. None:
+        the first end. DOFs have no lever arm. A node without rotations uses the rotation of its
+        neighbours, for arms up to 1e-4 of the machine's size, which come from coordinates with few
+        digits.
 
     Examples
     --------
@@ -66,7 +67,9 @@ class Joint(Value):
         axes = None if self.axes is None else name_list(self.axes, "axes of a joint")
         require_known("axis", axes or (), DIRECTIONS)
         if axes is not None and (not axes or len(set(axes)) < len(axes)):
-            raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
+            raise LabelError(
+                f"axes of a joint must be different, got {axes!r}: name each axis once."
+            )
         self._set(
             first=_checked_end(self.first),
             second=None if self.second is None else _checked_end(self.second),
@@ -99,7 +102,7 @@ class Joint(Value):
 
     @property
     def is_rigid(self) -> bool:
-        """Whether both sides move alike along its axes."""
+        """Whether both sides have the same motion along its axes."""
         return self.stiffness is None and self.rate is None
 
     def values(self, axes: Sequence[str]) -> tuple[FloatArray, FloatArray]:
@@ -154,27 +157,27 @@ _RANK = 1e-8
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Patch(Value):
-    """Nodes of a component whose mean motion is joined, as NASTRAN's RBE3 does.
+    """Nodes of a component whose mean motion is joined, as by NASTRAN's RBE3.
 
-    Displacements u of the nodes have the mean motion ``v = (A^T W A)^-1 A^T W u``, A being the
-    rigid-body motions about the point of the patch: the rigid motion nearest to them. A force on
-    the patch is spread over its nodes with the same weights; the patch itself may bend. The
-    opposite, a patch that stays rigid (RBE2), is too stiff; the truth of a bonded patch lies
-    between, and the certificate of `joined` says how far these are apart.
+    Displacements u of the nodes have the mean motion ``v = (A^T W A)^-1 A^T W u``, where A are the
+    rigid-body motions about the point of the patch: it is the closest rigid motion. A force on the
+    patch is distributed over its nodes with the same weights, and the patch may bend. A rigid patch
+    (RBE2) is too stiff; a bonded patch lies between the two, and the certificate of `joined` states
+    their difference.
 
     Parameters
     ----------
     component : str
-        Whose nodes; of a component of a joined machine, "machine/stage".
+        Component of the nodes; "machine/stage" for a component of a joined machine.
     nodes : sequence of int, optional
-        Which; None: those in the box.
+        Node numbers; None: the nodes in the box.
     box : (2, 3) array [m], optional
         Lowest and highest corner, in the coordinates of the machine.
     at : (3,) array [m], optional
-        The point whose motion is meant, in the coordinates of the machine; None: the mean of the
+        Reference point of the motion in the coordinates of the machine; None: the mean of the
         nodes.
     weights : (m,) array, optional
-        Weights of the nodes, in the order of `nodes`: such as the area of each. None: equal.
+        Weights of the nodes in the order of `nodes`, for example their areas. None: equal weights.
 
     Examples
     --------
@@ -198,13 +201,13 @@ class Patch(Value):
         instance(self.component, str, "component of a patch", "Name it.", LabelError)
         if (self.nodes is None) == (self.box is None):
             raise LabelError(
-                "a patch needs nodes=[...] or box=[(x, y, z), (x, y, z)], not both: give one."
+                "a patch needs either nodes=[...] or box=[(x, y, z), (x, y, z)]. Give one of them."
             )
         nodes = None if self.nodes is None else tuple(node_numbers(self.nodes).tolist())
         if nodes and len(set(nodes)) < len(nodes):
             raise LabelError(
-                f"nodes of a patch must be different ones, got {short(nodes)}: name each once, "
-                "with the sum of its weights."
+                f"nodes of a patch must be different, got {short(nodes)}: name each once, with "
+                "the sum of its weights."
             )
         weights = self.weights
         if weights is not None:
@@ -226,7 +229,8 @@ class Patch(Value):
         if self.nodes is not None and dofs.components and not inner:
             raise LabelError(
                 f"{self!r} names nodes by numbers, which {', '.join(dofs.components)} may share. "
-                f"Say whose: fx.joining.Patch('{self.component}/{dofs.components[0]}', nodes), "
+                f"Name the component: fx.joining.Patch('{self.component}/{dofs.components[0]}', "
+                "nodes), "
                 "or give box=."
             )
         own = max(inner, key=len, default=None)
@@ -235,7 +239,7 @@ class Patch(Value):
         return np.asarray(rows[dofs.kinds[rows] < 3])
 
     def point(self, dofs: DofSet) -> FloatArray:
-        """Return the point (3,) [m] whose motion is meant."""
+        """Return the reference point (3,) [m] of the motion."""
         if self.at is not None:
             return np.asarray(self.at, dtype=np.float64)
         rows = self.rows(dofs)
@@ -245,8 +249,8 @@ class Patch(Value):
     def mean(self, dofs: DofSet, point: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
         """Return the mean motions of the patch at a point.
 
-        The six motions by the displacements of the nodes (6, m), zero for those it does not make;
-        A, these displacements by the six motions (m, 6); and which of the six it determines.
+        Returns the six motions from the displacements of the nodes (6, m), zero for undetermined
+        ones; A, the displacements from the six motions (m, 6); and which of the six are determined.
         """
         rows = self.rows(dofs)
         return mean_motions(dofs._taken(rows), point, self._weight_of(dofs, rows))
@@ -274,12 +278,13 @@ def mean_motions(
     return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
 
 
-#: up to this fraction of the size, a node without rotations turns as the nodes next to it do
+#: largest lever arm, relative to the size, at which a node without rotations uses that of its
+#: neighbours
 _SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
 
 class JointEnd:
-    """One end of a joint, on components by their DOFs: all that move, or those measured."""
+    """One end of a joint, on components with all their DOFs or with measured ones."""
 
     def __init__(
         self, parts: Mapping[str, DofSet], end: Any, size: float, motions: Sequence[FloatArray]
@@ -311,7 +316,7 @@ class JointEnd:
             for row in np.flatnonzero(dofs.nodes == int(node)).tolist():
                 self._rows[dofs.directions[row]] = np.eye(1, len(dofs), row)[0]
                 self.point = np.asarray(dofs.xyz[row])
-        else:  # of a machine: "frame/41", of which DOFs may follow others
+        else:  # in a machine: "frame/41", whose DOFs may follow others
             for axis in DIRECTIONS:
                 with suppress(LabelError):
                     self._rows[axis] = dofs.row(f"{node}:{axis}")
@@ -339,10 +344,10 @@ class JointEnd:
             except LabelError as error:
                 failed = failed or str(error)
         if not self._rows:
-            raise LabelError(f"the joint at {self.text} is nowhere: {failed}")
+            raise LabelError(f"the place of the joint at {self.text} is unknown: {failed}")
 
     def is_near(self, point: FloatArray) -> bool:
-        """Return whether a point is so near that coordinates with few digits explain its gap."""
+        """Return whether coordinates with few digits explain the distance of a point."""
         return bool(np.linalg.norm(point - self.point) <= _SHORT_ARM * self._size)
 
     def row(self, axis: str, point: FloatArray) -> FloatArray:
@@ -369,8 +374,9 @@ class JointEnd:
             if turned is None:
                 raise LabelError(
                     f"the lever arm ({', '.join(f'{x:g}' for x in arm)}) m of the joint at "
-                    f"{self.text} needs its rotation {turn}, which it has not. Give point=, where "
-                    "the joint acts, on its side, or join a Patch of nodes, which has mean "
+                    f"{self.text} needs its rotation {turn}, which is missing. Give point=, "
+                    "where the joint acts, on its side, or join a Patch of nodes, which has "
+                    "mean "
                     "rotations."
                 )
             found = found + share * turned
@@ -378,7 +384,7 @@ class JointEnd:
 
     def _turn_of_neighbours(self, turn: str) -> FloatArray | None:
         """Return the mean rotation (n,) of the nodes next to this end, None without such nodes."""
-        # coordinates with few digits leave gaps between nodes that are meant to be one
+        # coordinates with few digits leave gaps between nodes that should coincide
         dofs = self._dofs
         first = np.unique(dofs.node_index, return_index=True)[1]
         distance = np.linalg.norm(dofs.xyz[first] - self.point, axis=1)
@@ -392,13 +398,13 @@ class JointEnd:
         return found
 
     def carried(self, row: FloatArray) -> FloatArray:
-        """Return what a row (n,) gives for the six rigid-body motions of the machine (6,)."""
+        """Return the value (6,) of a row (n,) for the six rigid-body motions of the machine."""
         some = np.flatnonzero(row)
         return np.asarray(row[some] @ self._motions[some])
 
 
 def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
-    """Return the axes that a joint joins: those given, that of a DOF, or those of both ends."""
+    """Return the joined axes: the given ones, that of a DOF, or those of both ends."""
     if joint.axes is not None:
         return tuple(joint.axes)
     for place in (first, second):
@@ -421,7 +427,7 @@ def joint_list(joints: Any) -> list[Joint]:
 
 
 def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
-    """Return which component a text such as "stage/41:z" begins with, and the rest of it."""
+    """Return the component and the rest of a text such as "stage/41:z"."""
     own = (name for name in sorted(names, key=len, reverse=True) if text.startswith(f"{name}/"))
     name = next(own, text.partition("/")[0])
     return name, text[len(name) + 1 :]

@@ -20,14 +20,14 @@ from ..tolerances import SAME, TYPED
 from .component import Component, Model, Pose, components_of
 from .joint import Joint, JointEnd, joint_axes, joint_list
 
-#: relative: what a joint feels of a motion of the whole machine below this is rounding
+#: relative stretch of a joint in a motion of the whole machine below which it counts as zero
 BALANCED = SAME
-#: part of a joint's row that static shapes of a reduced component may miss
+#: fraction of a joint's row that static shapes of a reduced component may miss
 _STATIC = 1e-3
 
 
 class Felt(NamedTuple):
-    """What a joint feels of a component: ``values @ q[columns]`` of all its DOFs."""
+    """Motion of a component seen by a joint: ``values @ q[columns]`` of all its DOFs."""
 
     component: int
     columns: IntArray
@@ -46,12 +46,12 @@ class Link(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether forces go through it: a spring of zero stiffness, to be updated say, has none."""
+        """Whether it transmits forces: a spring of zero stiffness, for an update, does not."""
         return self.joint.is_rigid or self.stiffness != 0 or self.rate != 0
 
     @property
     def owners(self) -> tuple[int, ...]:
-        """The components it joins."""
+        """Components that it joins."""
         return tuple(end.component for end in self.ends)
 
 
@@ -63,7 +63,7 @@ def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
 
 
 def machine_size(parts: Sequence[Component]) -> float:
-    """Return the largest extent of a machine [m], 1 when it has none."""
+    """Return the largest extent of a machine [m], 1 for a single point."""
     xyz = np.vstack([part.dofs.xyz for part in parts])
     return float(np.ptp(xyz, axis=0).max()) or 1.0
 
@@ -76,7 +76,7 @@ def _links(
     axes = joint_axes(joint, first, second)
     point = first.point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
     if joint.point is None and second is not None and second.is_near(point):
-        point = second.point  # the second end follows, by the rotations of the first
+        point = second.point  # the second end follows with the rotations of the first
     found = []
     for axis, stiffness, rate in zip(axes, *joint.values(axes), strict=True):
         row = first.row(axis, point)
@@ -89,7 +89,10 @@ def _links(
                 ends = [_felt(first.index, row + other)]
             _check_balance(joint, axis, carried, size)
         if not any(end.columns.size for end in ends):
-            raise ModelError(f"both ends of {joint!r} are one place: it would do nothing.")
+            raise ModelError(
+                f"both ends of {joint!r} are the same place, so that it has no effect. Name two "
+                "places."
+            )
         found.append(Link(joint, axis, tuple(ends), float(stiffness), float(rate), carried))
     return found
 
@@ -117,7 +120,7 @@ def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) ->
 
 
 def stretch_rows(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
-    """Return the stretches of links (m, n) by the coordinates of all components."""
+    """Return the stretches of links (m, n) from the coordinates of all components."""
     starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
     data, rows, columns = [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for i, link in enumerate(links):
@@ -152,8 +155,9 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
             more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
             warn(
                 f"component {part.name!r} ({part.model!r}) holds no static shape for the load of "
-                f"{lost[0].joint!r} ({lost[0].axis}){more}: without the compliance of the modes "
-                "left out, the joint is too stiff. Solve with compliance_at=[...] there, or by "
+                f"{lost[0].joint!r} ({lost[0].axis}){more}: without the compliance of the "
+                "truncated modes, the joint is too stiff. Solve with compliance_at=[...] there, "
+                "or by "
                 "CraigBampton(boundary=[...]) or Rubin."
             )
 
@@ -165,25 +169,25 @@ def coincident_joints(
     box: Sequence[Sequence[float]] | FloatArray | None = None,
     tolerance: float | None = None,
 ) -> list[Joint]:
-    """Return rigid joints of all nodes of different components that are at one place.
+    """Return rigid joints of all coincident nodes of different components.
 
-    For meshes that match. Each joins the directions that both nodes have.
+    It serves meshes that match. Each joint connects the directions that both nodes have.
 
     Parameters
     ----------
     components : mapping {str: FEModel or ReducedModel}
-        As `joined` takes them; of a reduced model all nodes count.
+        Components as for `joined`; all nodes of a reduced model count.
     placed : mapping {str: Pose}, optional
-        As `joined` takes it.
+        Poses as for `joined`.
     box : (2, 3) array [m], optional
-        Only nodes in this box of the machine.
+        Box in the machine that limits the nodes.
     tolerance : float [m], optional
-        How far apart nodes may be; None: 1e-6 of the machine's size.
+        Largest distance of coincident nodes; None: 1e-6 of the machine's size.
 
     Raises
     ------
     ModelError
-        When no two nodes are at one place, or some are near several.
+        When no nodes coincide, or a node is close to several others.
 
     Examples
     --------
@@ -200,7 +204,7 @@ def coincident_joints(
     if not found:
         raise ModelError(
             f"no nodes of {', '.join(part.name for part in parts)} are within {reach:.2g} m of "
-            "each other. Are they placed as they are meant to be? Give tolerance=, or join a Patch."
+            "each other. Check their poses, give tolerance=, or join a Patch."
         )
     return found
 
@@ -240,20 +244,21 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
 
 
-#: diagonal entries of R below this, relative to the first, count as zero: a joint repeats others
+#: size of diagonal entries of R relative to the first below which a joint repeats others
 _RANK = 1e-8
-#: below this, relative to the first one, it nearly repeats them
+#: the same size below which it nearly repeats others
 _DOUBTFUL = 1e-5
-#: how much later components come first among those that follow; far above rounding
+#: preference for later components as followers; far above rounding
 _LATER, _WITHIN = 1e-2, 1e-4
-#: of the heaviest in its constraint: a coordinate that may follow without looking for a better one
+#: size relative to the largest in its constraint above which a coordinate may follow without
+#: further search
 _HEAVY = 0.3
-#: relative: entries of the expansion below this are rounding
+#: relative size of entries of the expansion below which they count as zero
 _ROUNDING = 1e-15
 
 
 class Elimination(NamedTuple):
-    """Coordinates (n,) that fulfil constraints, by those that are left (k,): ``q = T q_k``."""
+    """Coordinates (n,) that satisfy constraints, from the remaining ones (k,): ``q = T q_k``."""
 
     T: sp.csc_array
     kept: IntArray
@@ -261,15 +266,15 @@ class Elimination(NamedTuple):
 
 
 def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Elimination:
-    """Return the motions that fulfil ``B q = 0``."""
-    # coordinates that no constraint names are left alone, one that a single constraint names
-    # follows it, and of the others, constraints that share no coordinate are solved apart: sparse
+    """Return the motions that satisfy ``B q = 0``."""
+    # coordinates without a constraint stay; a coordinate in a single constraint follows from it;
+    # the other constraints are solved in separate groups without common coordinates, so that sparse
     # matrices stay sparse
     n = B.shape[1]
     lead = _own_followers(B, size, order)
     plain = lead >= 0
     first = _block_motions(B[~plain], size, order)
-    # those that one constraint alone names follow it, whatever the others say
+    # coordinates in one constraint only follow from it, independent of the others
     leads = lead[plain]
     some = sp.csr_array(B[plain])
     pivot = some[np.arange(leads.size), leads]
@@ -284,7 +289,7 @@ def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Eliminatio
 
 
 def _own_followers(B: Any, size: FloatArray, order: IntArray) -> IntArray:
-    """Return for each constraint (m,) the coordinate that it alone names, or -1."""
+    """Return for each constraint (m,) a coordinate that only it contains, or -1."""
     part = sp.coo_array(B)
     rows, columns = part.coords
     weight = np.abs(part.data) / size[columns]
@@ -295,12 +300,12 @@ def _own_followers(B: Any, size: FloatArray, order: IntArray) -> IntArray:
     found = np.full(B.shape[0], -1, dtype=np.int64)
     chosen = np.flatnonzero(alone)
     chosen = chosen[np.lexsort((columns[chosen], order[columns[chosen]]))]
-    found[rows[chosen]] = columns[chosen]  # of several, the last one stays
+    found[rows[chosen]] = columns[chosen]  # the last of several is kept
     return found
 
 
 def _block_motions(B: Any, size: FloatArray, order: IntArray) -> Elimination:
-    """Return the motions that fulfil constraints, solved apart where they share no coordinate."""
+    """Return the motions that satisfy constraints, solved in groups without common coordinates."""
     n = B.shape[1]
     touched = np.unique(B.indices).astype(np.int64)
     follow, rows, columns, values = [np.zeros(0, np.int64)], [], [], []
@@ -342,7 +347,7 @@ def _follower_rows(
     k = block.shape[1]
     scaled = block / size
     scaled = scaled / np.linalg.norm(scaled, axis=1)[:, None]
-    # equally good pivots must not hang on rounding
+    # rounding must not decide between equal pivots
     prefer = 1.0 + _LATER * order / (order.max() + 1) + _WITHIN * np.arange(k) / k
     R, pivots = la.qr(scaled * prefer, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(R))

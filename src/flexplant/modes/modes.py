@@ -487,7 +487,7 @@ class Modes(Placed, Value):
         finer : Modes
             Modes of the same structure with smaller elements, for example half as large.
         order : float
-            2 for plates and for bricks of eight nodes.
+            Order of convergence; 2 for plates and for bricks of eight nodes.
 
         Raises
         ------
@@ -511,7 +511,7 @@ class Modes(Placed, Value):
             Modes of the same structure with larger elements, 1.5 or 2 times as large, say, and
             a few more modes than are needed, among which the highest find a partner.
         order : float
-            2 for plates and for bricks of eight nodes.
+            Order of convergence; 2 for plates and for bricks of eight nodes.
 
         Raises
         ------
@@ -582,7 +582,7 @@ class Modes(Placed, Value):
         place : str, (3,) array [m] or mapping
             A DOF label, a point, or {label: weight}.
         direction : str
-            The motion at a point.
+            Direction of the motion at a point.
         """
         motion: FloatArray | ComplexArray = self.dofs.row(place, direction) @ self.phi
         return motion

@@ -1,11 +1,11 @@
-"""Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality.
+"""Model reduction: fewer degrees of freedom, same input-output behaviour, with error bounds.
 
 A `ReducedModel` has small M, D and K in physical DOFs and the expansion T of the whole structure.
 
-- `reduce(modes, DesiredDofs(labels))`: the paper's; the DOFs are chosen, modes stay exact.
+- `reduce(modes, DesiredDofs(labels))`: the method of the paper; chosen DOFs, exact modes.
 - `select_dofs(modes, count)`: DOFs at which the modes are well distinguished.
 - other methods: `ModalTruncation`, `ModalBalanced`, `Guyan`, `Irs`, `Serep`, `CraigBampton`,
-  `Rubin`, `MacNeal`, `Krylov`; a new one is a value with one method.
+  `Rubin`, `MacNeal`, `Krylov`; a new method is a class with one function.
 - `ReducedModel.quality(model, band=, inputs=, outputs=)`: frequencies, shapes, responses, bound.
 - `rank_modes`: which modes matter between ports.
 

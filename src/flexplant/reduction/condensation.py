@@ -32,7 +32,7 @@ from .reduced import ReducedModel
 
 _SINGULAR = (
     "K of the condensed DOFs is singular: with the kept DOFs held, the structure can still move "
-    "(rigidly, or as a mechanism), so that it has no static shape. Keep DOFs that hold its "
+    "(rigidly, or as a mechanism), so that it has no static shape. Keep DOFs that prevent its "
     "rigid-body motions: three z-DOFs that are not on a line for a plate."
 )
 
@@ -44,7 +44,8 @@ def _loose(model: FEModel, kept: IntArray) -> str:
     _, sizes, turned = la.svd(rigid[kept])
     held = np.pad(sizes, (0, rigid.shape[1] - sizes.size))
     left = rigid @ turned[held < SAME * max(largest, held.max(initial=0.0))].T
-    # the displacements that move most, one after the other; rotations where there are no others
+    # the displacements that move most, one after the other; rotations only where displacements are
+    # missing
     names = model.dofs.labels
     straight = model.dofs.kinds < 3
     order = la.qr(np.where(straight[:, None], left, 0.0).T, mode="r", pivoting=True)
@@ -56,8 +57,8 @@ def _loose(model: FEModel, kept: IntArray) -> str:
     add = ", ".join(repr(names[i]) for i in order[1][:count])
     return (
         f"the kept DOFs leave {counted(count, 'rigid-body motion')} free: with them held, "
-        f"the structure has no static shape. Keep {add} as well, say; or take Rubin or "
-        "ModalTruncation, which need nothing held."
+        f"the structure has no static shape. Keep for example {add} as well; or use Rubin or "
+        "ModalTruncation, which hold no DOF."
     )
 
 
@@ -67,7 +68,7 @@ def mode_numbers(numbers: Any, name: str) -> tuple[int, ...]:
         raise ModelError(f"{name} are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
     listed = [whole(number, "a mode number") for number in numbers]
     if not listed or len(set(listed)) != len(listed):
-        raise ModelError(f"mode numbers must be there once each, got {listed!r:.80}.")
+        raise ModelError(f"every mode number may appear only once, got {listed!r:.80}.")
     return tuple(sorted(listed))
 
 
@@ -79,10 +80,12 @@ class DofPartition:
         self.others = np.delete(np.arange(model.n_dof), self.kept)
         if not self.others.size:
             every = counted(model.n_dof, "DOF")
-            raise ShapeError(f"all {every} would be kept: nothing is left to condense.")
+            raise ShapeError(
+                f"all {every} would be kept, so that nothing is condensed. Keep fewer."
+            )
         rigid = model.rigid_body
         if rigid.shape[1]:
-            # held at the kept DOFs, no rigid-body motion may be left
+            # with the kept DOFs held, no rigid-body motion may remain
             size = la.svdvals(rigid[self.kept] / np.linalg.norm(rigid, axis=0))
             if size.size < rigid.shape[1] or size[-1] < SAME * size[0]:
                 raise ModelError(_loose(model, self.kept))
@@ -103,12 +106,12 @@ class Guyan(ReductionMethod):
     """Static condensation to a few DOFs: ``T = [I; -Kss^-1 Ksm]``.
 
     Exact at 0 Hz for loads on the kept DOFs and for rigid-body motions; every frequency is at or
-    above the true one (Rayleigh-Ritz), and none falls when DOFs are added.
+    above the true one (Rayleigh-Ritz) and never falls below it when DOFs are added.
 
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
-        The DOFs that are kept; held, they must stop all rigid-body motion.
+        Kept DOFs. When they are held, the structure must not move as a rigid body.
     damping : ModalDamping or Rayleigh, optional
         Damping of the reduced model's own modes; None: ``T^T D T``.
 
@@ -146,8 +149,8 @@ class Irs(ReductionMethod):
     """Improved reduced system: static condensation with the inertia of the condensed DOFs.
 
     ``T_1 = T_s + S M T_s M_s^-1 K_s``, ``S = diag(0, Kss^-1)`` (one iteration is the IRS of
-    O'Callahan); iterated, T takes the place of T_s in the second term and tends to SEREP: the
-    lowest k modes exactly.
+    O'Callahan); in further iterations T replaces T_s in the second term and converges to SEREP,
+    which has the lowest k modes exactly.
 
     Parameters
     ----------
@@ -155,7 +158,7 @@ class Irs(ReductionMethod):
     iterations : int
         Largest number of iterations.
     tolerance : float
-        Stop when no omega^2 changes by more than this fraction of itself.
+        Relative change of every omega^2 below which the iteration stops.
 
     Notes
     -----
@@ -193,7 +196,7 @@ class Irs(ReductionMethod):
             M, K = inner(model.M, T), inner(model.K, T)
             rates, squares = _rates(M, K)
             inertia = np.asarray(model.M @ T)[part.others] @ rates
-            # rigid-body motions have no rate: rounding in K is kept out of them
+            # rigid-body motions have zero frequency, without rounding of K
             inertia = inertia - inertia @ rigid @ la.pinv(rigid) if rigid.shape[1] else inertia
             T = part.static + part.whole(np.zeros_like(rates), part.solver.solve(inertia))
             floor = self.tolerance * np.abs(squares) + ROUNDING * squares[-1]
@@ -206,7 +209,7 @@ class Irs(ReductionMethod):
             dofs=model.dofs.select(labels),
             method=f"improved condensation (IRS, {counted(done, 'iteration')})",
             damping=self.damping,
-            singular="The iteration lost modes: take fewer iterations, or other DOFs.",
+            singular="The iteration lost modes: use fewer iterations, or other DOFs.",
             static_at=labels,
         )
 
@@ -219,7 +222,7 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
         lower = la.cholesky(np.asarray(scaled), lower=True)
     except la.LinAlgError as error:
         raise SolverError(
-            "the reduced M is singular in the IRS iteration: it lost modes. Take fewer "
+            "the reduced M is singular in the IRS iteration: it lost modes. Use fewer "
             "iterations, or other DOFs."
         ) from error
     rates = scale[:, None] * la.cho_solve((lower, True), stiffness) / scale
@@ -230,7 +233,7 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Serep(ReductionMethod):
-    """System equivalent reduction (SEREP): the chosen modes, exactly, in as many DOFs.
+    """System equivalent reduction (SEREP): chosen modes, exactly, in the same number of DOFs.
 
     ``T = phi phi_kk^-1`` like `DesiredDofs` (paper, eq. (6) to (8)), but the modes are solved here
     and the matrices are ``T^T M T``, ``T^T K T`` and, for any D, ``T^T D T``.
@@ -239,11 +242,11 @@ class Serep(ReductionMethod):
     ----------
     dofs, damping : as for `Guyan`
     modes : sequence of int, optional
-        As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
+        Mode numbers from 1, as many as DOFs, with all rigid-body modes. None: the lowest modes.
 
     Notes
     -----
-    With fewer modes than DOFs its M* is singular, which no plant can take: refused.
+    With fewer modes than DOFs M* would be singular, which is refused.
 
     References
     ----------
@@ -304,19 +307,19 @@ def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:
 class CraigBampton(ReductionMethod):
     """Static shapes of the boundary and modes of the interior with the boundary held.
 
-    ``T = [I 0; -Kii^-1 Kib  phi_i]``: coordinates are the boundary DOFs, then one per
+    ``T = [I 0; -Kii^-1 Kib phi_i]``: coordinates are the boundary DOFs, then one per
     fixed-interface mode ("fixed mode 1", ...). Every frequency is at or above the true one
-    (Rayleigh-Ritz) and none rises when modes are added; rigid-body motions are exact.
+    (Rayleigh-Ritz) and never rises when modes are added; rigid-body motions are exact.
 
     Parameters
     ----------
     boundary : sequence of str, DofSet or DofSelection
-        DOFs that stay, where loads and other structures attach; held, they stop all rigid-body
-        motion.
+        Kept DOFs, where loads and other structures attach. When they are held, the structure must
+        not move as a rigid body.
     modes : int
         Number of fixed-interface modes; 0 is static condensation.
     below : float [Hz], optional
-        In place of `modes`: all fixed-interface modes up to this frequency.
+        Highest frequency of the fixed-interface modes, in place of `modes`.
     damping : ModalDamping or Rayleigh, optional
         Damping of the reduced model's own modes; None: ``T^T D T``.
 
@@ -379,7 +382,7 @@ class _FreeInterface(ReductionMethod):
 
     boundary: Iterable[str] = field(metadata=checked(labels_given, name="boundary DOFs"))
     modes: int = field(metadata=checked(whole))
-    #: whether the residual flexibility has no inertia, and its name
+    #: whether the residual flexibility is without inertia, and its name
     _massless: ClassVar[bool]
     _kind: ClassVar[str]
 
@@ -408,7 +411,7 @@ class _FreeInterface(ReductionMethod):
         rigid = np.zeros((light.size, r))
         rigid[:b], rigid[b : b + r] = np.real(modes.phi)[model.dofs.indices(labels), :r], np.eye(r)
         if massless:
-            # exactly: zeros say which coordinates have no mass
+            # exact zeros mark coordinates without mass
             for matrix in (M, D):
                 matrix[:b], matrix[:, :b] = 0.0, 0.0
         values = la.eigvalsh(dense(unit_diagonal(M[b:, b:] if massless else M)[0]))
@@ -454,13 +457,14 @@ class Rubin(_FreeInterface):
 
     The span is that of the modes and their residual attachment vectors; coordinates are the
     boundary DOFs, then the modal ones ("mode 1", ...). The modes are exact, the response to loads
-    on the boundary is so up to order omega^2, and all other frequencies are above the true ones. A
-    free structure's flexibility is that of loads in balance with its inertia (inertia relief).
+    on the boundary is exact up to order omega^2, and all other frequencies are above the true ones.
+    For a free structure the flexibility holds for loads in equilibrium with its inertia (inertia
+    relief).
 
     Parameters
     ----------
     boundary : sequence of str, DofSet or DofSelection
-        DOFs that stay, where loads and other structures attach.
+        Kept DOFs, where loads and other structures attach.
     modes : int
         Number of free modes, rigid-body modes included.
     damping : ModalDamping or Rayleigh, optional
@@ -486,15 +490,14 @@ class Rubin(_FreeInterface):
 class MacNeal(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, without inertia.
 
-    As `Rubin`, but what lies beyond the modes answers at once: the boundary coordinates have no
-    mass (rows of M* are zero), and its poles are those of the modes alone. Exact at 0 Hz for loads
-    on the boundary. A plant takes it with a feedthrough; coupling and updating give the boundary
-    mass.
+    Like `Rubin`, but the truncated part responds statically: the boundary coordinates have no mass
+    (rows of M* are zero), and the poles are only those of the modes. Exact at 0 Hz for loads on the
+    boundary. A plant of this model has a feedthrough; coupling and updating give the boundary mass.
 
     Parameters
     ----------
     boundary, modes, damping
-        As for `Rubin`; the damping is that of the modes alone, None: their part of D.
+        As for `Rubin`; the damping applies to the modes only, None: their part of D.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Ways to choose degrees of freedom that distinguish modes; each is a small value."""
+"""Criteria for the choice of degrees of freedom that distinguish modes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from ..words import instance, name_list
 #: shapes at DOFs, real or complex
 Rows: TypeAlias = FloatArray | ComplexArray
 
-#: downdates after which the information matrix is made anew, and dropped rows leave the arrays
+#: number of downdates after which the information matrix is computed again and dropped rows are
+#: removed
 _REFRESH = 64
 
 
@@ -45,9 +46,9 @@ class SelectionCriterion(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PivotedQr(SelectionCriterion):
-    """QR with column pivoting: each next DOF is the one least explained by those before.
+    """QR with column pivoting: each next DOF is the one least explained by the previous ones.
 
-    Its value for a DOF is the length of what those before it do not explain.
+    The value of a DOF is the length of its row that previous rows do not explain.
 
     References
     ----------
@@ -80,10 +81,10 @@ class PivotedQr(SelectionCriterion):
 class EffectiveIndependence(SelectionCriterion):
     """Effective independence: drop the DOF that adds least to the information on the modes.
 
-    Starts from all candidates. Their information is ``Q = phi^H phi``, of which row i holds the
-    share ``E_i = phi_i Q^-1 phi_i^H``, from 0 to 1 (without it, a mode is lost). One by one the
-    lowest goes, and Q^-1 follows by a rank-one downdate. Fewer DOFs than modes are chosen by
-    `PivotedQr` from the last k.
+    The search starts with all candidates. Their information is ``Q = phi^H phi``, in which row i
+    has the share ``E_i = phi_i Q^-1 phi_i^H`` from 0 to 1 (at 1, a mode is lost without the row).
+    The row with the lowest share is dropped, Q^-1 is updated by a rank-one downdate, and so on.
+    Fewer DOFs than modes are chosen by `PivotedQr` from the last k.
 
     References
     ----------
@@ -102,7 +103,7 @@ class EffectiveIndependence(SelectionCriterion):
         if not count:
             return []
         fixed, p = required.shape[0], pool.shape[0]
-        # orthonormal columns, so that no unit of a mode matters
+        # orthonormal columns, so that the units of modes do not matter
         both: FloatArray = np.vstack([required, pool])
         length = np.linalg.norm(both, axis=0)
         both = both / divisor(length)
@@ -145,7 +146,7 @@ def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
 class Greedy(SelectionCriterion):
     """Each next DOF is the one that leaves the largest smallest singular value of phi_kk.
 
-    Its value for a DOF is that singular value when it was taken.
+    The value of a DOF is that singular value when the DOF was taken.
 
     Examples
     --------
@@ -175,9 +176,9 @@ class Greedy(SelectionCriterion):
 
 def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
     """Return the smallest eigenvalue of the Gram matrix of the taken rows plus one of the pool."""
-    # the root below all eigenvalues of the Gram matrix of the taken rows of the secular equation
-    # `v'v - mu - sum_i w_i^2 / (lambda_i - mu) = 0`, w the products of v with their eigenvectors,
-    # bisected for all of the pool at once
+    # this is the root of the secular equation below all eigenvalues of the Gram matrix of the taken
+    # rows: `v'v - mu - sum_i w_i^2 / (lambda_i - mu) = 0`, w the products of v with their
+    # eigenvectors, bisected for all of the pool at once
     size = np.einsum("ij,ij->i", pool, pool.conj()).real
     if not taken.shape[0]:
         return np.asarray(size)
@@ -194,7 +195,7 @@ def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DofSelection(Value):
-    """Selected DOFs, to be given to `DesiredDofs`, `Guyan` or as a boundary.
+    """Selected DOFs for `DesiredDofs`, `Guyan` or as a boundary.
 
     Parameters
     ----------
@@ -203,9 +204,9 @@ class DofSelection(Value):
     condition : float
         Condition number of the rows of modes and vectors at these DOFs (phi_kk).
     values : (count,) array, optional
-        What the criterion says of each DOF, in the order of the labels.
+        Value of the criterion for each DOF, in the order of the labels.
     criterion : SelectionCriterion
-        How they were chosen.
+        Criterion by which they were chosen.
 
     Examples
     --------
@@ -254,9 +255,9 @@ def select_dofs(
     required : iterable of str
         DOFs that are kept in any case.
     criterion : PivotedQr, EffectiveIndependence or Greedy, optional
-        How to choose; None: `PivotedQr`.
+        Criterion of the choice; None: `PivotedQr`.
     limit : float
-        Largest condition of phi_kk that is let pass.
+        Largest accepted condition number of phi_kk.
 
     Raises
     ------
@@ -295,7 +296,8 @@ def select_dofs(
     missing = number - len(kept)
     if missing > len(pool):
         raise ShapeError(
-            f"{missing} DOFs are to be chosen from {len(pool)} candidates: name more of them."
+            f"{missing} DOFs are wanted, but there are {len(pool)} candidates: name more "
+            "candidates."
         )
     taken = rule.chosen(basis[rows], basis[open_rows], missing) if missing else []
     chosen = kept + [pool[i] for i in taken]

@@ -1,4 +1,4 @@
-"""A reduced model compared with the full one: modes, responses and static compliance compared."""
+"""Comparison of a reduced model with the full one: modes, responses and static compliance."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from ..structure import FEModel
 from ..tolerances import SAME, divisor
 from .ranking import ErrorBound
 
-#: refinements of the frequencies at which the error is largest
+#: number of refinements of the frequencies at which the error is largest
 _ROUNDS = 3
 #: a `ReducedModel`, whose module imports this one
 Reduced: TypeAlias = Any
@@ -70,7 +70,7 @@ def quality_of(
     Br, Cr = reduced.T.T @ B, C @ reduced.T
     undamped = full.D is None if isinstance(full, FEModel) else not np.any(full.basis_zeta)
     factor = _loss(reduced, own, loss) if undamped else None
-    # one factor for the static shapes and the check, while it is held here
+    # keep one factor for the static shapes and the check
     held = held_factor(full) if isinstance(full, FEModel) else None
     responses = FullResponses(full, modes, B, C, factor)
 
@@ -82,13 +82,15 @@ def quality_of(
     grid, peaks, deep = check_frequencies(low, high, elastic)
     grid = np.unique(np.atleast_1d(grid if freq is None else real_array(freq, "freq")))
     if not grid.size or grid[0] < 0:
-        raise ModelError("freq needs at least one frequency [Hz], none below 0.")
+        raise ModelError(
+            "freq needs at least one frequency [Hz], and negative frequencies are refused."
+        )
     responses.checked(grid)
     del held
     places_move = responses.drive_points(np.append(peaks, grid[[0, -1]]))
     sizes, _ = channel_sizes(np.abs(responses.at(grid)).max(axis=0), places_move.max(axis=0))
     if freq is None and B.shape[1] and C.shape[0]:
-        # between resonances of both the error may be larger than at either
+        # between two close resonances of the models the error may be larger than at either
         grid, _ = climbed_grid(
             lambda at: (np.abs(responses.at(at) - less(at)) / sizes).max(axis=(1, 2)), grid, _ROUNDS
         )
@@ -96,7 +98,8 @@ def quality_of(
     gap, size = np.abs(found - whole_response), np.abs(whole_response)
     larger, peak = np.maximum(size, np.abs(found)), size.max(axis=0)
     sizes, silent = channel_sizes(peak, places_move.max(axis=0))
-    # of the largest response there: a mode on a node line makes no resonance of that pair
+    # relative to the largest response there: a mode with a node line at a place has no resonance in
+    # that pair
     at_peaks = gap / divisor(larger.max(axis=(1, 2), keepdims=True, initial=0.0))
     at_peaks[:, silent] = np.nan
     at_dips = gap / np.where(silent, sizes, divisor(larger))
@@ -128,7 +131,7 @@ def quality_of(
 
 
 def channel_sizes(peak: FloatArray, places_move: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return what errors of channels (p, q) are relative to, and which channels are silent.
+    """Return the reference of errors of channels (p, q), and which channels are silent.
 
     `places_move` (q + p) has the responses of the inputs, then of the outputs, to forces on
     themselves. The error of a silent channel is relative to their geometric mean, since its own
@@ -141,7 +144,7 @@ def channel_sizes(peak: FloatArray, places_move: FloatArray) -> tuple[FloatArray
 
 
 def _largest_error(error: FloatArray, chosen: Any) -> FloatArray:
-    """Return the largest of errors (f, p, q) over the chosen frequencies, NaN where none is."""
+    """Return the largest of errors (f, p, q) over the chosen frequencies, NaN without any."""
     if not chosen.any():
         return np.full(error.shape[1:], np.nan)
     return np.asarray(error[chosen].max(axis=0))
@@ -170,7 +173,7 @@ def _loss(reduced: Reduced, own: Modes, loss: float | None) -> float:
         return positive(loss, "loss", zero=True)
     if not np.any(reduced.D):
         return 0.01
-    # 2 zeta = phi^T D phi / omega, mode by mode: dampers to ground leave no modes at 0
+    # 2 zeta = phi^T D phi / omega, mode by mode: with dampers to ground no modes at 0 exist
     shapes = np.linalg.lstsq(reduced.T, np.real(own.phi), rcond=None)[0]
     rates = np.einsum("ik,ij,jk->k", shapes, reduced.D, shapes)[own.n_rigid :]
     return float(np.mean(rates / own.omega[own.n_rigid :]))
@@ -186,7 +189,7 @@ def _full_modes(full: FEModel | Modes, count: int | None, high: float) -> Modes:
 def _mode_comparison(
     full: FEModel | Modes, modes: Modes, found: Modes, count: int | None, high: float
 ) -> dict[str, Any]:
-    """Return the pairs of full and reduced modes, and how alike they are."""
+    """Return the pairs of full and reduced modes, and their MAC."""
     wanted = whole(count, "count") if count is not None else int(np.sum(modes.freq <= high))
     phi: Any = np.asarray(modes.phi)[:, :wanted]
     f, own, shapes = modes.freq[:wanted], found.freq, np.real(found.phi)
@@ -215,20 +218,20 @@ def _mode_comparison(
     }
 
 
-#: points over the band, in addition to resonances and antiresonances
+#: number of points over the band, in addition to resonances and antiresonances
 _GRID = 200
-#: direct solutions that check the responses of a small and of a large structure
+#: number of direct solutions that check the responses of a small and of a large structure
 _CHECKS, _SMALL = (6, 3), 2000
-#: their difference, of the peak, from which on they join the basis
+#: difference relative to the peak above which direct solutions extend the basis
 _TOLERANCE = 1e-4
 
 
-#: gives the responses (f, p, q) at frequencies [Hz]
+#: function that returns the responses (f, p, q) at frequencies [Hz]
 Find: TypeAlias = Callable[[FloatArray], ComplexArray]
 
 
 class FullResponses:
-    """The responses of a full structure, wherever they are wanted."""
+    """The responses of a full structure at any frequency."""
 
     def __init__(
         self, full: FEModel | Modes, modes: Modes, B: FloatArray, C: FloatArray, loss: float | None
@@ -251,7 +254,7 @@ class FullResponses:
         return _modal_response(self.modes, freq, loads, rows, self.loss or 0.0)
 
     def checked(self, freq: FloatArray) -> None:
-        """Compare the responses in a band with direct solutions, which mend the basis."""
+        """Compare the responses in a band with direct solutions, which improve the basis."""
         if self.basis is not None and self.B.shape[1]:
             checks = _CHECKS[len(self.full.dofs) > _SMALL]
             self.basis, _, self.check = checked_response(
@@ -291,7 +294,7 @@ class FullResponses:
 def check_frequencies(
     low: float, high: float, both: Sequence[tuple[Find, FloatArray]]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return frequencies [Hz] over a band, and of these the resonances and antiresonances."""
+    """Return frequencies [Hz] over a band, and those that are resonances and antiresonances."""
     start = low if low > 0 else high / 1000
     resonances = np.concatenate([own for _, own in both])
     resonances = resonances[(resonances >= low) & (resonances <= high)]
@@ -330,7 +333,7 @@ def reduced_response(
 def static_error(
     whole: FloatArray, reduced: Reduced, Br: FloatArray, Cr: FloatArray, places_move: FloatArray
 ) -> FloatArray:
-    """Return errors (p, q) of the elastic compliance `whole`, of the size of its channels."""
+    """Return errors (p, q) of the elastic compliance `whole`, relative to its channels."""
     q = Br.shape[1]
     watched = np.hstack([Br, Cr.T])
     found = watched.T @ static_response(reduced, watched)
@@ -348,52 +351,53 @@ class ReductionQuality(Value):
     modes : (m,) array of int
         Numbers of the full model's modes that are compared.
     full_freq, freq : (m,) arrays [Hz]
-        Their frequencies, and those of the reduced modes paired with them, one to one, by shape and
-        frequency; NaN where none has a MAC of 0.5.
+        Frequencies of these modes, and of the reduced modes paired with them, one to one, by shape
+        and frequency; NaN without a partner with a MAC of 0.5.
     freq_error : (m,) array
-        Relative; 0 for rigid-body modes, NaN without a partner.
+        Relative error; 0 for rigid-body modes, NaN without a partner.
     mac : (m,) array
-        MAC of each full mode with the reduced one: mass-weighted for an FEModel. Of repeated modes,
-        whose shapes are any basis of a subspace, the squared cosines of the angles between the two
-        subspaces.
+        MAC of each full mode with the reduced one: mass-weighted for an FEModel. For repeated
+        modes, whose shapes are an arbitrary basis of a subspace, the squared cosines of the angles
+        between the two subspaces.
     group : (m,) array of int
-        Number of the first mode whose shape cannot be distinguished from that of each: of
-        repeated modes that lack a partner it is not known which one is missing.
+        Number of the first mode whose shape cannot be distinguished from that of the mode. When one
+        of several repeated modes has no partner, it is not known which one.
     check_freq : (f,) array [Hz]
-        Where responses were compared.
+        Frequencies of the comparison of responses.
     frf_error : (p, q) array
-        Largest error over the band, relative to the channel's largest response, output by input.
+        Largest error over the band relative to the largest response of the channel, outputs by
+        inputs.
     silent : (p, q) array of bool
-        Channels of the full model that consist of rounding: below 1e-9 of the geometric mean of
-        the largest responses of the input and of the output to forces on themselves. Their errors
-        are relative to this mean, and the printed worst channel is one that responds.
+        Channels of the full model that consist of rounding: below 1e-9 of the geometric mean of the
+        largest responses of the input and of the output to forces on themselves. Their errors are
+        relative to this mean; the printed worst channel is not silent.
     resonance_error : (p, q) array
-        Largest error at a resonance of either model, of the largest response of any pair and
-        either model there; NaN without a resonance in the band, and of silent channels.
+        Largest error at a resonance of either model, relative to the largest response of any
+        channel of both models there; NaN without a resonance in the band, and for silent channels.
     antiresonance_error : (p, q) array
-        Largest error at an antiresonance of either model, of the larger response of both there: 1
-        where one has an antiresonance that the other does not have. NaN without one. Of silent
-        channels relative to what `silent` names.
+        Largest error at an antiresonance of either model, relative to the larger response of both
+        there: 1 where only one model has the antiresonance. NaN without an antiresonance. For
+        silent channels relative to the mean of `silent`.
     static_error : (p, q) array
-        Error of the elastic static compliance, relative to its size sqrt(G_ii G_jj); where this is
-        rounding, relative to the responses of both places at the upper end of the band.
+        Error of the elastic static compliance relative to sqrt(G_ii G_jj); where this is rounding,
+        relative to the responses of both places at the upper end of the band.
     true_error : float [m/N]
         Largest singular value of the error at the check frequencies.
     orthogonality : float
         Departure of the expanded reduced modes from M-orthonormality; NaN against Modes.
     condition : float
-        Condition of the matrix that the method inverted.
+        Condition number of the matrix that the method inverted.
     inputs, outputs : sequence of str
     route : str
-        How the full responses were found.
+        Method by which the full responses were found.
     full_error : float
-        Difference between these and direct solutions with all of the matrices, of the peak; NaN
-        against Modes.
+        Difference between these and direct solutions with the full matrices, relative to the peak;
+        NaN against Modes.
     bound : ErrorBound, optional
-        The a-priori bound of the method, when it is of these channels.
+        A-priori bound of the method, when it holds for these channels.
     bounded : bool
-        Whether the bound covers all modes that were compared with: that of a reduction of some
-        modes says nothing of the others of a model.
+        Whether the bound covers all compared modes. The bound of a reduction of some modes does not
+        hold for the other modes of the model.
 
     Examples
     --------
@@ -429,7 +433,7 @@ class ReductionQuality(Value):
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the elastic modes whose shapes cannot be distinguished, group by group."""
+        """Groups of elastic modes, by number, whose shapes cannot be distinguished."""
         elastic = self.full_freq > 0
         firsts = np.unique(self.group[elastic])
         groups = [self.modes[elastic & (self.group == first)].tolist() for first in firsts]
@@ -493,7 +497,7 @@ class ReductionQuality(Value):
         return "\n  ".join(lines) + ">"
 
     def table(self) -> str:
-        """Return mode by mode: both frequencies, error, MAC and of which shape it may also be."""
+        """Return a table of modes: both frequencies, error, MAC and modes with the same shape."""
         other = {
             n: f"alike: {', '.join(str(k) for k in members if k != n)}"
             for members in self.alike

@@ -30,24 +30,25 @@ class Krylov(ReductionMethod):
     """Second-order rational Krylov reduction: moments of the response at given frequencies.
 
     At each frequency f the response X = (s^2 M + s D + K)^-1 B, s = 2 pi i f, and its first
-    `moments` - 1 derivatives are put into the span, as real vectors, orthonormal in M, rigid-body
-    motions first; M* is the unit matrix, the coordinates are "krylov 1", ... From the inputs to any
-    place, `moments` Taylor coefficients at each s agree with the full model, and twice as many
-    between inputs (a Galerkin projection of symmetric matrices keeps both sides). Without D they
-    are coefficients in s^2. Frequencies are above the true ones (Rayleigh-Ritz).
+    `moments` - 1 derivatives span the basis, as real vectors, orthonormal in M, after the
+    rigid-body motions. M* is the unit matrix and the coordinates are "krylov 1", ... From the
+    inputs to any place, `moments` Taylor coefficients at each s agree with the full model, and
+    twice this number between inputs (a Galerkin projection of symmetric matrices keeps both sides).
+    Without D the coefficients are those in s^2. Frequencies are above the true ones
+    (Rayleigh-Ritz).
 
     Parameters
     ----------
     inputs : place or sequence of places
-        Where loads act: DOF labels, points (z) or mappings.
+        Places of loads: DOF labels, points (z) or mappings.
     freq : float or sequence of float [Hz]
-        Expansion points, none a resonance of an undamped model; 0 is the static response (of a
-        free structure: of loads in balance with its inertia).
+        Expansion points, which must not be resonances of an undamped model; 0 is the static
+        response (for a free structure: to loads in equilibrium with its inertia).
     moments : int
-        At each frequency.
+        Number of moments at each frequency.
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model's own modes, with a basis of the undamped structure; None: the
-        model's D, in the basis too.
+        Damping of the reduced model's modes, with a basis of the undamped structure. None: the
+        model's D, also in the basis.
 
     References
     ----------
@@ -71,10 +72,10 @@ class Krylov(ReductionMethod):
         if freq.ndim > 1 or not freq.size or np.any(freq < 0):
             raise ModelError(
                 f"freq must be one or more frequencies [Hz] from 0 up, got {self.freq!r:.60}: "
-                "choose such, in the band of interest."
+                "choose frequencies in the band of interest."
             )
         if np.unique(freq).size < freq.size:
-            raise ModelError("an expansion frequency is there twice: choose more moments.")
+            raise ModelError("an expansion frequency appears twice: choose more moments instead.")
         if not self.inputs:
             raise ModelError("Krylov needs at least one input: the place of a load.")
         self._set(freq=freq)
@@ -112,14 +113,14 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     if omega > 0:
         solve: Any = _factorised(K - omega**2 * M, omega)
     else:
-        held = held_factor(model)  # one for all moments
+        held = held_factor(model)  # one factor for all moments
         solve = partial(static_response, model) if held is None else held.static
     if D is not None:
         return np.asarray(_second_order(solve, D, M, B, count))
     block = _normed(model, solve(B))
     found = [block]
     for _step in range(count - 1):
-        # a new start in the same Krylov space: what is already there taken out first
+        # a new start vector in the same Krylov space: its component in the basis is removed first
         fresh, basis = solve(np.asarray(model.M @ block)), np.hstack(found)
         gram = basis.T @ np.asarray(model.M @ basis)
         for _ in range(2):
@@ -132,7 +133,7 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
 def _second_order(
     solve: Callable[[Any], Any], slope: Any, M: Any, B: FloatArray, count: int
 ) -> Any:
-    """Return the tops of an orthonormal Krylov basis of the linearised problem (SOAR's space)."""
+    """Return the upper parts of an orthonormal Krylov basis of the linearised problem (SOAR)."""
     top, (n, m) = solve(B), B.shape
     basis = la.qr(np.vstack([top, np.zeros_like(top)]), mode="economic")[0]
     for _ in range(count - 1):
@@ -165,7 +166,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
     def solve(loads: Any) -> Any:
         loads = np.ascontiguousarray(np.asarray(loads, dtype=kind))
         found = lu.solve(loads)
-        # pivots kept on the diagonal: one refinement brings the digits back
+        # pivots stay on the diagonal: one refinement restores the accuracy
         found = found + lu.solve(loads - matrix @ found)
         left = np.linalg.norm(loads - matrix @ found, axis=0)
         if not np.all(left <= TYPED * np.linalg.norm(loads, axis=0).clip(TINY)):
@@ -184,7 +185,7 @@ def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
 
 
 def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return an M-orthonormal basis with vectors added, those that add nothing left out."""
+    """Return an M-orthonormal basis extended by the vectors that are independent of it."""
     size = np.sqrt(np.sum(vectors * np.asarray(model.M @ vectors), axis=0))
     vectors = vectors[:, size > 0] / size[size > 0]
     for _ in range(2):
@@ -196,7 +197,7 @@ def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArr
         fresh = fresh - basis @ (basis.T @ np.asarray(model.M @ fresh))
         gram = dense(fresh.T @ np.asarray(model.M @ fresh))
         values, mix = la.eigh(gram)
-        # squares of lengths: the rest is a combination but for 1e-3, and comes again orthogonal
+        # squared lengths: the others depend on these to 1e-3, and are made orthogonal again
         good = values > 1e-6 * max(float(values[-1]) if values.size else 0.0, TINY)
         fresh = fresh @ (mix[:, good] / np.sqrt(values[good]))
     return np.hstack([basis, fresh])

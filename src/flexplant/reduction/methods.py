@@ -1,4 +1,4 @@
-"""`reduce`, what reductions by projection share, and the paper's way; each way is a small value."""
+"""`reduce`, the common part of reductions by projection, and the method of the paper."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from .criteria import PivotedQr
 from .ranking import ErrorBound
 from .reduced import ReducedModel
 
-#: part of a rigid-body motion that a basis may miss, and of the loads that a solution may leave
+#: fraction of a rigid-body motion that a basis may miss, and largest relative residual of a
+#: solution
 _LEFT = 1e-7
 
 
@@ -49,7 +50,7 @@ class Solver:
             lower = la.cholesky(dense(scaled), lower=True)
         except (SolverError, la.LinAlgError) as error:
             raise ModelError(singular) from error
-        # a root: pivots below 1e-14 of a unit diagonal are rounding
+        # a square root: pivots below 1e-14 of a unit diagonal count as zero
         if np.diag(lower).min(initial=1.0) < 1e-7:
             raise ModelError(singular)
         scale = size[:, None]
@@ -62,7 +63,7 @@ class Solver:
         found: FloatArray = self._once(loads)
         found = found + self._once(loads - np.asarray(self._matrix @ found))
         left = np.linalg.norm(loads - np.asarray(self._matrix @ found))
-        # a mechanism that rounding let through the factorisation takes no load
+        # a mechanism that the factorisation did not detect, because of rounding, carries no load
         if not left <= _LEFT * np.linalg.norm(loads):
             raise ModelError(self._singular)
         return found
@@ -72,15 +73,15 @@ def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
     """Return labels as a tuple, none of them twice."""
     labels = name_list(dofs, name)
     if not labels:
-        raise LabelError(f"no {name} are given: name at least one DOF, such as '41:z'.")
+        raise LabelError(f"{name} is empty: name at least one DOF, such as '41:z'.")
     if len(set(labels)) < len(labels):
         doubled = sorted({label for label in labels if labels.count(label) > 1})
-        raise LabelError(f"{name} {doubled} appear twice: what must be inverted would be singular.")
+        raise LabelError(f"{name} {doubled} appear twice: the matrix to invert would be singular.")
     return labels
 
 
 def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
-    """Return the structure when it has the matrices that a method needs."""
+    """Return the structure if it has the matrices that a method needs."""
     if isinstance(structure, FEModel):
         return structure
     raise ModelError(
@@ -119,15 +120,15 @@ def projected_model(
 ) -> ReducedModel:
     """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
 
-    A reduction of your own computes T and returns this; see `ReductionMethod`.
+    Your own reduction computes T and returns the result of this function; see `ReductionMethod`.
 
     Parameters
     ----------
     model : FEModel
     T : (n, k) array
-        Columns that span the motions that are kept, the rigid-body motions among them.
+        Columns that span the kept motions, including the rigid-body motions.
     dofs : DofSet
-        The DOFs of the coordinates, k of them; empty where they are not physical.
+        The k DOFs of the coordinates; empty where the coordinates are not physical.
     method : str
         Name of the method, for messages and reprs.
     coordinates : sequence of str
@@ -135,12 +136,12 @@ def projected_model(
     damping : Damping, optional
         Replaces the D of the model.
     condition, condition_of : float, str
-        Condition number of what the method inverted, and what that was.
+        Condition number of the inverted matrix, and the name of this matrix.
     bound : ErrorBound, optional
     singular : str
         Advice for the error where the columns depend on each other.
     static_at : sequence of str
-        Labels whose static response T holds exactly.
+        Labels whose static response is exact in the span of T.
 
     Returns
     -------
@@ -178,7 +179,7 @@ def projected_model(
             f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "
             + (singular or "Add coordinates that do.")
         )
-    if damping is not None:  # modes with the ratios of the law
+    if damping is not None:  # modes with the damping ratios of the law
         omega, phi = elastic_modes(M, K, rigid)
         omega, phi = np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
         zeta = damping.zeta(omega)
@@ -214,7 +215,7 @@ class ReductionMethod(Value):
     Parameters
     ----------
     damping : ModalDamping or Rayleigh, optional
-        With an FEModel: of the reduced model, in place of its D.
+        Damping of the reduced model in place of its D, with an FEModel.
 
     Examples
     --------
@@ -239,14 +240,15 @@ class DesiredDofs(ReductionMethod):
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
-        As many labels as there are modes plus attachment vectors. With fewer labels than modes
-        and no attachment vectors, the lowest modes are kept, as many as there are labels; the
-        model keeps the others as `truncated`. Of an FEModel as many modes are solved as there are
-        labels, less the places of `static_at`.
+        Labels of the kept DOFs, as many as modes plus attachment vectors. With fewer labels than
+        modes and no attachment vectors, the same number of lowest modes is kept, and the model
+        stores the others as `truncated`. For an FEModel the number of solved modes is that of the
+        labels minus that of the places in `static_at`.
     static_at : place or sequence of places
-        With an FEModel: where attachment vectors keep the static compliance of what is truncated.
+        Places where attachment vectors keep the static compliance of truncated modes, with an
+        FEModel.
     damping : ModalDamping or Rayleigh, optional
-        With an FEModel: of modes and vectors, in place of its D.
+        Damping of modes and vectors in place of the model's D, with an FEModel.
 
     References
     ----------
@@ -312,8 +314,8 @@ class DesiredDofs(ReductionMethod):
         if isinstance(structure, Modes):
             if self.damping is not None or static:
                 raise ModelError(
-                    "damping= and static_at= of DesiredDofs go with an FEModel, these Modes have "
-                    "theirs: give solve_modes damping= and compliance_at=."
+                    "damping= and static_at= of DesiredDofs need an FEModel, but Modes were "
+                    "given: pass damping= and compliance_at= to solve_modes."
                 )
             return structure
         count = len(tuple(self.dofs)) - len(static)
@@ -334,7 +336,7 @@ def refused_partition(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], 
 
 
 def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
-    """Return in words which DOFs to take in place of some of the given ones."""
+    """Return a text with better DOFs in place of some of the given ones."""
     k = basis.shape[1]
     _, upper, order = la.qr(basis[dofs.indices(labels)].T, mode="economic", pivoting=True)
     size = np.abs(np.diag(upper))
@@ -366,10 +368,10 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     Parameters
     ----------
     model : FEModel or Modes
-        The structure. An `FEModel` goes with every method; the `Modes` of `solve_modes` go with
-        those that need no matrices: `DesiredDofs`, `ModalTruncation` and `ModalBalanced`.
+        The structure. Every method accepts an `FEModel`. `DesiredDofs`, `ModalTruncation` and
+        `ModalBalanced` need no matrices and accept the `Modes` of `solve_modes` too.
     method : ReductionMethod
-        How to reduce: `DesiredDofs` (the paper), `ModalTruncation`, `ModalBalanced`, `Guyan`,
+        Reduction method: `DesiredDofs` (the paper), `ModalTruncation`, `ModalBalanced`, `Guyan`,
         `Irs`, `Serep`, `CraigBampton`, `Rubin`, `MacNeal` or `Krylov`.
 
     Returns
@@ -380,10 +382,10 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     Raises
     ------
     ShapeError
-        When numbers of DOFs and modes do not belong together.
+        When the numbers of DOFs and modes do not match.
     ModelError
-        When the method needs another kind of structure, cannot invert what it must, or the modes
-        are complex.
+        When the method needs another kind of structure or meets a singular matrix, or the modes are
+        complex.
 
     References
     ----------

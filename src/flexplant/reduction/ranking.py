@@ -1,4 +1,4 @@
-"""Which modes matter to which channels, and bounds of what is left without the others."""
+"""Importance of modes for channels, and bounds of the error without the other modes."""
 
 from __future__ import annotations
 
@@ -41,12 +41,13 @@ class ModeRanking(Value):
         Modal Hankel values of each mode from each of q inputs to each of p outputs,
         ``|c b| / (4 zeta omega^2)``.
     total : (m,) array [m/N]
-        Those of all channels together, ``||c|| ||b|| / (4 zeta omega^2)``.
+        Modal Hankel values of all channels together, ``||c|| ||b|| / (4 zeta omega^2)``.
     peak : (m,) array [m/N]
-        The largest singular value of each mode's own response, over all frequencies.
+        Largest singular value of the response of each mode over all frequencies.
     exact : (2 m,) array [m/N]
         Hankel singular values of all elastic modes together, by Lyapunov equations, the largest
-        first; two for each mode, close to its `total` when damping is low and modes are apart.
+        first; two for each mode, close to its `total` when damping is low and modes are well
+        separated.
     inputs, outputs : sequence of str
 
     Examples
@@ -81,7 +82,7 @@ class ModeRanking(Value):
         return f"<ModeRanking: {found}, {channels}; by Hankel value: {first}{more}>"
 
     def table(self, most: int = 12) -> str:
-        """Return the most important modes as text, with the channels each matters most to."""
+        """Return a table of the most important modes, each with its most important channel."""
         rows = []
         top = float(self.total.max(initial=0.0)) or 1.0
         for i in np.argsort(-self.total, kind="stable")[: whole(most, "most")]:
@@ -98,16 +99,17 @@ def rank_modes(
 ) -> ModeRanking:
     """Return which elastic modes matter to which channels, by Hankel values.
 
-    The Hankel values of a lightly damped mode alone are both about ``||c|| ||b|| / (4 zeta
-    omega^2)``, b its forces and c its displacements at the channels; modes that are far apart
-    compared with their damping keep them side by side.
+    The two Hankel values of a single lightly damped mode are about
+    ``||c|| ||b|| / (4 zeta omega^2)`` with its forces b and displacements c at the channels. They
+    are nearly the same in a sum of modes whose distance is large compared with their damping.
 
     Parameters
     ----------
     modes : Modes
-        Real and damped; attachment vectors are left out.
+        Real and damped modes; attachment vectors are ignored.
     inputs, outputs : place or sequence of places
-        Forces and displacements: DOF labels, points (z) or mappings; no outputs: the inputs.
+        Places of forces and displacements: DOF labels, points (z) or mappings; no outputs: the
+        inputs.
 
     Raises
     ------
@@ -164,7 +166,7 @@ def modal_channels(
     pushed = places(inputs)
     watched = places(outputs) or pushed
     if not pushed:
-        raise ModelError("no inputs are given: name at least one place, such as '41:z'.")
+        raise ModelError("inputs is empty: name at least one place, such as '41:z'.")
     into, out = labels_of(pushed, modes.dofs), labels_of(watched, modes.dofs)
     phi = np.real(modes.phi)
     B = np.column_stack([modes.dofs.row(place) @ phi for place in pushed])
@@ -185,25 +187,25 @@ def _exact(omega: FloatArray, zeta: FloatArray, b: FloatArray, c: FloatArray) ->
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorBound(Value):
-    """A bound of the error of a reduction, known before any response is computed.
+    """An upper bound of the error of a reduction, known before any response is computed.
 
     Parameters
     ----------
     value : float [m/N]
-        At least the largest singular value, over all frequencies, of full minus reduced
-        displacement per force between the channels.
+        Upper bound, over all frequencies, of the largest singular value of the full minus the
+        reduced response (displacement per force) between the channels.
     inputs, outputs : sequence of str
-        The channels it holds for.
+        Channels for which the bound holds.
     rule : str
-        Where it comes from.
+        Rule from which the bound follows.
     terms : (k, 3) array, optional
-        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of all that differs, mode
-        by mode; they make the bound below a frequency.
+        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode;
+        they give the bound below a frequency.
     static : float [m/N], optional
-        What is missed at 0 Hz, exactly.
+        Exact error at 0 Hz.
     covers : int, optional
-        How many modes of the structure it covers, where only some were solved: the error of a
-        reduction of these. What others add is not in it. None: all modes.
+        Number of modes of the structure that the bound covers, where only some were solved. The
+        contribution of other modes is not included. None: all modes.
 
     Examples
     --------
@@ -236,8 +238,8 @@ class ErrorBound(Value):
         """Return the bound [m/N] for all frequencies up to `freq` [Hz].
 
         Modes above the band are far from their peaks: the sum over the neglected modes of the
-        largest ``g_i |h_i(w)|`` there, or, where that is less, the static error and the sum of the
-        largest ``g_i |h_i(w) - h_i(0)|``. Never more than `value`.
+        largest ``g_i |h_i(w)|`` there, or, where smaller, the static error plus the sum of the
+        largest ``g_i |h_i(w) - h_i(0)|``. It is at most `value`.
         """
         top = 2 * np.pi * positive(freq, "freq")
         if self.terms is None:
@@ -255,14 +257,14 @@ def _largest_modal_gain(omega: FloatArray, zeta: FloatArray, top: float) -> Floa
     peak = peak_gains(omega, zeta)
     with np.errstate(divide="ignore"):
         at_top = 1 / (omega**2 * np.hypot(1 - r**2, 2 * zeta * r))
-    # rising up to the peak, where there is one; else falling from the start
+    # it rises up to the peak, if there is one; otherwise it falls from the start
     rising = r**2 < 1 - 2 * zeta**2
     return np.asarray(np.where(rising, at_top, peak), dtype=np.float64)
 
 
 def _largest_change(omega: FloatArray, zeta: FloatArray, top: float) -> FloatArray:
-    """Return the largest departure of the same response from its value at 0, for w up to `top`."""
-    # with `x = w^2 / omega^2` and `a = 4 zeta^2` its square is, times omega^4,
+    """Return the largest deviation of the same response from its value at 0, for w up to `top`."""
+    # with `x = w^2 / omega^2` and `a = 4 zeta^2` the square of this deviation times omega^4 is
     # `(x^2 + a x) / ((1 - x)^2 + a x)`, rising up to `x = (1 + sqrt(1 + 2 a)) / 2`
     a = 4 * zeta**2
     x = np.minimum((top / omega) ** 2, 0.5 * (1 + np.sqrt(1 + 2 * a)))

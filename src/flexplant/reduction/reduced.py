@@ -1,4 +1,4 @@
-"""A structure in a few coordinates: some of its own degrees of freedom, modes, or both."""
+"""A structure in a few coordinates: some of its degrees of freedom, modes, or both."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from ..words import name_list
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 
-#: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
+#: fraction of the largest eigenvalue of K*: K* counts as indefinite when an eigenvalue is below
+#: minus this
 _DEFINITE = 1e-14
-#: how the names of coordinates begin that hold the static compliance of what was left out
+#: prefix of the names of coordinates with the static compliance of truncated modes
 STATIC = "static "
 
 
@@ -53,36 +54,36 @@ class ReducedModel(Value):
     full_dofs : DofSet
         The n DOFs of the full structure, with its shape functions.
     rigid_body : (k, r) array
-        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. Eigenvalues of (K*, M*)
-        alone would have them at rounding, some imaginary.
+        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. An eigenvalue solver for (K*,
+        M*) would give frequencies of rounding size, some imaginary.
     method : str
-        How it was made.
+        Name of the reduction method.
     condition : float
-        Condition number of what had to be inverted: phi_kk, or the scaled M*.
+        Condition number of the inverted matrix: phi_kk, or the scaled M*.
     coordinates : sequence of k str
         Names of all coordinates: the labels of `dofs` first, then generalised ones such as
         "mode 7". Empty: the labels of `dofs`.
     condition_of : str
-        Which matrix `condition` is of.
+        Name of the matrix of `condition`.
     bound : ErrorBound, optional
-        On the error between channels, where the method has one.
+        Bound of the error between channels, where the method has one.
     truncated : Modes, optional
-        The modes over `full_dofs` that were known to `reduce` and left out, M-orthogonal to the
-        kept ones. They stay as they were solved when M, D or K change (an update): the modes of
-        the changed full structure are then nearer.
+        Modes over `full_dofs` that `reduce` knew and left out, M-orthogonal to the kept ones. They
+        do not change when M, D or K change (an update); the modes of the changed full structure are
+        then more accurate.
     n_vectors : int
-        Number of shapes that are attachment vectors: the same number of the model's modes are not
-        modes of the structure, but hold the compliance of those left out.
+        Number of shapes that are attachment vectors. The same number of modes of the model are not
+        modes of the structure; they represent the compliance of the modes left out.
     static_at : sequence of str
-        Places whose static compliance it holds in full.
+        Places whose static compliance is exact.
     joint_motions : (k, m) array, optional
         Motions of the components of a joined machine that its rigid joints allow.
     joining : Value, optional
-        How a joined machine was joined, with the checks that were made; not after an update.
+        Record of how a machine was joined, with its checks; None after an update.
     calibration : MeasuredModes, optional
         The measured poles that `calibrated` put in.
     machines : Machines, optional
-        What the update that it is from leaves open of the machine.
+        Uncertainty of the machine that an update leaves.
 
     References
     ----------
@@ -122,7 +123,7 @@ class ReducedModel(Value):
         if names[: len(self.dofs)] != self.dofs.labels or len(set(names)) != len(names):
             raise ModelError(
                 f"the coordinates {list(names[:3])} ... must be unique and begin with the physical "
-                f"DOFs {list(self.dofs.labels[:3])} ...: rows of T are found by them."
+                f"DOFs {list(self.dofs.labels[:3])} ...: the rows of T are found by these names."
             )
         self._set(coordinates=names)
         super().__post_init__()
@@ -161,7 +162,7 @@ class ReducedModel(Value):
         return len(self.dofs) == self.n_dof
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m), complex or not."""
+        """Return the motion ``T q`` of all n DOFs for motions (k,) or (k, m), complex or not."""
         listed = complex_array(q, "q") if isinstance(q, list | tuple) else q
         shape = (self.n_dof,) if np.ndim(listed) == 1 else (self.n_dof, None)
         check: Any = complex_array if np.iscomplexobj(q) else real_array
@@ -179,7 +180,7 @@ class ReducedModel(Value):
             A DOF label, a point, or {label: weight}: any of the full structure, not only of the
             desired DOFs.
         direction : str
-            The motion at a point.
+            Direction of the motion at a point.
         """
         return np.asarray(self.full_dofs.row(at, direction) @ self.T)
 
@@ -208,7 +209,7 @@ class ReducedModel(Value):
 
     @cached_property
     def n_unstable(self) -> int:
-        """How many rigid-body motions springs of negative stiffness make unstable."""
+        """Number of rigid-body motions that springs of negative stiffness make unstable."""
         stiff = la.eigvalsh(self.K)
         if not self.n_dof or stiff[0] > -_DEFINITE * stiff[-1]:
             return 0
@@ -227,15 +228,15 @@ class ReducedModel(Value):
 
     @property
     def massless(self) -> IntArray:
-        """The positions (from 0) of coordinates without any mass; `MacNeal` makes such."""
+        """Positions (from 0) of coordinates without any mass, as in `MacNeal`."""
         return np.flatnonzero(~np.any(self.M, axis=1))
 
     def condensed(self) -> tuple[ReducedModel, FloatArray, FloatArray]:
-        """Return the model without its massless coordinates, and the flexibility they leave.
+        """Return the model without its massless coordinates, and their flexibility.
 
-        These follow at once: ``q_k = S q_c + G T^T f``, exactly. The model in the c coordinates
-        that have mass, S (k, c), and G (k, k) [m/N], the displacement at once per load on the
-        coordinates; the model itself, and zero, when all have mass.
+        These follow without delay: ``q_k = S q_c + G T^T f``, exactly. Returns the model in the c
+        coordinates with mass, S (k, c), and G (k, k) [m/N], the immediate displacement per load on
+        the coordinates; the model itself and zero when all coordinates have mass.
 
         Raises
         ------
@@ -261,7 +262,7 @@ class ReducedModel(Value):
         return model, follow, flexibility
 
     def calibrated(self, measured: Any) -> ReducedModel:
-        """Return the model with the measured poles of some modes, and its own shapes.
+        """Return the model with the measured poles of some modes; the shapes stay.
 
         ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, D* likewise. Modes left out stay as
         they are, rigid-body modes at 0.
@@ -269,20 +270,20 @@ class ReducedModel(Value):
         Parameters
         ----------
         measured : MeasuredModes
-            With mode numbers, from 1, rigid-body modes included.
+            Measured poles with their mode numbers, which count from 1 and include rigid-body modes.
 
         Raises
         ------
         ModelError, LabelError
-            When it has no numbers, one is of no elastic mode of the structure here, or the model
-            is not free of massless coordinates and of magnets.
+            When it has no numbers, a number is not that of an elastic mode, or the model has
+            massless coordinates or unstable modes (magnets).
         SolverError
             When damping couples the modes too much.
         """
         if self.massless.size or self.n_unstable:
             raise ModelError(
                 "a model with massless coordinates or unstable modes has no modes that measured "
-                "poles could take the place of. Reduce it by DesiredDofs, or calibrate the Modes."
+                "poles could replace. Reduce it by DesiredDofs, or calibrate the Modes."
             )
         free = self.rigid_body.shape[1]
         places, poles = measured_poles(measured, range(free + 1, self.n_dof - self.n_vectors + 1))
@@ -290,10 +291,10 @@ class ReducedModel(Value):
         return self.replace(D=D, K=K, bound=None, calibration=measured)
 
     def completed(self) -> ReducedModel:
-        """Return the model with the modes that were left out, as further coordinates.
+        """Return the model with the truncated modes as further coordinates.
 
         ``M = diag(M*, I)``, ``D = diag(D*, 2 Z Omega)``, ``K = diag(K*, Omega^2)``,
-        ``T = [T, phi]``: (5) and (8) side by side. Static coordinates ("static 1") are dropped,
+        ``T = [T, phi]``: a combination of (5) and (8). Static coordinates ("static 1") are dropped,
         since the truncated modes hold their compliance. Without truncated modes: the model itself.
 
         Raises
@@ -304,7 +305,7 @@ class ReducedModel(Value):
         more = self.truncated
         if more is None:
             return self
-        require_real(more, "truncated ones cannot stand beside real coordinates")
+        require_real(more, "complex truncated modes cannot be combined with real coordinates")
         names = tuple(self.coordinates)
         kept = [i for i, name in enumerate(names) if not name.startswith(STATIC)]
         block = np.ix_(kept, kept)
@@ -331,12 +332,12 @@ class ReducedModel(Value):
 
         Shapes are in the desired DOFs where all coordinates are DOFs, else those of the full
         structure, ``T phi_k``. Complex where D is not proportional (after a damper was added).
-        Massless coordinates make no modes, and overdamped motions neither.
+        Massless coordinates and overdamped motions give no modes.
 
         Raises
         ------
         ModelError
-            When M is no longer positive definite, or D drags the rigid-body motions.
+            When M has lost its positive definiteness, or D damps the rigid-body motions.
 
         Warns
         -----
@@ -363,20 +364,20 @@ class ReducedModel(Value):
         freq: FloatArray | None = None,
         loss: float | None = None,
     ) -> ReductionQuality:
-        """Return how well this model stands for the full one, checked by another computation.
+        """Return the errors of this model relative to the full one, found independently.
 
         Parameters
         ----------
         full : FEModel or Modes
-            The full structure. Responses of an FEModel come from its modes (solved ones in use are
-            taken) and static shapes, which direct solutions with its matrices check.
+            The full structure. Responses of an FEModel are computed from its modes and static
+            shapes, and checked by direct solutions with its matrices.
         band : (float, float) [Hz]
-            Where modes and responses are compared.
+            Frequency band of the comparison.
         inputs, outputs : places
-            DOF labels, points (z) or mappings; none: those of the bound, if there is one. No
-            outputs: the inputs.
+            Places of forces and displacements: DOF labels, points (z) or mappings. No inputs: those
+            of the bound. No outputs: the inputs.
         count : int, optional
-            How many modes are compared; None: those up to the end of the band.
+            Number of modes that are compared; None: those up to the end of the band.
         freq : (m,) array [Hz], optional
             Check frequencies; None: the resonances and antiresonances of both models in the band,
             and a grid over it.
@@ -387,7 +388,7 @@ class ReducedModel(Value):
         Raises
         ------
         ModelError
-            When `full` is of another kind or another size, or the band is not one.
+            When `full` has another type or size, or the band is not valid.
         """
         refuse_unstable(self, "a comparison of responses")
         with Progress(0, "quality"):
@@ -397,17 +398,20 @@ class ReducedModel(Value):
 def static_followers(
     D: FloatArray, K: FloatArray, light: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return the coordinates with mass (c,), how all k follow them (k, c), flexibility and K."""
+    """Return coordinates with mass (c,), the map (k, c) to all, the flexibility and K."""
     # `q_light = -K_ll^-1 K_lh q_heavy + K_ll^-1 f_light`, exactly; the flexibility (k, k) is that
-    # of the second term, K (c, c) what is left of the stiffness
+    # of the second term, and K (c, c) the condensed stiffness
     k = K.shape[0]
     heavy = np.setdiff1d(np.arange(k), light)
     if np.any(D[light]):
-        raise ModelError("a massless coordinate is damped: give it a mass, or no damper.")
+        raise ModelError("a massless coordinate is damped: give it a mass, or remove the damper.")
     try:
         inverse = la.inv(K[np.ix_(light, light)])
     except la.LinAlgError as error:
-        raise ModelError("a massless coordinate has no stiffness: nothing holds it.") from error
+        raise ModelError(
+            "a massless coordinate has no stiffness, so that nothing holds it. Give it stiffness "
+            "or mass."
+        ) from error
     flexibility, follow = np.zeros((k, k)), np.eye(k)[:, heavy]
     flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
     follow[light] = -inverse @ K[np.ix_(light, heavy)]

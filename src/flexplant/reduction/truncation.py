@@ -1,4 +1,4 @@
-"""Modal truncation: the lowest modes, or those that matter to the channels, with a true bound."""
+"""Modal truncation: the lowest modes, or the most important for channels, with a true bound."""
 
 from __future__ import annotations
 
@@ -37,11 +37,10 @@ class ModalTruncation(ReductionMethod):
     Parameters
     ----------
     count : int, optional
-        How many modes, rigid-body modes included.
-    modes : sequence of int, optional
-        In place of `count`: mode numbers from 1, all rigid-body modes among them.
+        : sequence of int, optional In place of `count`: mode numbers from 1, all rigid-body modes
+        among them.
     static_at : place or sequence of places
-        Where the static compliance is kept.
+        Places where the static compliance is kept.
     inputs, outputs : place or sequence of places
         Channels of the a-priori bound; no outputs: the inputs.
     damping : ModalDamping or Rayleigh, optional
@@ -49,14 +48,13 @@ class ModalTruncation(ReductionMethod):
 
     Notes
     -----
-    From `Modes`, what is truncated is what is left of them (their attachment vectors included),
-    and the bound is the sum over it of ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, each
-    mode's own peak: it covers the modes that were solved (`ErrorBound.covers`), what the others add
-    is not in it. From an FEModel with one damping ratio for all, it covers all modes of the
-    structure unseen: by Cauchy-Schwarz the sum is at most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta
-    sqrt(1 - zeta^2))``, G the residual flexibility of one static solution. With `static_at`, the
-    peaks of the vectors are added. Over a band, modes above it are far from their peaks:
-    `ErrorBound.below(freq)` is tighter by orders.
+    With `Modes`, the bound is the sum over the truncated ones (attachment vectors included) of
+    ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, the peak of each mode. It covers the solved
+    modes only (`ErrorBound.covers`). With an FEModel and one damping ratio for all modes, the bound
+    covers all modes of the structure, also unsolved ones: by Cauchy-Schwarz the sum is at most
+    ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``, G the residual flexibility of one
+    static solution. With `static_at`, the peaks of the vectors are added. Over a band, modes above
+    it are far from their peaks, and `ErrorBound.below(freq)` is tighter by orders of magnitude.
 
     Examples
     --------
@@ -76,7 +74,8 @@ class ModalTruncation(ReductionMethod):
         super().__post_init__()
         if (self.count is None) == (self.modes is None):
             raise ModelError(
-                "ModalTruncation needs count= (the lowest modes) or modes=, not both: give one."
+                "ModalTruncation needs either count= (the lowest modes) or modes=. Give one of "
+                "them."
             )
 
     @property
@@ -133,7 +132,7 @@ class ModalTruncation(ReductionMethod):
         value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
         vectors, _ = _channel_terms(_vectors_as_modes(kept), (self.inputs, self.outputs))
         value += _peaks(vectors)
-        # of the lowest modes: none unseen is below the last, all are at most like one there
+        # with the lowest modes kept, every unsolved mode lies above the last solved one
         lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
         omega = kept.omega[-1] if lowest else 0.0
         terms = np.vstack([[both * omega**2, omega, law.ratio], vectors]) if omega else None
@@ -142,30 +141,29 @@ class ModalTruncation(ReductionMethod):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalBalanced(ReductionMethod):
-    """The modes of largest modal Hankel value between the channels: balanced modal truncation.
+    """The modes with the largest modal Hankel values between the channels (balanced truncation).
 
-    Lightly damped modes that are apart are almost balanced one by one, with the Hankel values
-    ``||c|| ||b|| / (4 zeta omega^2)``; the smallest are left out, whatever their frequency.
-    Rigid-body modes stay. `rank_modes` shows the values.
+    Lightly damped and well separated modes are each almost balanced, with the Hankel values
+    ``||c|| ||b|| / (4 zeta omega^2)``. The modes with the smallest values are left out, whatever
+    their frequency. Rigid-body modes stay. `rank_modes` shows the values.
 
     Parameters
     ----------
     count : int
-        How many modes, rigid-body modes included.
+        Number of modes, rigid-body modes included.
     inputs, outputs : place or sequence of places
-        Forces and displacements that matter; no outputs: the inputs.
+        Places of forces and displacements; no outputs: the inputs.
     among : int, optional
-        With an FEModel: how many of its lowest modes are used; None: all of a model that is
-        not large.
+        Number of lowest modes that are used, with an FEModel; None: all modes of a small model.
     static_at, damping : as for `ModalTruncation`
 
     Notes
     -----
-    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode, of those
-    that were solved (`ErrorBound.covers`: with `among`, or from `Modes`, not all); over a band
-    `ErrorBound.below(freq)` is tighter. Twice the
-    sum of neglected Hankel values [Glover1984]_ bounds the truncation of the exactly balanced
-    model (`flexplant.balanced`), which is not of second order; `rank_modes(...).exact` has them.
+    The bound is the sum of the peaks of the neglected modes and exact for one neglected mode. It
+    covers the solved modes only (`ErrorBound.covers`), which are not all with `among` or `Modes`.
+    Over a band `ErrorBound.below(freq)` is tighter. Twice the sum of neglected Hankel values
+    [Glover1984]_ bounds the truncation of the exactly balanced model (`flexplant.balanced`), which
+    is not of second order; `rank_modes(...).exact` has them.
 
     References
     ----------
@@ -191,7 +189,7 @@ class ModalBalanced(ReductionMethod):
         if self.among is not None:
             whole(self.among, "among", minimum=self.count)
         if not self.inputs:
-            raise ModelError("ModalBalanced needs inputs: the Hankel values are of channels.")
+            raise ModelError("ModalBalanced needs inputs, since Hankel values belong to channels.")
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the truncated model; `reduce` is the public way."""
@@ -199,7 +197,10 @@ class ModalBalanced(ReductionMethod):
         if not isinstance(modes, Modes):
             modes = solve_modes(modes, count=self.among, damping=self.damping)
         elif self.damping is not None or self.among is not None:
-            raise ModelError("among= and damping= are for an FEModel: these Modes are solved.")
+            raise ModelError(
+                "among= and damping= need an FEModel, but Modes were given. Pass damping= to "
+                "solve_modes."
+            )
         if not modes.n_rigid <= self.count <= modes.n_modes:
             raise ModelError(
                 f"count must be from {modes.n_rigid} (rigid-body modes stay) to {modes.n_modes} "
@@ -219,7 +220,7 @@ def truncated(
     bound_of: tuple[Any, Any] | None,
     method: str,
 ) -> ReducedModel:
-    """Return some of the modes, with the static compliance of the others in the same modes."""
+    """Return some of the modes, with the static compliance of the others."""
     require_real(modes, "(5) has no diagonal form (an FEModel may be given, its D is projected)")
     columns = kept_columns(numbers, modes)
     basis, omega, zeta = np.real(modes.basis), modes.basis_omega, modes.basis_zeta
@@ -240,7 +241,7 @@ def truncated(
             covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
     left = None
-    if others.size:  # the modes that are not kept, with the attachment vectors of all of them
+    if others.size:  # the neglected modes, with the attachment vectors
         fields = ("vectors", "vector_omega", "vector_zeta", "vector_dofs")
         left = modes.select(others[others < modes.n_modes])
         left = left.replace(**{name: getattr(modes, name) for name in fields})
@@ -248,7 +249,7 @@ def truncated(
 
 
 def _with_static(kept: Modes, gone: Modes, static: Any) -> Modes:
-    """Return modes with attachment vectors made of the other modes of a known set."""
+    """Return modes with attachment vectors computed from the other modes of a known set."""
     shapes, omega, zeta = np.real(gone.phi), gone.omega, gone.zeta
     names = labels_of(static, kept.dofs)
     rows = np.array([kept.dofs.row(place) for place in static])
@@ -257,7 +258,8 @@ def _with_static(kept: Modes, gone: Modes, static: Any) -> Modes:
     if not values.size or values[-1] <= SAME * values[0] or moved.shape[1] > moved.shape[0]:
         raise ModelError(
             f"the truncated modes cannot give {counted(len(static), 'independent static shape')} "
-            f"at {', '.join(names)}: they are too few, or a place is there twice."
+            f"at {', '.join(names)}: they are too few, or a place appears twice. Solve more "
+            "modes, or name each place once."
         )
     squares, mix = la.eigh((vectors.T * omega**2) @ vectors)
     mix = vectors @ mix
@@ -291,7 +293,7 @@ def _peaks(terms: FloatArray) -> float:
 def _modal_model(
     modes: Modes, numbers: Sequence[int], method: str, bound: ErrorBound | None
 ) -> ReducedModel:
-    """Return the reduced model whose coordinates are the modes themselves, equation (5)."""
+    """Return the reduced model whose coordinates are the modes, equation (5)."""
     k, r = modes.basis_omega.size, modes.n_rigid
     static = [f"{STATIC}{i}" for i in range(1, modes.n_vectors + 1)]
     extra = f" and {counted(modes.n_vectors, 'static vector')}" if modes.n_vectors else ""

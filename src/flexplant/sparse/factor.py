@@ -18,13 +18,13 @@ from ..parallel import one_thread
 from .ordering import Dissection, Front, dissect
 from .symmetric import by_rows, dense, diagonal, unit_diagonal
 
-#: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
+#: number of DOFs up to which dense LAPACK is as fast as a sparse factorisation, and safer
 DENSE_LIMIT = 1500
-#: a full matrix with more rows does not fit the memory comfortably
+#: largest number of rows of a full matrix, limited by memory
 LARGEST_FULL = 6000
-#: from here on a bound by Lanczos is cheaper than a factorisation
+#: number of DOFs above which a Lanczos bound is cheaper than a factorisation
 _BOUND_LIMIT = 10_000
-#: steps of that bound, and the chance that it is wrong
+#: number of Lanczos steps for that bound, and the probability that it is wrong
 _BOUND_STEPS, _BOUND_CHANCE = 180, 1e-9
 
 
@@ -151,17 +151,18 @@ def lowest_eigenvalue_bound(matrix: Any) -> float:
     return bound
 
 
-#: blocks smaller than this (entries, on average) are added by index lists, larger ones as slices
+#: mean number of entries of a block below which blocks are added by index lists, larger ones as
+#: slices
 _SLICE = 600
-#: pivot blocks of up to this many DOFs are kept as inverses
+#: largest number of DOFs of a pivot block that is stored as its inverse
 _INVERTED = 128
 
 
 class MultifrontalFactor:
     """``A = L D L^T`` of a sparse symmetric matrix, D of +1 and -1 [DuffReid1983]_.
 
-    Cholesky (D = I) unless `signed`, for matrices that need not be definite: pivots are not moved
-    between fronts then, and what the factor leaves shows whether that was stable.
+    Cholesky (D = I) unless `signed`, for matrices that need not be definite: pivots are then not
+    moved between fronts, and the residual shows whether this was stable.
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class MultifrontalFactor:
         signed: bool = False,
     ) -> None:
         lower, self._scale = sp.csc_array(matrix), 0.0
-        if single:  # where the range of numbers is small
+        if single:  # single precision has a small range of numbers
             self._scale = float(np.abs(lower.data).max(initial=0.0)) or 1.0
             lower = _in_single(lower, self._scale)
         self.dissection = dissect(lower) if dissection is None else dissection
@@ -233,7 +234,7 @@ def _in_single(matrix: Any, scale: float) -> Any:
 
 @cache
 def _kernels(kind: str) -> dict[str, Any]:
-    """Return what the fronts need of LAPACK and BLAS in a precision."""
+    """Return the LAPACK and BLAS routines that fronts need in a precision."""
     names = ("potrf", "trtri", "sytrf", "sytrf_lwork", "syconv")
     found: Any = lapack.get_lapack_funcs(names, dtype=kind)
     more: Any = blas.get_blas_funcs(("trsm", "syrk"), dtype=kind)
@@ -241,7 +242,7 @@ def _kernels(kind: str) -> dict[str, Any]:
 
 
 def _stored(pivots: Pivots, below: FloatArray) -> tuple[Pivots | None, FloatArray]:
-    """Return a front as it is kept: small ones as ``[L^-1; B L^-1]``, for one product per solve."""
+    """Return a front in stored form: small ones as ``[L^-1; B L^-1]``, one product per solve."""
     if pivots.size > _INVERTED or isinstance(pivots, _SignedPivots):
         return pivots, below
     inverse = pivots.inverse()
@@ -251,7 +252,7 @@ def _stored(pivots: Pivots, below: FloatArray) -> tuple[Pivots | None, FloatArra
 def eliminated(
     lower: Any, dissection: Dissection, *, signed: bool
 ) -> Iterator[tuple[Front, Pivots, FloatArray]]:
-    """Yield each front with its factored pivots ``G diag(s) G^T``, and what is below by ``G^-T``.
+    """Yield fronts with their factored pivots ``G diag(s) G^T``, and the rows below times ``G^-T``.
 
     Cholesky where the pivot block is positive definite; where it is not, Bunch-Kaufman when signed.
     """
@@ -267,7 +268,7 @@ def eliminated(
             below = pivots.after(below)
             syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
             if pivots.negative:
-                # the few with a negative sign are added, not taken away
+                # the few with a negative sign are added, not subtracted
                 few = np.asfortranarray(below[:, pivots.signs < 0])
                 syrk(2.0, few, beta=1.0, c=rest, lower=1, overwrite_c=1)
         yield front, pivots, below
@@ -276,9 +277,9 @@ def eliminated(
 class Pivots:
     """``A = G G^T`` of a positive definite block, by its Cholesky factor."""
 
-    #: s of +1 and -1 in ``G diag(s) G^T``; none where all are +1
+    #: s of +1 and -1 in ``G diag(s) G^T``; None where all are +1
     signs: Any = None
-    #: how many are -1
+    #: number of entries -1
     negative = 0
 
     def __init__(self, factor: FloatArray) -> None:
@@ -373,8 +374,8 @@ def assembled_fronts(
     lower: Any, dissection: Dissection
 ) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
     """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it."""
-    # the blocks are real or complex, as the matrix is, their lower triangles
-    # `rest` must hold what remains for the parent when the next front is allocated
+    # the blocks are real or complex, as the matrix is, their lower triangles `rest` must contain
+    # the remainder for the parent before the next front is allocated
     pointer, index, value = _permuted_triangle(lower, dissection.order)
     place = np.zeros(dissection.order.size, dtype=np.int64)
     left: dict[int, FloatArray] = {}
@@ -450,7 +451,7 @@ def _add(
                 rest[r - p : r - p + re - rb, c - p : c - p + ce - cb] += child[rb:re, cb:ce]
 
 
-#: columns of a remainder that are updated at once: of its symmetric upper part little is computed
+#: number of columns of a remainder updated together: little of the symmetric upper part is computed
 _STRIP = 256
 
 
@@ -465,7 +466,7 @@ class ComplexSymmetricFactor:
     def __init__(self, matrix: Any, dissection: Dissection | None = None) -> None:
         lower = sp.csc_array(matrix, dtype=np.complex128)
         self.dissection = dissect(lower) if dissection is None else dissection
-        #: of each front: LU of its pivot block, the exchanges, and ``D^-1 B^T``
+        #: for each front: LU of its pivot block, the exchanges, and ``D^-1 B^T``
         self._blocks: list[tuple[ComplexArray, Any, ComplexArray]] = []
         with one_thread():
             for _, pivots, below, rest in assembled_fronts(lower, self.dissection):

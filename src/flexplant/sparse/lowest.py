@@ -31,34 +31,36 @@ from .symmetric import (
     without_zeros,
 )
 
-#: vectors that are solved for at a time
+#: number of vectors solved together
 BLOCK = 12
-#: residual of a Ritz pair of the inverse, relative to its value, at which it counts as found
+#: residual of a Ritz pair of the inverse, relative to its value, below which it counts as found
 FOUND = 1e-8
-#: residual at which the value, in error by its square, is known to rounding
+#: residual below which the value is exact to rounding, since its error is the square of the
+#: residual
 VALUE = SPLIT
-#: what a bar calls the blocks that extend the basis
+#: label of the progress bar
 STEPS = "modes, steps of Lanczos"
-#: steps between two restarts, with a large block
+#: number of steps between two restarts with a large block
 _STEPS, _FEW_STEPS = 12, 6
-_RESTARTS = 60  # then M and K are called badly conditioned
-#: a block with directions this much shorter than others is orthonormalised again
+_RESTARTS = 60  # above this, M and K are reported as badly conditioned
+#: relative length of a direction below which its block is orthonormalised again
 _LOST = 1e-3
-#: what one orthogonalisation may take away, relative, for rounding to leave nothing of it
+#: relative part that one orthogonalisation may remove without a second one
 _SMALL = 1e-4
-#: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
+#: relative change of M W that the final Rayleigh-Ritz step on the modes corrects
 _STALE = NULL
-#: relative error of a Ritz pair below which its shape needs no separate tolerance
+#: relative error of a Ritz pair below which its shape needs no tolerance of its own
 _SURE = ROUNDING
-#: values below this, relative to the largest one times FOUND, are not found together with it
+#: size of values relative to the largest one times FOUND, below which they are not found together
+#: with it
 _ROUNDING = 1e-14
-#: residuals of this size, relative to the largest value, are rounding: no step reduces them
+#: residual relative to the largest value that counts as rounding: no step reduces it
 REACHED = 1e-15
-#: values this close (relative) are of one repeated mode
+#: relative distance below which values belong to one repeated mode
 SAME = 1e-8
-#: shapes that are solved for at a time: each time, the whole factor is read
+#: number of shapes solved together, since each solution reads the whole factor
 _SOLVED = 32
-#: entries of a vector worked on at a time
+#: number of entries of a vector processed together
 _PIECE = 8192
 
 
@@ -99,8 +101,8 @@ class BlockLanczos:
         self._over = np.zeros((self._next.shape[1], 0))
 
     def _reserve(self, want: int) -> None:
-        # after a restart want + block vectors are kept; more than as many or _STEPS blocks follow,
-        # of a large block fewer
+        # a restart keeps want + block vectors; then at least the same number again or _STEPS blocks
+        # follow, fewer for a large block
         room = 2 * self._block + max(
             _STEPS * BLOCK, _FEW_STEPS * self._block, 5 * want // 4 + self._block
         )
@@ -115,12 +117,11 @@ class BlockLanczos:
         needed: Callable[[FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the `count` largest theta found and their shapes (n, count)."""
-        # the last `extra` of them need not be shapes yet, only values. Of shapes (n, m) that are
-        # found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
-        # Fewer than `count` are returned where the others are so much smaller than the largest that
-        # its rounding hides them, or where a value has as many copies as the block has vectors,
-        # which do not see them any longer: with those returned locked, another search, of a larger
-        # block, finds the rest
+        # only the values of the last `extra` are needed. For shapes (n, m) that are found to
+        # `tolerance`, `needed` gives the tolerance (m,) that each must reach. Fewer than `count`
+        # are returned where the others are hidden by rounding of the largest value, or where a
+        # value has as many copies as the block has vectors. A new search with a larger block, with
+        # the returned ones locked, finds the rest
         n = self._V.shape[1]
         count = min(count, n - self._r)
         check_at = self.steps
@@ -133,11 +134,11 @@ class BlockLanczos:
             if self.steps < check_at and not full:
                 continue
             theta, mix, error = self._pairs()
-            # what rounding of the largest value lets be found in this search
+            # smallest value that this search can find, by the rounding of the largest one
             sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
             limited = sure < min(count, theta.size)
             wanted = sure if limited else count
-            # a shape is as good as those of the same value: they may be mixed
+            # shapes of equal values have the same accuracy, since they may be mixed
             last = theta[min(count, theta.size) - extra - 1] if theta.size > extra else 0.0
             shapes = int(np.count_nonzero(theta[:count] >= (1 - SAME) * last))
             required = np.full(count, tolerance)
@@ -160,10 +161,10 @@ class BlockLanczos:
                 self._restart(theta, mix, keep)
                 self._over = self._over @ mix[-self._over.shape[1] :, :keep]
             if done:
-                # the memory of the others is needed; a copy would need more first
+                # in place, since a copy would need more memory
                 self._V.resize((self._r + keep, n), refcheck=False)
                 return theta[:wanted], self._V[self._r :][:wanted].T.copy()
-            # a step brings at most a block of new ones, usually half of it
+            # a step adds at most one block of new values, usually half a block
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
         raise SolverError(
             f"Lanczos did not converge for {counted(count, 'mode')} in {self.steps} steps: M and K "
@@ -180,10 +181,10 @@ class BlockLanczos:
         """Extend the basis by the next block."""
         width, at = self._next.shape[1], self._r + self._m
         self._append(self._next)
-        self._next = np.zeros((0, width))  # the basis has it
+        self._next = np.zeros((0, width))  # it is now part of the basis
         moved = self._solve(self._loaded)
-        # nearly all of it along the basis lies along the last block and those before it that T
-        # couples to it: what is left is small, and one orthogonalisation enough
+        # its component in the basis lies almost entirely along the last block and the blocks that T
+        # couples to it; the remainder is small, and one orthogonalisation is enough
         near = np.vstack([self._over.T, self._loaded.T @ moved])
         rows = slice(at + width - near.shape[0], at + width)
         _subtract(moved, self._V[rows], near)
@@ -229,13 +230,13 @@ class BlockLanczos:
         self, W: FloatArray
     ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients."""
-        # Gram-Schmidt until it takes next to nothing away, twice at most: that is enough
-        # [Giraud2005]_; and again where the block itself had next to nothing new in some direction
+        # Gram-Schmidt until it removes almost nothing, at most twice, which is enough
+        # [Giraud2005]_; again where the block had almost nothing new in some direction
         basis = self._V[: self._r + self._m]
         along = np.zeros((basis.shape[0], W.shape[1]))
         over = np.eye(W.shape[1])
         W = np.ascontiguousarray(W)
-        # rounding of W is along what is locked: M times that is known
+        # rounding of W lies along the locked vectors, whose products with M are known
         _subtract(W, self._V[: self._r], self._locked.T @ W)
         loaded = self._M @ W
         for _ in range(3):
@@ -245,16 +246,16 @@ class BlockLanczos:
                 along += part @ over
                 before = float(np.sqrt(np.abs(np.sum(W * loaded, axis=0)).min()))
                 taken = np.abs(part).max(initial=0.0)
-                # where next to nothing is taken away, M W does not change
+                # where almost nothing is removed, M W does not change
                 if taken > _STALE * before:
                     loaded = self._M @ W
                 if taken <= _SMALL * before:
                     break
             poor = False
-            # twice: the first turn is exact only to the condition of the block
+            # twice, since the accuracy of the first pass is limited by the condition of the block
             for _ in range(2):
                 size, turn = la.eigh(W.T @ loaded)
-                # squares of lengths: 1e-12 of the longest direction is rounding
+                # squared lengths: 1e-12 of the longest direction counts as zero
                 keep = size > ROUNDING**2 * max(size[-1], 0.0)
                 if size[-1] <= 0 or not np.any(keep):
                     empty = np.zeros((W.shape[0], 0))
@@ -273,7 +274,7 @@ def iterated(
     solve: Callable[[FloatArray], FloatArray], M: Matrix, locked: FloatArray, phi: FloatArray
 ) -> None:
     """Move shapes on by one inverse iteration next to the locked ones, in place."""
-    # what is left in them of high modes, most of their residual, is gone then
+    # this removes the remainders of high modes, which make up most of the residual
     deflated = np.asarray(M @ locked)
     for at in column_groups(phi.shape[1], _SOLVED):
         force = np.asarray(M @ phi[:, at])
@@ -290,7 +291,7 @@ def _unconverged(theta: FloatArray, error: FloatArray, required: FloatArray) -> 
 
 
 def _most_copies(theta: FloatArray) -> int:
-    """Return how many descending values the largest group of equal ones has."""
+    """Return the size of the largest group of equal values among descending ones."""
     ends = np.flatnonzero(theta[:-1] - theta[1:] > SAME * theta[:-1])
     return int(np.diff(np.concatenate([[-1], ends, [theta.size - 1]])).max(initial=0))
 
@@ -311,12 +312,12 @@ def _subtract(W: FloatArray, basis: FloatArray, part: FloatArray) -> None:
         W[piece] -= (part.T @ basis[:, piece]).T
 
 
-#: rounding let pass in the energies that accompany a count
+#: largest rounding error of the energies that accompany a count
 _ENERGY = 1e-4
-#: spectral radius of the error of a factor, relative to it, up to which its inertia is accepted
+#: largest relative spectral radius of the error of a factor whose inertia is accepted
 _RADIUS = 0.5
-#: random vectors that estimate it, and the part of its largest effect that all may miss: with a
-#: chance of (0.8 _MISSED)^_VECTORS, 1e-13; the largest power that is tried
+#: number of random vectors that estimate it, and the fraction of its largest effect that all may
+#: miss, with a probability of (0.8 _MISSED)^_VECTORS = 1e-13; largest power that is tried
 _VECTORS, _MISSED, _POWER = 12, 0.1, 10
 
 
@@ -324,11 +325,10 @@ def multifrontal_inertia(
     matrix: Any, dissection: Dissection | None = None, *, single: bool = True
 ) -> int:
     """Return how many eigenvalues of a sparse symmetric matrix are negative."""
-    # with `single`, and where the factorisation is most of the work, it is tried in single
-    # precision first, and taken if refinement shows that its rounding changes no sign. In double
-    # precision the factor is not kept. A random `b = A x` is eliminated along:
-    # `x^T A x = y^T D^-1 y` with `L y = b` shows whether pivots restricted to the blocks were
-    # stable
+    # with `single`, and where the factorisation dominates the cost, single precision is tried
+    # first, and accepted if refinement shows that its rounding changes no sign. In double precision
+    # the factor is not stored. A random `b = A x` is eliminated along: `x^T A x = y^T D^-1 y` with
+    # `L y = b` shows whether pivots restricted to the blocks were stable
     lower = sp.csc_array(matrix)
     chosen = dissect(lower) if dissection is None else dissection
     if single and chosen.is_costly:
@@ -384,11 +384,11 @@ def _error_radius(factor: MultifrontalFactor, matrix: Any) -> float:
     return bound
 
 
-#: up to this many DOFs dense LAPACK finds every eigenvalue
+#: number of DOFs up to which dense LAPACK finds every eigenvalue
 _DENSE = 300
-#: relative to the typical K_ii / M_ii: the first shift
+#: first shift, relative to the typical K_ii / M_ii
 _FIRST_SHIFT = 1e-8
-#: more zero eigenvalues than this are not listed one by one
+#: largest number of zero eigenvalues that are listed one by one
 _MOST = 64
 
 
@@ -414,7 +414,7 @@ def lowest_modes(
     nodes: IntArray | None = None,
     xyz: FloatArray | None = None,
 ) -> Lowest:
-    """Return the `count` lowest eigenvalues and more, until one of them is not zero."""
+    """Return the `count` lowest eigenvalues, or more until one of them is not zero."""
     # by inverse iteration at a shift below zero, hence exact to rounding also where K is singular
     # and M has massless rows
     K, M = sp.csc_array(K), sp.csc_array(M)
@@ -442,7 +442,8 @@ def lowest_modes(
             number *= 3
             continue
         elastic = np.abs(values[n_zero:])
-        # close to the elastic modes, these separate well; as near to zero as rounding allows
+        # a shift close to the elastic modes separates them well; it is as close to zero as rounding
+        # allows
         if elastic.size and shift > 1e3 * elastic[0]:
             most = float(np.concatenate([spread[:n_zero], of_known]).max(initial=0.0))
             shift = max(float(elastic[0]), 10 * floor * most)
@@ -488,7 +489,7 @@ def _inverse_iteration(
         try:
             mu, shapes = la.eigh(heavy, stiff)
         except la.LinAlgError:
-            # K is indefinite: M must then be definite, or there is nothing to work with
+            # K is indefinite: M must then be definite
             try:
                 found, shapes = la.eigh(stiff, heavy)
             except la.LinAlgError as error:
@@ -504,7 +505,7 @@ def _inverse_iteration(
         return rayleigh_ritz(K, M, beyond(M, known, _both_ways(K, M, shift, count + r, factor)))
     values, shapes = np.zeros(0), np.zeros((n, 0))
     while shapes.shape[1] < count:
-        # what the rounding of the largest hides is found next to it
+        # values hidden by the rounding of the largest one are found with it locked
         locked, want = np.hstack([known, shapes]), count - shapes.shape[1]
         more = BlockLanczos(factor.solve, M, locked, want=want).lowest(want, VALUE)[1]
         if not more.shape[1]:
@@ -518,7 +519,7 @@ def _both_ways(K: Any, M: Any, shift: float, count: int, factor: Any) -> FloatAr
     """Return shapes (n, count) with the largest |1 / (lambda + shift)|, K + shift M indefinite."""
     n = K.shape[0]
     inverse: Any = spla.LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
-    # the same start every time: the same answer every time
+    # a fixed start vector gives the same result in every run
     start = factor.solve(M @ np.random.default_rng(0).standard_normal(n))
     basis = min(n, 2 * count + 20)
     try:

@@ -12,29 +12,30 @@ import scipy.sparse.csgraph as csgraph
 
 from ..arrays import BoolArray, FloatArray, IntArray
 
-#: a part of fewer DOFs is eliminated as one dense block: of 40, twice the fronts take 30 % longer,
-#: of 96 a plate's factor has 16 % more entries
+#: number of DOFs below which a part is eliminated as one dense block: with 40, twice as many fronts
+#: take 30 % longer; with 96 the factor of a plate has 16 % more entries
 LEAF = 64
-#: a node with this many times the mean number of neighbours (a spider, a constraint) goes last
+#: number of neighbours, relative to the mean, above which a node is eliminated last (a constraint)
 _HUB = 20
-#: coordinates whose first separator has more than this times the nodes of the graph's own do not
-#: fit the graph (a rolled-up shell, where they meet through air: 2.5); boxes have 1.0 to 1.1
+#: ratio of the first separator by coordinates to that by the graph, above which the coordinates do
+#: not fit the graph (a rolled-up shell has 2.5, boxes have 1.0 to 1.1)
 _USELESS = 1.3
-#: multiplications of a factorisation for each entry of the factor from which on it is costly
+#: multiplications per entry of the factor above which a factorisation counts as costly
 _COSTLY = 350.0
-#: averages over neighbours of a distance through the graph: 10 to 40 give the same fill within 1 %
+#: number of averages over neighbours of a distance in the graph: 10 to 40 give the same fill within
+#: 1 %
 _AVERAGES = 20
-#: part of the nodes on either side of the middle in which the smallest separator is looked for
+#: fraction of the nodes on either side of the middle among which the smallest separator is searched
 _BAND = 0.05
-#: a side with less than this fraction of the DOFs: cut in the middle instead
+#: least fraction of the DOFs on a side; below it the cut goes through the middle
 _LEAST_SIDE = 0.15
-#: capacity of what no cut goes through: above any flow, below the limit of 32-bit integers
+#: capacity of edges that must not be cut: above any flow, below the limit of 32-bit integers
 _UNCUT = 2**30
 
 
 @dataclass(frozen=True)
 class Front:
-    """One dense block of the elimination: DOFs `first` to `last` of the order, and what they touch.
+    """One dense block of the elimination: DOFs `first` to `last` of the order, and touched DOFs.
 
     `rows` are the later DOFs (in the order, ascending) in the same columns, `children` the fronts
     whose remainders are added before this one is eliminated.
@@ -60,14 +61,14 @@ class Dissection:
 
     @property
     def multiplications(self) -> float:
-        """Of one factorisation."""
+        """Number of multiplications of one factorisation."""
         sizes = ((float(f.last - f.first), float(f.rows.size)) for f in self.fronts)
         return sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
 
     @property
     def is_costly(self) -> bool:
         """Whether single precision is faster: factors cost far more than solutions with them."""
-        # so it is for bulky structures, whose modes are also not lost in its rounding
+        # this holds for bulky structures, whose modes also stand out from its rounding
         return self.multiplications > _COSTLY * self.n_factor
 
 
@@ -79,8 +80,8 @@ def dissect(
     leaf: int = LEAF,
 ) -> Dissection:
     """Return the nested dissection of a symmetric matrix [George1973]_."""
-    # where coordinates fit the graph, parts are cut across their longest side; else along the graph
-    # itself (`_graph_cut`), which costs eight times the time
+    # where coordinates fit the graph, parts are cut across their longest side; otherwise along the
+    # graph (`_graph_cut`), which takes eight times as long
     if nodes is None:
         nodes = _supervariables(matrix)
     _, first, member = np.unique(nodes, return_index=True, return_inverse=True)
@@ -102,9 +103,10 @@ def dissect(
 
 
 def _supervariables(matrix: sp.csc_array) -> IntArray:
-    """Return a number for each DOF, the same where DOFs touch each other and the same others."""
-    # so are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.
-    # Where few are alike (elements whose axes do not couple), groups of unlike sizes cost fill
+    """Return a number for each DOF, equal for DOFs that touch each other and the same others."""
+    # the DOFs of a node have this property; sums of a random integer for each touched DOF identify
+    # them. Where few are equal (elements whose axes do not couple), groups of unequal sizes cost
+    # fill
     n = matrix.shape[0]
     lower: Any = sp.tril(matrix, -1, format="csc")
     lower = sp.csc_array((np.ones(lower.nnz, np.int64), lower.indices, lower.indptr), shape=(n, n))
@@ -130,7 +132,7 @@ def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_ar
 
 @dataclass(frozen=True)
 class _GraphLevel:
-    """What one level cuts: nodes, the part (0, 1, ...) and width of each, edges inside parts.
+    """Nodes of one level of cuts, the part (0, 1, ...) and width of each, edges inside parts.
 
     `heads` and `tails` are positions in `nodes`, each edge once.
     """
@@ -148,7 +150,7 @@ class _GraphLevel:
         return np.asarray(found, dtype=np.float64)
 
 
-#: what cuts the parts of a level: masks over its nodes, the upper sides and the separators
+#: function that cuts the parts of a level: masks over its nodes for upper sides and separators
 _Cut = Callable[[_GraphLevel], tuple[BoolArray, BoolArray]]
 
 
@@ -218,8 +220,8 @@ def _coordinate_cut(where: FloatArray) -> _Cut:
 
 def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
     """Return the smallest separator near the middle of the longest way through each part."""
-    # its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
-    # much as it has DOFs (Menger's theorem), for all parts in one network
+    # its nodes are the minimum cut of the flow through a band of nodes, each with a capacity equal
+    # to its number of DOFs (Menger's theorem), for all parts in one network
     piece, along = _long_axis(level)
     order = np.lexsort((along, piece, level.part))
     begin = np.searchsorted(level.part[order], np.arange(int(level.part.max()) + 2))
@@ -282,9 +284,9 @@ def _steps(graph: sp.csr_array, starts: IntArray) -> FloatArray:
 def _minimum_cut(
     level: _GraphLevel, low: BoolArray, high: BoolArray, band: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return the upper sides and the fewest DOFs in the band that part `low` from `high`."""
-    # node k of the band is an edge from k to m + k; of the cuts nearest to `low` and nearest to
-    # `high` the one of the more equal sides is taken, part by part
+    """Return the upper sides and the smallest separator in the band between `low` and `high`."""
+    # node k of the band is an edge from k to m + k; of the two cuts nearest to `low` and to `high`,
+    # the one with more equal sides is taken for each part
     nodes = np.flatnonzero(band)
     m = nodes.size
     local = np.zeros(band.size, dtype=np.int64)
@@ -319,12 +321,12 @@ def _minimum_cut(
 def _unit_box(xyz: FloatArray) -> FloatArray:
     spread = np.ptp(xyz, axis=0)
     box = (xyz - xyz.min(axis=0)) / (spread.max() or 1.0)
-    # what rounding separates belongs to one row of nodes
+    # nodes that only rounding separates belong to one row
     return np.asarray(np.round(box, 9), dtype=np.float64)
 
 
 def _upper_half(where: FloatArray, number: IntArray) -> BoolArray:
-    """Return a mask of the nodes beyond the median of their part, along its longest side."""
+    """Return a mask of the nodes beyond the median of each part, along its longest side."""
     count = int(number.max()) + 1
     by_part = np.argsort(number, kind="stable")
     begin = np.searchsorted(number[by_part], np.arange(count + 1))
@@ -363,7 +365,7 @@ def _morton(where: FloatArray) -> IntArray:
 def _fronts(
     graph: sp.csr_array, parts: _Parts, place: IntArray, member: IntArray, width: IntArray
 ) -> Dissection:
-    """Order the nodes part by part, children first, and find what each part touches."""
+    """Order the nodes part by part, children first, and find the nodes that each part touches."""
     names = np.unique(parts.part)
     names = names[np.argsort(_postorder_key(names), kind="stable")]
     rank = np.empty(names.size, dtype=np.int64)
@@ -414,11 +416,11 @@ def interval_numbers(begin: IntArray, end: IntArray) -> IntArray:
 
 
 def _postorder_key(names: IntArray) -> FloatArray:
-    """Return keys that put the parts below a part before it: ends of intervals of [0, 1]."""
+    """Return keys that sort subparts before their part: ends of intervals of [0, 1]."""
     depth = np.floor(np.log2(names)).astype(np.int64)
     deepest = int(depth.max())
     end = (names + 1) << (deepest - depth)
-    # of parts that end together the deeper one comes first
+    # among parts that end together the deeper one comes first
     return np.asarray(end * (deepest + 2.0) + (deepest - depth), dtype=np.float64)
 
 

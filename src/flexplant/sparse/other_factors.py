@@ -1,4 +1,4 @@
-"""CHOLMOD of SuiteSparse, MKL PARDISO: in place of the library's own factor, where chosen."""
+"""CHOLMOD of SuiteSparse and MKL PARDISO as optional solvers."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Cholmod(Value):
     """Factor with CHOLMOD [Chen2008]_: ``pip install scikit-sparse``, 0.4.16 or later.
 
     It needs SuiteSparse and a compiler (Debian: ``apt-get install libsuitesparse-dev``), and parts
-    of CHOLMOD have the GPL: hence no extra of this package. 24 modes of a plate of 99 400 DOFs took
-    5.6 s with it and 5.2 s without, of a solid of 52 700 DOFs 24 s and 10 s. Modes are counted and
-    checked as always, by the library's own factorisation.
+    of CHOLMOD are under the GPL, so that no extra of this package installs it. 24 modes of a plate
+    of 99 400 DOFs took 5.6 s with it and 5.2 s without, of a solid of 52 700 DOFs 24 s and 10 s.
+    Modes are counted and checked as always, by the library's own factorisation.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class CholmodCholesky:
 
     @property
     def n_entries(self) -> int:
-        """Entries of the factor: those of a copy, since 0.4 shows them in another form only."""
+        """Entries of the factor, from a copy, since version 0.4 only shows another form."""
         shown = self._factor.copy()
         return int(shown.nnz if hasattr(shown, "nnz") else shown.L().nnz)
 
@@ -149,7 +149,7 @@ class PardisoCholesky:
         self._entries = np.ascontiguousarray(lower.data, dtype=np.float64)
         self._memory = np.zeros(64, dtype=np.int64)
         self._options = np.zeros(64, dtype=np.int32)
-        self._options[0] = 1  # none of the defaults
+        self._options[0] = 1  # no default options
         self._options[1] = 2  # nested dissection (METIS)
         self._options[17] = -1  # report the entries of the factor
         nothing = np.zeros(1)
@@ -212,7 +212,7 @@ def _release(mkl: Any, memory: Any, options: Any, n: int) -> None:
 
 
 def _library_paths() -> Iterator[Path]:
-    """Yield where mkl_rt may be: in the installed package, below MKLROOT, on the system's path."""
+    """Yield possible paths of mkl_rt: the installed package, below MKLROOT, the system's path."""
     try:
         for file in metadata.files("mkl") or []:
             if any(file.match(name) for name in _NAMES):

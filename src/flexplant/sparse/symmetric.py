@@ -13,19 +13,19 @@ from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError
 from ..tolerances import SAME, SPLIT, divisor
 
-#: stored zeros are left out for products where fewer than this fraction of the entries are not zero
+#: fraction of non-zero entries below which stored zeros are removed before products
 _FULL = 0.8
-#: eigenvalues closer together than this are found to 1e-9 of themselves in one go
+#: ratio of eigenvalues below which one solution finds all with a relative error of 1e-9
 SPREAD = SPLIT
-#: a group of soft modes ends below this fraction of the largest eigenvalue, at the widest gap
+#: fraction of the largest eigenvalue below which a group of soft modes ends, at the widest gap
 _END = 1e-3
-#: rows that are worked on at a time
+#: number of rows processed together
 _ROWS = 65536
-#: shapes that are multiplied at a time: a product of all at once is memory at its peak
+#: number of shapes multiplied together, which limits the peak memory
 _COLUMNS = 16
 #: relative error of an entry in double precision
 PRECISION = float(np.finfo(np.float64).eps)
-#: eigenvalues that rounding of this many units in the last place could make are zero
+#: number of units in the last place below which an eigenvalue counts as zero
 ZERO = 30 * PRECISION
 
 
@@ -38,7 +38,7 @@ def dense(matrix: Matrix) -> FloatArray:
 
 
 def by_rows(matrix: Any) -> Any:
-    """Return a symmetric sparse matrix (dense: itself) stored by rows: faster times many vectors.
+    """Return a symmetric sparse matrix stored by rows, which multiplies faster; dense: itself.
 
     No copy is made: the columns of a symmetric matrix are its rows.
     """
@@ -81,7 +81,7 @@ def without_zeros(matrix: Any) -> Any:
 
 
 def matrix_sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
-    """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
+    """Return the sum of two matrices, either may be None; sparse where the first one is."""
     if matrix is None or change is None:
         return change if matrix is None else matrix
     if sp.issparse(matrix):
@@ -96,7 +96,7 @@ def diagonal(matrix: Matrix) -> FloatArray:
 
 def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
     """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S."""
-    # displacements and rotations have different units: only after this scaling do entries compare
+    # displacements and rotations have different units, and entries compare only after this scaling
     size = np.sqrt(np.abs(diagonal(matrix)))
     scale = 1.0 / np.where(size > 0, size, size.max(initial=0.0) or 1.0)
     if sp.issparse(matrix):
@@ -107,9 +107,9 @@ def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
 
 def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 (k,), ascending, and M-orthonormal shapes (n, k) in the span of X."""
-    # LAPACK's error is a rounding of the largest eigenvalue. The soft modes, separated from the
-    # stiff ones to first order, are therefore solved for again separately, group by group, as
-    # often as the spread of the eigenvalues needs it. X is overwritten
+    # LAPACK's error is of the order of the rounding of the largest eigenvalue. The soft modes are
+    # therefore separated from the stiff ones to first order and solved again, group by group, as
+    # often as the spread of the eigenvalues requires. X is overwritten
     K, M = by_rows(K), by_rows(M)
     squares, mix = _eigh(K, M, X)
     X = mixed(X, mix)
@@ -123,9 +123,10 @@ def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def soft_group(squares: FloatArray) -> int:
-    """Return how many of some ascending eigenvalues form a soft group, up to the widest gap."""
+    """Return the number of ascending eigenvalues in the soft group, up to the widest gap."""
     top = float(squares[-1])
-    # those below are wrong by a rounding of the largest one: gaps among them say nothing
+    # lower values have an error of the rounding of the largest one, so that gaps among them mean
+    # nothing
     sure = np.maximum(squares, 0.1 * SPREAD * top)
     ratio = np.where(sure[:-1] <= _END * top, sure[1:] / sure[:-1], 0.0)
     return int(np.argmax(ratio)) + 1
@@ -133,8 +134,8 @@ def soft_group(squares: FloatArray) -> int:
 
 def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
     """Return ``eps |phi|^T |K| |phi|`` of each M-orthonormal shape [1/s^2]."""
-    # by so much the eigenvalue of a shape may change when the entries of K are rounded to double
-    # precision: no method finds it closer to that of the structure
+    # this is the change of an eigenvalue when the entries of K are rounded to double precision; no
+    # method can find it more accurately
     size_of_K, found = Absolute(K), np.zeros(phi.shape[1])
     for at in column_groups(phi.shape[1]):
         size = np.abs(phi[:, at])
@@ -143,14 +144,14 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
 
 
 def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
-    """Yield the columns of a wide array in groups of one size: made of one, little is large."""
+    """Yield the columns of a wide array in groups of one size, which limits the memory."""
     groups = -(-count // most)
     for k in range(groups):
         yield slice(k * count // groups, (k + 1) * count // groups)
 
 
 class Absolute:
-    """``|K|``, entry by entry, for products: a copy of a large matrix is memory at its peak."""
+    """Products with ``|K|``, entry by entry, without a copy of a large matrix."""
 
     def __init__(self, K: Any) -> None:
         self._K: Any = by_rows(K) if sp.issparse(K) else np.abs(K)
@@ -172,7 +173,7 @@ class Absolute:
 
 
 def mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
-    """Return ``X mix`` in the place of X: a second array of this size is memory at its peak."""
+    """Return ``X mix`` in place of X, without a second array of this size."""
     for begin in range(0, X.shape[0], _ROWS):
         rows = slice(begin, begin + _ROWS)
         X[rows, : mix.shape[1]] = X[rows] @ mix
@@ -190,7 +191,7 @@ def _eigh(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(squares), np.asarray(mix)
 
 
-#: part of a vector, beyond the basis, below which it depends on it
+#: fraction of a vector outside of a basis below which it depends on the basis
 _DEPENDENT = 1e-5
 
 
@@ -206,7 +207,7 @@ def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPEN
     size, mix = la.eigh((gram + gram.T) / 2)
     keep = size > dependent**2
     new = part @ (mix[:, keep] / np.sqrt(size[keep]))
-    # once more: what was nearly dependent has lost digits
+    # again, since nearly dependent vectors have lost digits
     new = new - V @ (V.T @ np.asarray(M @ new))
     factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
     return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)
@@ -215,7 +216,7 @@ def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPEN
 def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
     """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice."""
     done = np.zeros((basis.shape[0], 0))
-    loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
+    loaded = np.zeros((basis.shape[0], 0))  # M times the basis, stored to save products with M
     for i in range(basis.shape[1]):
         vector = basis[:, i]
         length = _mass_norm(M, vector) if vector.any() else 0.0
@@ -231,7 +232,7 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
                 f"(M-norm {left:.3g} of {length:.3g} is left): give independent vectors."
             )
         vector = vector / left
-        # once more, now that rounding of the normalisation shows
+        # again, to remove the rounding of the normalisation
         vector = vector - done @ (loaded.T @ vector)
         forces = np.asarray(M @ vector)
         size = np.sqrt(vector @ forces)
@@ -245,6 +246,6 @@ def _mass_norm(M: Matrix, vector: FloatArray) -> float:
     if square < 0:
         raise ModelError(
             f"M is not positive definite: a motion has the inertia {square:.3g}. Look for a sign, "
-            "or for a negative added mass that is larger than what it is added to."
+            "or for a negative added mass that is larger than the mass at its place."
         )
     return float(np.sqrt(square))

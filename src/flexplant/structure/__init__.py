@@ -1,13 +1,13 @@
-r"""What the machine is: finite-element matrices with labelled degrees of freedom, and damping.
+r"""Structure of a machine: finite-element matrices with labelled degrees of freedom, and damping.
 
-An `FEModel` holds M, D and K with the DOFs they belong to; ``"41:z"`` is the motion of node 41 in
-z. It is read from files (`fx.read_model`), or meshed here:
+An `FEModel` holds M, D and K with the DOFs of their rows; ``"41:z"`` is the motion of node 41 in z.
+It is read from files (`fx.read_model`), or meshed here:
 
 - `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), both with fields of thickness
   and modulus; `beam`, `chain`, `solid_block`: meshes.
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
 - `ModalDamping` (of measured poles too), `Rayleigh`; a complex K is read as modal damping.
-- `check`: symmetry, definiteness, rigid-body motions, mechanisms, mass: what is wrong with a model.
+- `check`: report on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
 - `interpolated`: shapes between the nodes of foreign matrices, so that a POI may be anywhere.
 
 >>> import flexplant as fx

@@ -41,8 +41,8 @@ class PointMass(Value):
     mass : float [kg]
         The mass; of a label that is a rotation, the inertia [kg m^2].
     inertia : float or (3,) array [kg m^2]
-        About its own centre and the axes x, y, z: it rides on the rotations that the model has (or
-        that follow from its shapes) at a point.
+        Moments of inertia about the centre of the mass along x, y, z. They act on the rotations
+        that the model has at the point, or that follow from its shapes.
 
     Examples
     --------
@@ -100,7 +100,7 @@ class Spring(Value):
         displacement. Modes and plants take a negative stiffness that moves the structure as a
         rigid body; one that bends it is refused when the modes are solved.
     direction : str
-        The motion it feels at points: x, y, z, rx, ry, rz. A label carries its own.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
     to : place, optional
         The other end; the ground when not given.
 
@@ -136,7 +136,7 @@ class Damper(Value):
     rate : float [N s/m or N m s/rad]
         Force per velocity, not negative.
     direction : str
-        The motion it feels at points: x, y, z, rx, ry, rz. A label carries its own.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
     to : place, optional
         The other end; the ground when not given. A grounded damper slows rigid-body motions down:
         hold the structure by springs too, or modes and plants refuse it.
@@ -174,7 +174,7 @@ class HeldShape(Interpolation):
     free : Interpolation
         Interpolation of the structure with all its DOFs.
     rows_left : (n,) array of int
-        Which of those are left, in order.
+        The DOFs that remain, in order.
 
     Examples
     --------
@@ -204,7 +204,7 @@ class HeldShape(Interpolation):
 
 
 def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.csc_array]:
-    """Return what parts add to M, K and D, those that are touched only."""
+    """Return the terms that parts add to M, K and D, only for the matrices that change."""
     listed = (
         [parts]
         if isinstance(parts, Part)
@@ -213,7 +213,7 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
     rows: dict[str, list[sp.csc_array]] = {}
     signs: dict[str, list[float]] = {}
     for part in listed:
-        instance(part, Part, "a part", "Add matrices of your own by model.replace(K=...).")
+        instance(part, Part, "a part", "Add your own matrices by model.replace(K=...).")
         for name, row, weight in part.added(dofs):
             if weight:
                 scaled = np.sqrt(abs(weight)) * row

@@ -1,4 +1,4 @@
-"""The facts behind a report on a model, as numbers."""
+"""Numbers behind the report on a model."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .rigid import FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, 
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
-#: modes requested from the solver: six rigid-body motions and some elastic ones; a few are shown
+#: number of modes requested from the solver: six rigid-body motions and some elastic modes
 _MODES, _FEW = 10, 4
-#: DOFs without stiffness that are counted as motions without energy, at most
+#: largest number of DOFs without stiffness that are counted as motions without energy
 _LOOSE = 64
 
 
 @dataclass(frozen=True)
 class Facts:
-    """All facts that `check` reports."""
+    """All numbers that `check` reports."""
 
     given: FEMatrices
     skew: dict[str, tuple[float, int, int]]
@@ -82,7 +82,7 @@ class Facts:
 
 
 def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
-    """Return the facts on some matrices, all that can be known of them."""
+    """Return all known facts on some matrices."""
     proven = model is not None
     skew = {
         name: (0.0, 0, 0) if proven else _skew(matrix)
@@ -207,7 +207,7 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
 
 
 def _of_springs(K: Any, M: Any, lowest: Lowest, motions: ZeroEnergy) -> tuple[Lowest, int]:
-    """Return the lowest modes, those of springs not among the zero ones, and how many are unstable.
+    """Return the lowest modes, with those on springs not at zero, and the number of unstable ones.
 
     As the modes of a structure are judged: a rigid-body motion that is not free has springs, which
     rounding does not hide; negative ones, of magnets, may only move the structure as a rigid body.
@@ -243,14 +243,14 @@ def _try_lowest_modes(
     rounding: float,
     motions: ZeroEnergy | None,
 ) -> tuple[Lowest | None, bool, str]:
-    """Return the lowest modes, whether M made them, and why none was found."""
-    # DOFs without stiffness (`loose`) are motions without energy as they are; the others are judged
-    # without them, since shapes that M couples to them have no energy but rounding
+    """Return the lowest modes, whether M was used, and the reason if none was found."""
+    # each DOF without stiffness (`loose`) is a motion without energy. The others are judged without
+    # these, since shapes that M couples to them have no energy except rounding
     if not there.size or not K.nnz:
         return None, False, "K is zero"
     there = np.setdiff1d(there, loose)
     stiff = np.abs(diagonal(K))
-    # without a mass to weigh by, displacements and rotations compare by their own stiffness
+    # without a mass matrix, displacements and rotations are scaled by their own stiffness
     weight = sp.diags_array(np.where(stiff > 0, stiff, float(stiff.max()) or 1.0))
     scaled = M is not None and mass_definite
     inner: Any = M if scaled else weight

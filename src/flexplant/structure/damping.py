@@ -1,4 +1,4 @@
-"""Damping laws: a ratio for each mode, how well it stands for the law, and the matrix D."""
+"""Damping laws: damping ratios of modes and the matrix D."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Damping(Value):
         """
 
 
-#: field: one ratio of many modes
+#: field: one damping ratio per mode
 _OTHERS = checked(between, low=0.0, high=1.0, hint="1 % is 0.01. Check per cent.", ends="[")
 
 
@@ -53,13 +53,14 @@ class ModalDamping(Damping):
     Parameters
     ----------
     ratio : float or (k,) array [-]
-        In [0, 1). An array counts rigid-body modes too; their entries are not used.
+        Damping ratio in [0, 1). An array counts rigid-body modes too; their entries are not used.
     others : float [-], optional
-        For all modes beyond the array; without it there must be one entry for each mode.
+        Damping ratio of all modes beyond the array; without it there must be one entry for each
+        mode.
     rigid : float [1/s]
-        What slows rigid-body motions down in ``FEModel.with_damping``: their velocity decays with
-        this rate. `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose
-        rigid-body modes are at 0, refuses it.
+        Decay rate of the velocity of rigid-body motions in ``FEModel.with_damping``.
+        `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose rigid-body
+        modes are at 0, refuses it.
 
     Examples
     --------
@@ -82,8 +83,8 @@ class ModalDamping(Damping):
             )
         if self.others is not None and ratio.ndim == 0:
             raise ModelError(
-                "others goes with one ratio for each of the first modes: a single ratio is that of "
-                "all modes already. Leave others out, or pass an array."
+                "others needs an array of ratios for the first modes, but a single ratio holds "
+                "for all modes. Leave others out, or pass an array."
             )
         ratio = _ratios(ratio, "damping ratios")
         self._set(ratio=ratio if ratio.ndim else float(ratio))
@@ -92,17 +93,17 @@ class ModalDamping(Damping):
     def from_measured(
         cls, poles: Any, *, modes: Sequence[int] | None = None, others: float
     ) -> ModalDamping:
-        """Return the damping that measured poles show: ``zeta = -Re(p) / |p|``.
+        """Return the damping of measured poles: ``zeta = -Re(p) / |p|``.
 
         Parameters
         ----------
         poles : (k,) complex array [rad/s], or MeasuredModes
             Measured poles, of either sign of the imaginary part.
         modes : (k,) sequence of int
-            The number of each in the model, from 1, rigid-body modes included. MeasuredModes bring
-            their own.
+            Mode number of each pole in the model, counted from 1 with rigid-body modes.
+            MeasuredModes contain the numbers.
         others : float [-]
-            The ratio of every mode that was not measured.
+            Damping ratio of every mode that was not measured.
 
         Raises
         ------
@@ -171,13 +172,13 @@ class Rayleigh(Damping):
     Parameters
     ----------
     alpha : float [1/s]
-        Mass-proportional part.
+        Factor of the mass-proportional damping.
     beta : float [s]
-        Stiffness-proportional part.
+        Factor of the stiffness-proportional damping.
     rigid : bool
-        Let alpha slow rigid-body motions down too, in ``FEModel.with_damping``: D is then
-        ``alpha M + beta K`` as it stands. `assemble_plant` takes such a model as it is, in dense
-        form; `solve_modes`, whose rigid-body modes are at 0, refuses it.
+        Whether alpha damps rigid-body motions too in ``FEModel.with_damping``; D is then exactly
+        ``alpha M + beta K``. `assemble_plant` takes such a model as it is, in dense form;
+        `solve_modes`, whose rigid-body modes are at 0, refuses it.
 
     References
     ----------
@@ -260,7 +261,8 @@ def _ratios(value: Any, name: str) -> FloatArray:
         worst = ratio.min() if np.any(ratio < 0) else ratio.max()
         raise ModelError(
             f"{name} must be in [0, 1), got {worst:g}: 1 % is 0.01. Negative ones feed energy in, "
-            "and from 1 on there is no oscillation left. Check the sign, and per cent."
+            "and a mode with 1 or more does not oscillate. Check the sign, and whether the value "
+            "is in per cent."
         )
     return ratio
 

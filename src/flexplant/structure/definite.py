@@ -1,4 +1,4 @@
-"""What matrices of a structure must be, (semi-)definite, and the modes of dense ones."""
+"""Definiteness checks of structural matrices, and the modes of dense ones."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from ..sparse.symmetric import (
 from ..tolerances import SAME, TYPED
 from .zero_energy_motions import most_moved, nonrigid
 
-#: what becomes a matrix of a structure
+#: input types that become a matrix of a structure
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
-#: part of its largest possible energy that a rigid translation has at most in K, least in M
+#: fraction of the largest possible energy of a rigid translation: upper limit in K, lower limit in
+#: M
 _NONE, _SOME = 1e-6, 0.1
-#: a structure whose every DOF is slower than this [rad/s] is no machine
+#: sqrt(K_ii / M_ii) [rad/s] below which, if no DOF is faster, K and M are probably swapped
 _SLOW = 1e-2
 
 
@@ -44,7 +45,7 @@ def check_semidefinite(matrix: Matrix, name: str) -> None:
 
 
 def why_indefinite(matrix: Matrix, name: str) -> str:
-    """Return in words that K or D is not positive semi-definite; empty when it is."""
+    """Return a text on K or D that is not positive semi-definite; empty when it is."""
     if _is_semidefinite(matrix):
         return ""
     return (
@@ -81,7 +82,7 @@ def symmetric_matrix(given: Any, name: str, n: int) -> Matrix:
             raise ShapeError(f"{name} must have shape ({n}, {n}), got {value.shape}.")
         matrix = sp.csc_array(value)
         entries = real_array(matrix.data, f"stored entries of {name}")
-        # copies, which may be sorted; of 32 bits, products read a quarter less
+        # copies, which may be sorted; with 32-bit indices products read a quarter less memory
         width: Any = np.int32 if entries.size < 2**31 else np.int64
         indices, pointer = (a.astype(width) for a in (matrix.indices, matrix.indptr))
         matrix = sp.csc_array((entries, indices, pointer), shape=(n, n))
@@ -114,17 +115,17 @@ def _equals_transpose(matrix: Any) -> bool:
 
 def _is_semidefinite(matrix: Matrix) -> bool:
     if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
-        # the factorisation in solve_modes finds the rest; here it would double the cost
+        # the factorisation in solve_modes finds other errors; here it would double the cost
         return not np.any(diagonal(matrix) < 0)
     return is_positive_definite(matrix, SAME)
 
 
 def without_inertia(M: Matrix, K: Matrix) -> str:
-    """Return in words why M is not positive definite, and what to do."""
+    """Return a text that says why M is not positive definite, and what to do."""
     if not np.any(diagonal(M) <= 0) and is_positive_definite(K) and _is_semidefinite(M):
         return (
-            f"{lowest(M)}, as a stiffness has that moves freely, and K is positive definite, as a "
-            "mass is: they are swapped. The order is FEModel(M, K, D)."
+            f"{lowest(M)}, as for the stiffness of a free structure, and K is positive definite, "
+            "as a mass is: they are swapped. The order is FEModel(M, K, D)."
         )
     return (
         f"{lowest(M)}. Some motion would have no inertia, or a negative one. Condense massless "
@@ -133,7 +134,7 @@ def without_inertia(M: Matrix, K: Matrix) -> str:
 
 
 def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
-    """Return in words that no motion of a structure is as fast as one has; empty when one is."""
+    """Return a text when every DOF is too slow for a machine; empty otherwise."""
     fastest = _omega_bound(M, K)
     if not 0.0 < fastest < _SLOW:
         return ""
@@ -147,9 +148,9 @@ def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
 
 
 def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
-    """Return whether M moves freely as a stiffness does, and K resists as a mass does."""
-    # by the energy of rigid translations; where supports hold the structure, by single DOFs, if no
-    # motion is as fast as a structure's
+    """Return whether M behaves like a stiffness of a free structure, and K like a mass."""
+    # judged by the energy of rigid translations; for a held structure by single DOFs, if every
+    # motion is too slow for a structure
     if dofs is None or M is None:
         return False
     moves = [(dofs.kinds == axis).astype(np.float64) for axis in range(3)]
@@ -163,7 +164,7 @@ def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
 
 
 def _energy(matrix: Any, motion: FloatArray) -> float:
-    """Return ``t^T A t``, of what it would be if nothing cancelled."""
+    """Return ``t^T A t`` relative to its size if nothing cancelled."""
     size = float(motion @ (abs(matrix) @ motion))
     return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
 
@@ -175,7 +176,7 @@ def _omega_bound(M: Matrix, K: Matrix) -> float:
 
 
 def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:
-    """Return at how many DOFs a matrix makes no force when all of one axis move alike.
+    """Return the number of DOFs without a force when all DOFs of one axis move equally.
 
     For a stiffness these are the DOFs away from supports; a mass has a force at every one.
     """
@@ -188,7 +189,7 @@ def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:
 
 
 def lowest(matrix: Matrix) -> str:
-    """Return in words why a symmetric matrix is not positive definite."""
+    """Return a text that says why a symmetric matrix is not positive definite."""
     entries = diagonal(matrix)
     i = int(np.argmin(entries))
     if entries[i] <= 0:
@@ -199,7 +200,7 @@ def lowest(matrix: Matrix) -> str:
     return f"scaled to a unit diagonal its lowest eigenvalue is {least:.3g}"
 
 
-#: part of its kinetic energy that an unstable mode has in rigid-body motion, at least
+#: least fraction of the kinetic energy of an unstable mode in rigid-body motion
 _RIGID = 0.99
 
 
@@ -215,15 +216,15 @@ def signed_square(omega: FloatArray) -> FloatArray:
 
 
 def are_rigid(M: Any, motions: FloatArray, phi: FloatArray) -> np.ndarray:
-    """Return which shapes (k,) are rigid-body motions but for 1 % of their kinetic energy."""
+    """Return which shapes (k,) are rigid-body motions to 1 % of their kinetic energy."""
     part = np.asarray(by_rows(M) @ motions).T @ phi
     return np.asarray(np.sum(part**2, axis=0) > _RIGID)
 
 
 def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:
     """Return the negative eigenvalues [1/s^2] of ``R' K R``, R M-orthonormal rigid-body motions."""
-    # there are as many as K has negative ones when these belong to rigid-body motion; they lie
-    # above those (Rayleigh, Courant)
+    # their number equals that of the negative eigenvalues of K when these belong to rigid-body
+    # motion; they lie above them (Rayleigh, Courant)
     if not motions.shape[1]:
         return np.zeros(0)
     energy = motions.T @ np.asarray(by_rows(K) @ motions)
@@ -242,11 +243,12 @@ def refuse_unstable(model: Any, what: str) -> None:
         )
 
 
-#: eigenvalues above this fraction of the largest one are right to 1e-9 when M is made the identity
+#: fraction of the largest eigenvalue above which eigenvalues have a relative error of 1e-9 when M
+#: is transformed to the identity
 _DIRECT = 1e-6
-#: the shift of the inverse problem, in roundings of K: K + s M is well away from singular
+#: shift of the inverse problem in units of the rounding of K, so that K + s M is well-conditioned
 _SHIFT = 1e3
-#: steps of inverse iteration, until the eigenvalues change by at most this
+#: number of steps of inverse iteration, and change of the eigenvalues at which it ends
 _STEPS, _SETTLED = 5, 1e-10
 
 
@@ -260,14 +262,14 @@ def elastic_modes(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the elastic frequencies (k,) [rad/s] and M-orthonormal shapes (n, k), ascending.
 
-    Where springs of negative stiffness act on a structure that `motions` gives the M-orthonormal
-    rigid-body motions (n, r) of, its unstable modes come first: those are rigid-body motions, and
+    Where springs of negative stiffness act on a structure whose M-orthonormal rigid-body motions
+    (n, r) are given by `motions`, the unstable modes come first. They are rigid-body motions, and
     their frequency is ``-sigma`` for the poles +-sigma, ``omega |omega|`` their omega^2.
 
     ``K phi = omega^2 M phi`` is solved in the M-orthogonal complement of the M-orthonormal
-    rigid-body motions (n, r), so that these mix with no elastic mode. Each frequency is right to
-    1e-8 of itself, or to its own rounding ``eps |phi|^T |K| |phi| / (2 omega^2)``, whichever is
-    larger: the entries of K, as stored, define it no better.
+    rigid-body motions (n, r), so that these mix with no elastic mode. Each frequency has a relative
+    error of at most 1e-8, or of its own rounding ``eps |phi|^T |K| |phi| / (2 omega^2)``, whichever
+    is larger: the stored entries of K do not define it more accurately.
 
     The transformation that makes M the identity leaves an error of a rounding of the largest
     eigenvalue in all of them. Soft modes are therefore improved by inverse iteration with the
@@ -299,7 +301,7 @@ def elastic_modes(
         stiffness, subset_by_index=(0, kept - 1) if few else None, driver="evr" if few else "evd"
     )
     if squares.size > 1 and squares[0] < _DIRECT * largest:
-        if few:  # all of them, for the space of the soft ones to be right
+        if few:  # all of them, so that the space of the soft ones is accurate
             squares, vectors = la.eigh(stiffness, driver="evd")
         squares, phi = _improved(M, K, rigid, squares, reach.T @ (elastic @ vectors))
     else:
@@ -316,7 +318,7 @@ def elastic_modes(
 
 
 def has_negative_springs(model: Any) -> bool:
-    """Return whether an FEModel's K has negative eigenvalues, all of them of rigid-body motion."""
+    """Return whether K has negative eigenvalues that all belong to rigid-body motion."""
     count = model.n_unstable
     if not count or model.n_dof > DENSE_LIMIT:
         return False
@@ -382,9 +384,10 @@ def check_stiffness(
     found = f"omega^2 = {squares[first]:.3g} 1/s^2, rounding is about {rounding[first]:.1g}"
     if squares[first] < -10 * rounding[first]:
         raise ModelError(
-            f"an elastic mode has a negative stiffness ({found}): K is indefinite, and the motion "
-            "bends the structure. Negative stiffness is taken only where it moves the structure as "
-            "a rigid body, as magnets do. Look for a sign in K, or for springs of negative "
+            f"an elastic mode has a negative stiffness ({found}): K is indefinite, and the "
+            "motion bends the structure. Negative stiffness is accepted only where it moves the "
+            "structure as a rigid body, as magnets do. Look for a sign in K, or for springs of "
+            "negative "
             "stiffness that are too strong."
         )
     moved = ""
@@ -416,23 +419,23 @@ def signed(phi: FloatArray) -> FloatArray:
     return np.asarray(phi * np.where(phi[first, np.arange(phi.shape[1])] < 0, -1.0, 1.0))
 
 
-#: numbers of fewer digits may be exact; those of more cannot be distinguished from computed ones
+#: number of digits: numbers with fewer may be exact; numbers with more look like computed ones
 _WRITTEN = range(5, 15)
 
 
-#: number of different entries, at least and at most, that show how many digits were written
+#: least and largest number of different entries that show how many digits were written
 _SAMPLE = (20, 400)
 
 
-#: the part of them that needs every digit: of ten last digits one is zero
+#: fraction of entries that need every digit: one in ten last digits is zero
 _EVERY_DIGIT = 0.6
 
 
 def digits_of(given: Any) -> int | None:
     """Return the decimal digits that entries hold, None for double precision."""
-    # rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
-    # digits, in single precision. Entries in double precision that came from a text of few digits
-    # show it: written with as few digits as distinguish them, none has more
+    # rounding in single precision changes an entry by half a unit in the last place, 2^-24, hence 7
+    # digits. Entries in double precision that were read from a text with few digits are recognised:
+    # their shortest text has no more digits
     if not hasattr(given, "dtype"):
         real_array(given, "K")
         given = np.asarray(given)
@@ -444,7 +447,7 @@ def digits_of(given: Any) -> int | None:
 
 
 def _written_digits(given: Any) -> int | None:
-    """Return with how many digits some numbers were written, None when that does not show."""
+    """Return the number of digits with which numbers were written, None when unknown."""
     columns: Any = sp.csc_array
     held: Any = columns(given).data if sp.issparse(given) else np.ravel(given)
     entries = np.abs(held.real)

@@ -66,7 +66,7 @@ def _unit_coefficients() -> FloatArray:
     rows = []
     for s, t in PLATE_CORNERS.astype(float):
         rows += [plate_terms(s, t, 0, 0), plate_terms(s, t, 0, 1), -plate_terms(s, t, 1, 0)]
-    return np.round(np.linalg.inv(np.array(rows)), 6)  # small whole numbers
+    return np.round(np.linalg.inv(np.array(rows)), 6)  # small integers
 
 
 def plate_coefficients(a: float, b: float) -> FloatArray:
@@ -129,8 +129,8 @@ def brick_mass(a: float, b: float, c: float) -> FloatArray:
 def brick_stiffness(a: float, b: float, c: float, nu: float) -> FloatArray:
     """Return the stiffness (24, 24) of a brick for E = 1, three bending modes inside condensed."""
     # trilinear displacements and, for each of x, y, z, the incompatible parabolas 1 - xi^2: without
-    # them a brick in bending shears and is far too stiff (Wilson and Taylor; on rectangular
-    # elements the patch test holds as it stands)
+    # them a brick in bending is far too stiff (Wilson and Taylor; rectangular elements pass the
+    # patch test without changes)
     law = np.diag([0.5 * (1 - 2 * nu)] * 6)
     law[:3, :3] += nu + 0.5 * (1 - 2 * nu) * np.eye(3)  # lambda + 2 mu on the diagonal
     law /= (1 + nu) * (1 - 2 * nu)
@@ -167,16 +167,16 @@ def _mirror_upper(upper: FloatArray) -> FloatArray:
     return np.asarray(upper + np.triu(upper, 1).T, dtype=np.float64)
 
 
-#: number of numbers at once: more of them no longer fit the cache
+#: number of entries processed together, so that they fit the cache
 _CHUNK = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A line, rectangle or box of elements, of which some may be missing.
+    """A line, rectangle or box of elements; some elements may be missing.
 
-    A node sees up to 3^d nodes through up to 2^d elements; which of these exist decides what its
-    rows hold. Elements and nodes are counted with x fastest; an element's nodes likewise.
+    A node sees up to 3^d nodes through up to 2^d elements; the existing ones determine the entries
+    of its rows. Elements and nodes are counted with x fastest; an element's nodes likewise.
     """
 
     counts: tuple[int, ...]
@@ -269,7 +269,7 @@ class Grid:
         return indices, pointer
 
     def matrix(self, terms: Sequence[tuple[FloatArray, Any]]) -> sp.csc_array:
-        """Return the sum of element matrices, each term weighted element by element."""
+        """Return the assembled sum of element matrices, with a weight for each element."""
         f, n_corners, n_seen = self.per_node, 2**self._ndim, 3**self._ndim
         table = np.zeros((len(terms), n_corners, f, n_seen, f))
         weights = []
@@ -317,7 +317,7 @@ def _repeated_blocks(values: Any, lengths: IntArray, times: int) -> Any:
         return np.repeat(values.reshape(-1, 1, lengths[0]), times, axis=1).ravel()
     starts = np.cumsum(lengths) - lengths
     found = np.empty(times * values.size, dtype=values.dtype)
-    # runs of equal blocks are copied at once: on a grid there are few kinds of nodes
+    # runs of equal blocks are copied together, since a grid has few kinds of nodes
     for length in np.unique(lengths).tolist():
         chosen = np.flatnonzero(lengths == length)
         step = max(1, 20 * _CHUNK // (length * times))

@@ -1,4 +1,4 @@
-"""What varies over a grid of elements: material, thickness, missing elements."""
+"""Fields over a grid of elements: material, thickness, missing elements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .element_matrices import Grid
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]
 
-#: largest number of elements along one axis: more do not make a model of a machine
+#: largest number of elements along one axis that a machine model may have
 MOST = 10**6
 
 
@@ -30,7 +30,7 @@ def lengths_of(size: Any, count: int) -> tuple[float, ...]:
 
 
 def _field_values(function: Any, name: str, centres: FloatArray) -> list[Any]:
-    """Return what a user's function answers at the centres (elements, d)."""
+    """Return the values of a user's function at the centres (elements, d)."""
     if isinstance(function, type):
         raise ModelError(f"{name} is a class, {function.__name__}. Pass a number or a function.")
     names = ", ".join("xyz"[: centres.shape[1]])
@@ -50,7 +50,7 @@ def counts_of(elements: Any, count: int) -> tuple[int, ...]:
     if not isinstance(listed, Sequence | np.ndarray) or not several(listed) or len(listed) != count:
         raise ShapeError(
             f"elements must be {count} whole numbers (along {', '.join(axes)}), got "
-            f"{short(elements)}. Write ({', '.join(['8'] * count)}), say."
+            f"{short(elements)}. Write for example ({', '.join(['8'] * count)})."
         )
     return tuple(
         whole(value, f"elements along {axis}", maximum=MOST)

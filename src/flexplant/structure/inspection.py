@@ -1,4 +1,4 @@
-"""The report on a model: what is wrong with it, what is odd, and what to do about it."""
+"""Report on a model: errors, unusual findings, and what to do about them."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ from .zero_energy_motions import ZeroEnergy, held_by_rounding, most_moved, nearl
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelCheck(Value):
-    """What `check` found, line by line; printed it is a table.
+    """Findings of `check`, line by line; prints as a table.
 
     Parameters
     ----------
     lines : tuple of (verdict, subject, finding, next step)
-        Verdicts are "ok", "note" (worth a look) and "fail" (no model, or a wrong one).
+        Verdicts are "ok", "note" (worth a look) and "fail" (the model is missing or wrong).
     mass : (3,) array [kg]
-        Against translation in x, y, z; NaN where no DOF moves so.
+        Mass in translation along x, y, z; NaN for a direction without a DOF.
     center : (3,) array [m]
         Centre of gravity; NaN where the DOFs do not determine it.
     inertia : (3, 3) array [kg m^2]
-        About the centre of gravity.
+        Inertia about the centre of gravity.
     rigid : tuple of str
         Directions x to rz (rotations about the middle) in which the structure moves freely.
     grounded : tuple of str
-        Those that are held.
+        Directions in which the structure is held.
     n_rigid : int
-        Independent free rigid-body motions, combinations included.
+        Number of independent free rigid-body motions, combinations included.
     n_zero : int
-        Motions without energy found in K alone.
+        Number of motions without energy in K.
     mechanisms : tuple of tuple of str
         For each zero-energy motion that is not a rigid-body motion, the DOFs that move most.
     massless, stiffless : tuple of str
-        DOFs without mass, without stiffness.
+        DOFs without mass, and DOFs without stiffness.
     n_pieces : int
-        Parts of the structure that are not joined.
+        Number of parts of the structure that are not joined.
     first_freq : float [Hz]
         Frequency of the first elastic mode; NaN when it is not known.
     source : str or None
-        What was checked.
+        Name of the model that was checked.
 
     Examples
     --------
@@ -83,7 +83,7 @@ class ModelCheck(Value):
 
     @property
     def ok(self) -> bool:
-        """Whether nothing failed; notes may be there."""
+        """Whether no line failed; there may be notes."""
         return not self.of("fail")
 
     def of(self, verdict: str) -> tuple[str, ...]:
@@ -92,7 +92,7 @@ class ModelCheck(Value):
         Parameters
         ----------
         verdict : str
-            Which.
+            Verdict of the returned lines.
         """
         one_of(verdict, "verdict", ("ok", "note", "fail"))
         return tuple(subject for found, subject, _, _ in self.lines if found == verdict)
@@ -112,17 +112,18 @@ class ModelCheck(Value):
 
 
 def check(model: FEModel | FEMatrices) -> ModelCheck:
-    """Return the report on a model: what is wrong, what is odd, and the next step for each.
+    """Return the report on a model: errors, unusual findings, and a next step for each.
 
-    Symmetry and definiteness (by factorisation), rigid-body motions found in K against those of the
-    geometry, mechanisms and which DOFs move in them, total mass, centre of gravity and inertia,
-    DOFs without mass or stiffness, parts that are not joined, penalties, odd units, damping to
-    ground, and digits lost in a text or in single precision. Nothing is changed or repaired.
+    It covers symmetry and definiteness (by factorisation), rigid-body motions in K compared with
+    those of the geometry, mechanisms and which DOFs move in them, total mass, centre of gravity and
+    inertia, DOFs without mass or stiffness, parts that are not joined, penalties, odd units,
+    damping to ground, and digits lost in a text or in single precision. Nothing is changed or
+    repaired.
 
     Parameters
     ----------
     model : FEModel or FEMatrices
-        What is checked; matrices as a file holds them may be wrong in any way.
+        Model or matrices to check; FEMatrices may contain any error.
 
     Raises
     ------
@@ -153,7 +154,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
         *(_matrix_lines, _row_lines, _rigid_lines, _connectivity),
         *(_mass_lines, _scale_lines, _digits),
     )
-    # of swapped matrices all else would be nonsense
+    # for swapped matrices all other checks would be meaningless
     lines = [line for part in parts[: 1 if found.swapped else None] for line in part(found)]
     lines += [("note", "reader", note, "") for note in matrices_.notes]
     if matrices_.constrained:
@@ -191,7 +192,7 @@ def _connectivity(found: Facts) -> list[Line]:
         (
             "note",
             "connectivity",
-            f"{count} pieces that nothing joins; beside the largest: {'; '.join(shown)}{more}",
+            f"{count} separate pieces; in addition to the largest: {'; '.join(shown)}{more}",
             "coincident nodes not merged, or a missing contact? Join them, or model them apart",
         )
     ]
@@ -234,7 +235,7 @@ def _rounding_warning(found: Facts, digits: int) -> str | None:
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
 
-#: a diagonal that exceeds all it couples to by this much is a penalty
+#: ratio of a diagonal entry to all entries it couples to, above which it counts as a penalty
 _PENALTY = 1e6
 
 
@@ -263,7 +264,7 @@ def _matrix_lines(found: Facts) -> Iterator[Line]:
         yield (
             "fail",
             "order of K and M",
-            "M resists no rigid translation as a stiffness does, K every one as a mass does",
+            "M resists no rigid translation, as a stiffness; K resists all, as a mass",
             "they are swapped: FEMatrices(K, M), but FEModel(M, K)",
         )
         return
@@ -295,14 +296,14 @@ def _stiffness_line(found: Facts) -> Line:
             "fail",
             "definiteness of K",
             f"not found out: {found.failure}",
-            "mend what the other lines name first",
+            "correct the findings of the other lines first",
         )
     if found.n_negative:
         negative = found.lowest.negative
         text = f"K has {counted(found.n_negative, 'negative eigenvalue')}"
         if negative is not None:
             lowest = f", the lowest {negative[0][0]:.3g} 1/s^2" if found.scaled_by_mass else ""
-            # displacements and rotations compare by the forces that they take
+            # displacements and rotations are compared by their forces
             size = np.sqrt(np.abs(diagonal(found.given.K))) * negative[1][:, 0]
             text += f"{lowest}, moving {some_names(widest_dofs(found, size), most=3)}"
         if found.n_unstable == found.n_negative:
@@ -335,7 +336,7 @@ def _damping_line(found: Facts) -> Line:
             "D is not positive semi-definite: it feeds energy in",
             "look for a sign; gyroscopic terms are not symmetric and do not belong into D",
         )
-    # of the terms, which cancel to rounding
+    # relative to the terms, which cancel to rounding
     if found.damping["drag"] > 1e-9:
         return (
             "note",
@@ -373,7 +374,7 @@ def _row_lines(found: Facts) -> Iterator[Line]:
             "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
         )
     if found.stiffless.size:
-        # a mass alone is a rigid body: only other motions fail
+        # a single mass is a rigid body: only other motions fail
         whole = found.motions is not None and not found.mechanisms.size
         yield (
             "note" if whole and not found.massless.size else "fail",
@@ -414,7 +415,7 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
         yield (
             "note",
             "rigid body",
-            f"{text}; coordinates are not known, hence nor are rotations ({expected})",
+            f"{text}; coordinates and therefore rotations are not known ({expected})",
             "give them: located_at(nodes, xyz)",
         )
         return
@@ -423,7 +424,7 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
         "note" if partly else "ok",
         "rigid body",
         f"{text} ({expected})",
-        "the supports leave that free: a mode at 0 Hz. Hold it where the machine does"
+        "the supports leave this motion free: a mode at 0 Hz. Hold it where the machine does"
         if partly
         else "",
     )
@@ -456,7 +457,7 @@ def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
             alone += [f"free {way}" for way in _combined_motions(motions, found.given.dofs)]
             return f"{', and '.join(alone)}; else grounded in {held}{absent}"
         alone.append(f"free in {counted(combined, 'combination')} of {held}")
-        return f"{', and '.join(alone)} (each by itself is held){absent}"
+        return f"{', and '.join(alone)} (each is held separately){absent}"
     grounded = f"; grounded in {held}" if held else ""
     return f"{f'free in {free}' if free else 'held'}{grounded}{absent}"
 
@@ -482,7 +483,8 @@ def _mass_lines(found: Facts) -> Iterator[Line]:
     if np.isfinite(center).any():
         turning = np.nanmax(np.diag(found.body.inertia), initial=0.0)
         least = TYPED * np.sqrt(turning / np.abs(mass[known][0]))
-        near = np.where(np.abs(center) < least, 0.0, center)  # a sum that cancels is not a place
+        # a sum that cancels does not determine a place
+        near = np.where(np.abs(center) < least, 0.0, center)
         at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in near)
         yield ("ok", "centre of gravity", f"({at}) m", "")
     turns = np.diag(found.body.inertia)
@@ -522,7 +524,7 @@ def _scale_lines(found: Facts) -> Iterator[Line]:
 
 
 def _combined_motions(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
-    """Return in words the free motions that are combinations of x to rz, one by one."""
+    """Return a text for each free motion that combines several of x to rz."""
     # a motion `t + w x (r - r_0)` turns about the axis along w through `r_0 + w x t / |w|^2`, and
     # moves along it by `t . w / |w|` per radian
     center = dofs.xyz.mean(axis=0)

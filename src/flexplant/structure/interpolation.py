@@ -17,7 +17,7 @@ from ..tolerances import SAME, TINY
 from ..words import instance
 from .model import FEModel
 
-#: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do
+#: number of nodes up to which one smooth interpolant is used; for more, the nearest nodes are used
 _GLOBAL = 600
 _NEIGHBOURS = 80
 #: rotation of the material = half the curl: (sign, displacement, derivative along axis)
@@ -33,33 +33,34 @@ Interpolated = TypeVar("Interpolated", bound=Value)
 def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """Return a model (or its modes, or a DofSet) whose shapes are interpolated between its nodes.
 
-    For imported models, whose elements are not known: places may then be any point inside the
-    nodes, not only labels. It is done on request, never silently.
+    It serves imported models, whose elements are not known: places may then be any point inside the
+    nodes, not only labels. It is only done on request.
 
     Parameters
     ----------
     item : FEModel, Modes or DofSet
-        With nodes that are not all in one place.
+        Model whose nodes are not all in one place.
     margin : float [m]
-        How far outside the hull of the nodes a point may lie: a surface next to a mid-plane, say.
+        Largest distance of a point outside of the hull of the nodes, for example of a surface from
+        a mid-plane.
 
     Returns
     -------
     FEModel, Modes or DofSet
-        The same, its `dofs.interpolation` a ScatteredShape.
+        The same item with a ScatteredShape as `dofs.interpolation`.
 
     Raises
     ------
     ModelError
-        When it is something else, a joined machine, or margin is negative.
+        When the item has another type or is a joined machine, or margin is negative.
 
     Notes
     -----
     Each displacement is a radial basis function r^3 with linear part (scipy's RBFInterpolator):
     exact at the nodes and for rigid-body motion. Where the model has no rotations, they are half
     the curl of the displacements, or the one slope that is known: rx = dz/dy, ry = -dz/dx on a
-    plate. Up to 600 nodes the field is smooth; on larger models it is that of the 80 nearest
-    nodes, and may step by the error of interpolation where these change.
+    plate. Up to 600 nodes the field is smooth; on larger models it uses the 80 nearest nodes, and
+    may step by the interpolation error where these change.
 
     Examples
     --------
@@ -96,7 +97,7 @@ class ScatteredShape(Interpolation):
     directions : sequence of n str
         Direction of each DOF.
     margin : float [m]
-        How far outside their hull points are still taken.
+        Largest distance of a point outside of the hull of the nodes.
 
     Examples
     --------
@@ -168,13 +169,13 @@ class _Field:
             raise LabelError(
                 f"all DOFs {direction!r} are at one node: nothing to interpolate. Use labels."
             )
-        # of the distance of nodes: a slope
+        # relative to the distance of nodes: a slope
         self.step = 1e-3 * self.extent / max(rows.size ** (1 / self.axes.shape[0]), 2.0)
         self.all = self._interpolant(np.arange(rows.size)) if rows.size <= _GLOBAL else None
 
     def spans(self, axis: int) -> bool:
         """Return whether the nodes vary along x, y or z, so that slopes along it are known."""
-        # 1 where the axis lies in the span of the nodes, less by the square of what is missing
+        # 1 where the axis lies in the span of the nodes, lower by the square of the missing part
         return bool(np.linalg.norm(self.axes[:, axis]) > 1.0 - 1e-6)
 
     def values(self, points: FloatArray) -> FloatArray:
@@ -224,7 +225,7 @@ class _Field:
     def _exact(
         self, weights: FloatArray, chosen: IntArray, at: FloatArray, axis: int | None
     ) -> FloatArray:
-        """Take rounding out: constant and linear fields (rigid-body motion) come out exactly."""
+        """Remove rounding, so that constant and linear fields (rigid-body motion) are exact."""
         linear = np.column_stack([np.ones(chosen.size), self.flat[chosen] / self.extent])
         if axis is None:
             wanted = np.column_stack([np.ones(at.shape[0]), at / self.extent])

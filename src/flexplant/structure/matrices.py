@@ -1,4 +1,4 @@
-"""What a foreign file holds, before it is a model: matrices, and what their rows stand for."""
+"""Matrices of a file before they become a model, and the meaning of their rows."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from .zero_energy_motions import endangered, freed, held_by_rounding, shown_digi
 class FEMatrices(Value):
     """Matrices of ``M q'' + D q' + K q = f`` as a file holds them; `check` reports what is wrong.
 
-    An FEModel demands a positive definite M, known DOFs and coordinates; nothing of this is
-    required here. `model` makes one when all is there, and says what is missing when not.
+    An FEModel needs a positive definite M, known DOFs and coordinates; FEMatrices need none of
+    these. `model` makes an FEModel when all is available, and otherwise says what is missing.
 
     Parameters
     ----------
@@ -42,20 +42,21 @@ class FEMatrices(Value):
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping; M may be singular.
     dofs : DofSet, optional
-        What the rows stand for. None: not known yet, `with_dofs` gives it.
+        Meaning of the rows. None: not known yet; `with_dofs` adds it.
     digits : int, optional
         Significant decimal digits of the entries of K: as printed in a text, 7 when K is given in
-        single precision. None: double precision, nothing was lost.
+        single precision. None: double precision.
     source : str, optional
-        Where it came from, for display.
+        Origin of the matrices, for display.
     constrained : sequence of str
-        Labels of DOFs that the file holds fixed, and that were dropped.
+        Labels of fixed DOFs in the file, which were dropped.
     located : bool
-        Whether the coordinates in `dofs` are real ones. False: the file has none and they are zero.
+        Whether the coordinates in `dofs` are known. False: the file has no coordinates and they are
+        zero.
     notes : sequence of str
-        What the reader did: completed a triangle, dropped empty rows.
+        Actions of the reader, such as a completed triangle or dropped empty rows.
     loss_factor : float
-        The eta of a complex K; where it differs over the structure, the mean over the rows.
+        Loss factor eta of a complex K; the mean over the rows where it differs over the structure.
 
     Raises
     ------
@@ -169,21 +170,21 @@ class FEMatrices(Value):
         Parameters
         ----------
         dofs : DofSet, or path of a CSV file
-            In the order of the rows, with coordinates.
+            DOFs in the order of the rows, with coordinates.
         """
         given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
         instance(given, DofSet, "dofs", "Pass one, or the path of a table.")
         return self.replace(dofs=given, located=True)
 
     def located_at(self, nodes: Iterable[int], xyz: Any) -> FEMatrices:
-        """Return the same with the coordinates of the nodes, which the file did not hold.
+        """Return the same matrices with coordinates of the nodes, which the file does not contain.
 
         Parameters
         ----------
         nodes : sequence of m int
-            Node numbers, in any order, all those of the DOFs among them.
+            Node numbers in any order; they must include all nodes of the DOFs.
         xyz : (m, 3) array [m]
-            Where they are.
+            Coordinates of the nodes.
         """
         dofs = self._named_dofs
         numbers = node_numbers(nodes)
@@ -192,7 +193,7 @@ class FEMatrices(Value):
         return self.replace(dofs=dofs.replace(xyz=places), located=True)
 
     def without(self, labels: Iterable[str]) -> FEMatrices:
-        """Return what is left when DOFs are held: their rows and columns dropped.
+        """Return the matrices with some DOFs held: their rows and columns are dropped.
 
         Parameters
         ----------
@@ -206,7 +207,7 @@ class FEMatrices(Value):
         return self._kept(np.flatnonzero(keep))
 
     def trimmed(self) -> FEMatrices:
-        """Return the same without rows that a solver left for held DOFs; their names are kept.
+        """Return the same without rows that a solver left for held DOFs; their names stay listed.
 
         These are empty in every matrix, or hold no mass and nothing but a diagonal of K: such a
         DOF stays at rest, so that dropping it changes nothing.
@@ -230,18 +231,18 @@ class FEMatrices(Value):
     ) -> FEMatrices:
         """Return the matrices and coordinates in SI, from those in other units.
 
-        Each entry by its kind: ``N/mm`` for displacements, ``N mm`` for rotations and so on, as
-        they follow from the units of length, mass and time.
+        Each entry is converted by its kind (``N/mm`` for displacements, ``N mm`` for rotations),
+        which follows from the units of length, mass and time.
 
         Parameters
         ----------
         length, mass, time : str or float
-            The units they are in now: "mm", "t", "s"; or what one of these units is in SI.
+            Present units, such as "mm", "t", "s"; or the size of one unit in SI.
 
         Returns
         -------
         FEMatrices
-            In m, kg, s, N.
+            Matrices in m, kg, s, N.
 
         Raises
         ------
@@ -269,12 +270,13 @@ class FEMatrices(Value):
         Parameters
         ----------
         rotations : mapping {node: (3, 3) array}
-            For nodes with a local system: row i holds the global components of local axis i.
+            Direction cosines of nodes with a local system: row i holds the global components of
+            local axis i.
 
         Raises
         ------
         LabelError
-            When a node is not there.
+            When a node does not exist.
         ModelError
             When cosines are not orthogonal, or a node has only some of its three directions: the
             others, held in its local system, have no global ones.
@@ -318,7 +320,9 @@ class FEMatrices(Value):
         """
         number = whole(count, "count", minimum=1, maximum=MOST)
         if self.M is None:
-            raise ModelError("there is no M, hence no frequency. Read the mass matrix too: mass=.")
+            raise ModelError(
+                "the frequencies need M, which is missing. Read the mass matrix too: mass=."
+            )
         K, M = (symmetric_matrix(A, name, self.n_dof) for name, A in (("K", self.K), ("M", self.M)))
         written = 0.0 if self.digits is None else 10.0**-self.digits
         return natural_frequencies(K, M, number, rounding=written)
@@ -331,19 +335,19 @@ class FEMatrices(Value):
         Parameters
         ----------
         massless : "refuse" or "condense"
-            What to do with DOFs without mass. "condense" removes them statically,
+            Treatment of DOFs without mass. "condense" removes them statically,
             ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
         free : bool
-            Free the rigid-body motions that only lost digits hold (a text, or single precision), as
-            `freed` does, where there are such.
+            Whether to free the rigid-body motions that are held only by lost digits (text, single
+            precision), as `freed` does.
         name : str, optional
 
         Raises
         ------
         ModelError
-            When M is missing or singular, the DOFs are not known, coordinates are needed (the
-            structure is free) and not there, massless DOFs are to be refused, or the structure is
-            to be free and is held.
+            When M is missing or singular, the DOFs are not known, coordinates are missing and
+            needed (the structure is free), there are massless DOFs to refuse, or `free` is True and
+            the structure is held.
 
         Warns
         -----
@@ -353,7 +357,9 @@ class FEMatrices(Value):
         """
         one_of(massless, "massless", ("refuse", "condense"))
         if self.M is None:
-            raise ModelError("there is no M, hence no model. Read or export the mass matrix too.")
+            raise ModelError(
+                "the model needs M, which is missing. Read or export the mass matrix too."
+            )
         if self.dofs is None:
             raise ModelError(
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
@@ -377,12 +383,13 @@ class FEMatrices(Value):
         if done:
             dofs, notes = self.dofs._taken(rows), (*ready.notes, *done)
             ready = ready.replace(K=K, M=M, D=D, dofs=dofs, notes=notes)
-        # of few digits, the last one decides whether K is singular
+        # with few digits, the last digit decides whether K is singular
         rounding = 1e-14 if self.digits is None else 10.0**-self.digits
         if not self.located and not is_positive_definite(ready.K, -rounding):
             raise ModelError(
-                "the structure is free to move and its coordinates are not known, hence nor are "
-                "its rigid-body rotations. Give them: located_at(nodes, xyz), or to the reader."
+                "the structure is free to move, but its coordinates and therefore its rigid-body "
+                "rotations are not known. Give coordinates: located_at(nodes, xyz), or to the "
+                "reader."
             )
         instance(name, str | None, "name", "Pass a text.")
         parts: Any = ready
@@ -403,10 +410,11 @@ class FEMatrices(Value):
         return model
 
     def freed(self) -> FEMatrices:
-        """Return the same with rigid-body motions free that only lost digits of K hold.
+        """Return the same with those rigid-body motions free that only lost digits of K hold.
 
         ``K' = P^T K P`` with ``P = I - R R^T M``: elastic modes, M-orthogonal to the rigid-body
-        motions R, stay as they are. For texts and single precision; K becomes a full matrix.
+        motions R, stay as they are. Use it for text files and single precision; K becomes a full
+        matrix.
 
         Raises
         ------
@@ -421,7 +429,7 @@ class FEMatrices(Value):
         return self.replace(K=K, notes=(*self.notes, "K freed of rounding in rigid-body motions"))
 
     def _held_by_rounding(self, model: FEModel | None) -> str | None:
-        """Return what to say when rounding alone holds rigid-body motions."""
+        """Return a text when only rounding holds rigid-body motions."""
         if self.digits is None or self.dofs is None or not self.located:
             return None
         known = None if model is None else model.rigid_body
@@ -461,7 +469,7 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
 
 
 def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
-    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done."""
+    """Return a symmetric matrix from one or both triangles of a file, and a note."""
     # a matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
     # one that stores both is left as it is, for `check` to compare them
     if np.iscomplexobj(given):

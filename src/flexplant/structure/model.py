@@ -1,4 +1,4 @@
-"""A structure as a finite-element program leaves it: M, D, K and the meaning of their rows."""
+"""A structure from a finite-element program: M, D, K and the meaning of their rows."""
 
 from __future__ import annotations
 
@@ -45,36 +45,37 @@ class FEModel(Placed, Value):
         Mass: symmetric, positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
         Stiffness: symmetric, positive semi-definite; singular for a free structure, with negative
-        eigenvalues only where they belong to rigid-body motion (magnets). Double precision: what
-        single precision loses is refused or warned of, and
+        eigenvalues only where they belong to rigid-body motion (magnets). K needs double precision:
+        digits lost in single precision lead to an error or a warning, and
         ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees what only its rounding holds.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
     dofs : DofSet
-        What the n rows stand for, with coordinates.
+        DOFs of the n rows, with coordinates.
     name : str, optional
     held_inertia : (n, 6) array, optional
-        Loads ``M_fs r_s`` that the acceleration of held DOFs s makes by their mass coupling, for
-        the six rigid-body motions of the ground about the origin; kept by `fixed`.
+        Loads ``M_fs r_s`` by which held DOFs s act through their mass coupling when the ground
+        accelerates, for its six rigid-body motions about the origin; computed by `fixed`.
     joint_motions : (n, m) array, optional
         M-orthonormal motions of the components of a joined machine as rigid bodies that its rigid
         joints allow (a slide, a hinge), in place of those that follow from the coordinates.
     joining : Value, optional
-        Joints of a joined machine: how it was joined, with its checks; None once M or K is changed.
+        Record of how a machine was joined, with its checks; None after M or K is changed.
 
     Raises
     ------
     ShapeError
         When the sizes of the matrices and of `dofs` differ.
     ModelError
-        When a matrix is not finite, not symmetric, M, K, D not (semi-)definite, or swapped; a K is
-        taken whose negative eigenvalues move the structure as a rigid body.
+        When a matrix is not finite, not symmetric or not (semi-)definite, or K and M are swapped.
+        Negative eigenvalues of K are accepted where they move the structure as a rigid body.
 
     Warns
     -----
     FlexplantWarning
-        When K comes in single precision and its rounding holds rigid-body motions, or endangers
-        the first elastic eigenvalue; or no DOF is as fast as a machine's: swapped K and M?
+        When K is in single precision and its rounding holds rigid-body motions or changes the first
+        elastic eigenvalue; or when every DOF is too slow for a machine, which may mean that K and M
+        are swapped.
 
     References
     ----------
@@ -96,7 +97,7 @@ class FEModel(Placed, Value):
     joint_motions: FloatArray | None = field(default=None, kw_only=True)
     joining: Value | None = field(default=None, kw_only=True)
 
-    if TYPE_CHECKING:  # what comes in is anything array-like
+    if TYPE_CHECKING:  # the input is any array-like object
 
         def __init__(
             self,
@@ -114,7 +115,7 @@ class FEModel(Placed, Value):
     def __post_init__(self) -> None:
         n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
         if not n:
-            raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
+            raise ModelError("the DofSet is empty, it needs at least one DOF. Check the table.")
         instance(self.name, str | None, "name", "Pass text for reports.")
         digits = digits_of(self.K)
         M, K = symmetric_matrix(self.M, "M", n), symmetric_matrix(self.K, "K", n)
@@ -122,7 +123,7 @@ class FEModel(Placed, Value):
         if not is_positive_definite(M):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
-        # a pattern that they have in common lies in memory once
+        # a common sparsity pattern is stored once
         self.__dict__.update(M=with_pattern_of(self.M, self.K), D=with_pattern_of(self.D, self.K))
         try:
             check_semidefinite(K, "K")
@@ -165,11 +166,12 @@ class FEModel(Placed, Value):
     def rigid_body(self) -> FloatArray:
         """The rigid-body motions (n, r), ``K R = 0`` and ``R^T M R = I``.
 
-        From the coordinates, hence exact: translations first, then rotations about the centre of
-        gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0) when held. Pieces
-        that neither K nor M joins have their own each, the largest piece first. Where coordinates
-        have few digits (down to four), rotations are the null vectors of K next to theirs; what a
-        spring holds, however softly, has none.
+        They follow from the coordinates and are therefore exact: translations first, then rotations
+        about the centre of gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0)
+        when held. Pieces that neither K nor M joins each have their own, the largest piece first.
+        Where coordinates have few digits (down to four), rotations are the null vectors of K
+        closest to the geometric ones. A motion that is held by a spring, however soft, is not
+        included.
         """
         return np.asarray(
             frozen(rigid_body_basis(self.M, self.K, self.body_motions, self.dofs.xyz))
@@ -181,14 +183,14 @@ class FEModel(Placed, Value):
         if self.joint_motions is None:
             motions = body_motions(self.M, self.K, self.dofs)
         else:
-            # a mass or held DOFs may have been added since the machine was joined
+            # masses or held DOFs may have been added after joining
             given = nearest_free(self.K, self.joint_motions)
             motions = orthonormalised(self.M, given, dependent="drop")
         return np.asarray(frozen(motions))
 
     @cached_property
     def n_unstable(self) -> int:
-        """How many rigid-body motions springs of negative stiffness make unstable."""
+        """Number of rigid-body motions that springs of negative stiffness make unstable."""
         if self.rigid_body.shape[1] == self.body_motions.shape[1]:
             return 0
         return int(unstable_stiffness(self.K, self.body_motions).size)
@@ -200,7 +202,8 @@ class FEModel(Placed, Value):
     def ground_inertia(self, ground: FloatArray) -> FloatArray:
         """Return the load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
 
-        About the origin: x, y, z, rx, ry, rz. Of DOFs held by `fixed` the coupling is known.
+        The motion is about the origin: x, y, z, rx, ry, rz. The coupling is known for DOFs held by
+        `fixed`.
         """
         load = self.inertia(self.rigid_motions() @ ground)
         return load if self.held_inertia is None else load + self.held_inertia @ ground
@@ -238,7 +241,7 @@ class FEModel(Placed, Value):
         Parameters
         ----------
         damping : ModalDamping, Rayleigh or (n, n) matrix [N s/m, ...]
-            The law, or D itself. It takes the place of the D that was there, and of its dampers.
+            Damping law, or D itself. It replaces the previous D, including its dampers.
 
         Raises
         ------
@@ -269,13 +272,13 @@ class FEModel(Placed, Value):
     def with_parts(self, parts: Iterable[Part] | Part) -> FEModel:
         """Return the model with point masses, springs and dampers added.
 
-        Each adds ``weight row^T row`` to M, K or D, the row being the motion it feels, interpolated
-        where its place is between nodes.
+        Each part adds ``weight row^T row`` to M, K or D. The row gives the motion at the part,
+        interpolated where its place is between nodes.
 
         Parameters
         ----------
         parts : PointMass, Spring, Damper, or a sequence of them
-            What is added.
+            Parts to add.
 
         Examples
         --------
@@ -285,7 +288,7 @@ class FEModel(Placed, Value):
         <FEModel 'chain': 2 DOFs, sparse, no rigid-body motions, D given>
         """
         added = added_matrices(self.dofs, parts)
-        # sums of definite matrices are definite: nothing to check again
+        # sums of definite matrices are definite, so that no new check is needed
         return self._with(
             **{name: frozen(matrix_sum(getattr(self, name), more)) for name, more in added.items()}
         )
@@ -293,9 +296,8 @@ class FEModel(Placed, Value):
     def fixed(self, labels: Iterable[str]) -> FEModel:
         """Return the model with some DOFs held still: their rows and columns are taken out.
 
-        Places between nodes stay known where they were, and so does the load that the mass of the
-        held DOFs makes when the ground moves (`held_inertia`); parts that are added later load
-        their free DOFs only.
+        Places between nodes stay known, and so does the load that the mass of the held DOFs makes
+        when the ground moves (`held_inertia`). Parts that are added later load free DOFs only.
 
         Parameters
         ----------
@@ -336,15 +338,15 @@ class FEModel(Placed, Value):
     def converted(
         self, *, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
     ) -> FEModel:
-        """Return the model in SI units, its numbers being in the given ones now.
+        """Return the model in SI units, from numbers in the given units.
 
         Coordinates are scaled as well; rotations are in radians before and after.
 
         Parameters
         ----------
         length, mass, time : str or float
-            The units of the numbers, "mm", "t", "s" say, or their size in m, kg and s. Forces
-            follow: mm, t and s give N.
+            Present units, such as "mm", "t", "s"; or the size of one unit in SI. Forces follow: mm,
+            t and s give N.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Rigid-body motions by the geometry, the mass in them, soft springs on them; places of models."""
+"""Rigid-body motions from the geometry, their mass, soft springs on them; places of models."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from ..sparse.symmetric import (
 )
 from ..tolerances import NULL, ROUNDING, TYPED, divisor
 
-#: times the usual rounding of a row: a force larger than this is of a spring
+#: multiple of the usual rounding of a row above which a force belongs to a spring
 _OUTLIER = 30.0
-#: part of all DOFs: forces at fewer are of springs, not of rounding
+#: fraction of all DOFs: forces at fewer DOFs belong to springs, not to rounding
 _FEW, _FEW_ROWS = 0.02, 6
-#: in relative roundings of the entries: an energy larger than this may be of springs
+#: energy, in relative roundings of the entries, above which springs may be present
 ENERGY = 90.0
-#: times the root of the summed squares of the work at each DOF: springs everywhere add up, rounding
-#: of either sign does not
+#: multiple of the root of summed squares of the work at the DOFs: work of distributed springs adds
+#: up, rounding of either sign does not
 _COHERENT = 4.0
 
 
@@ -43,16 +43,16 @@ def unheld(
     K: Matrix, motions: FloatArray, rounding: float = PRECISION, far: float = 1.0
 ) -> FloatArray:
     """Return the combinations (r, m) of almost force-free motions (n, r) that no spring holds."""
-    # rounding of K leaves forces at all DOFs, of about the same size relative to what cancels
-    # there. A few springs leave larger ones at a few DOFs, however soft they are; springs
-    # everywhere, a bed, leave work of one sign, which sums to an energy above that of rounding
+    # rounding of K leaves forces at all DOFs, of about the same size relative to the terms that
+    # cancel. A few springs, however soft, leave larger forces at a few DOFs. Distributed springs do
+    # work of one sign, whose sum is an energy above that of rounding
     mix = np.eye(motions.shape[1])
     if not motions.size:
         return mix
     size_of_K = Absolute(K)
     mix = mix @ _beside_few_springs(K, size_of_K, motions, max(rounding, PRECISION * far))
     if mix.shape[1]:
-        # errors of coordinates are of second order in the energy
+        # errors of coordinates have a second-order effect on the energy
         mix = mix @ _beside_many_springs(K, size_of_K, motions @ mix, rounding)
     return mix
 
@@ -68,7 +68,7 @@ def _beside_few_springs(
     rows = np.flatnonzero(np.any(part > _OUTLIER * usual, axis=1))
     if not rows.size or rows.size > max(_FEW * n, min(_FEW_ROWS, n // 4)):
         return np.eye(r)
-    # each row in terms of its rounding, so that springs of any two stiffnesses compare
+    # each row in units of its rounding, so that springs of any stiffness compare
     held = np.asarray(K[rows] @ motions) / most[rows].max(axis=1, keepdims=True)
     values = np.zeros(r)
     _, found, right = la.svd(held)
@@ -80,7 +80,7 @@ def _beside_few_springs(
 def _beside_many_springs(
     K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float
 ) -> FloatArray:
-    """Return the combinations (r, m) without an energy that is more than rounding."""
+    """Return the combinations (r, m) whose energy is within rounding."""
     moved = np.abs(motions)
     most = np.sqrt(np.einsum("ij,ij->j", moved, size_of_K @ moved))
     most = divisor(most)
@@ -92,14 +92,14 @@ def _beside_many_springs(
 
 
 def _held_everywhere(K: Any, motions: FloatArray, energy: FloatArray, rounding: float) -> Any:
-    """Return which motions (r,) cost a relative `energy` to which all DOFs add."""
+    """Return which motions (r,) have a relative `energy` to which all DOFs contribute."""
     work = motions * np.asarray(K @ motions)
     coherent = work.sum(axis=0) > _COHERENT * np.linalg.norm(work, axis=0)
     return (energy > ENERGY * rounding) & coherent
 
 
 def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
-    """Return combinations (r, m): the motions themselves where as many of them are untouched."""
+    """Return combinations (r, m): single motions where enough of them are unaffected."""
     if np.count_nonzero(untouched) == null.shape[1]:
         return np.eye(untouched.size)[:, untouched]
     return null
@@ -107,19 +107,19 @@ def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
 
 def _uncancelled_forces(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest."""
-    # so that rounding is seen in proportion also where a motion passes through zero
+    # so that rounding stays in proportion where a motion passes through zero
     most = np.abs(motions).max(axis=0, initial=0.0)
     return np.asarray((size_of_K @ np.ones((motions.shape[0], 1))) * most)
 
 
-#: more motions of all bodies together than this are not listed: full columns would fill the memory
+#: largest number of motions of all bodies together; more full columns would fill the memory
 _MOST_MOTIONS = 2000
 
 
 def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
     """Return the number (n,) of the piece each DOF belongs to, 0 being the largest."""
-    # pieces are joined by no entry of K or M, the DOFs of one node counting as joined
-    # step by step, each among the parts found before: most structures are whole after the first
+    # pieces are joined by no entry of K or M, the DOFs of one node counting as joined in steps,
+    # each within the parts found before; most structures are one piece after the first
     label: Any = csgraph.connected_components(sp.csr_array(by_rows(K)), directed=False)[1]
     if M is not None and label.max(initial=0) > 0:
         entries = sp.coo_array(M)
@@ -136,9 +136,9 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
 
 def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
     """Return the DOFs of each body: of the pieces that nothing joins, the largest first."""
-    # a mass that no stiffness joins to anything is a body, a single DOF that only ground holds is
-    # none. DOFs with neither mass nor stiffness go with the first. Where the bodies may have more
-    # than 2000 motions, all DOFs are taken together
+    # a mass without any stiffness is a body; a single DOF held only by the ground is not a body.
+    # DOFs with neither mass nor stiffness belong to the first body. Where the bodies may have more
+    # than 2000 motions, all DOFs form one body
     piece = pieces(K, M, dofs)
     stiffness = diagonal(K)
     there = np.abs(stiffness) > 0
@@ -163,15 +163,15 @@ def _join_parts(label: IntArray, one: Any, other: Any) -> IntArray:
     return np.asarray(csgraph.connected_components(graph.tocsr(), directed=False)[1][label])
 
 
-#: ||K r|| below this, relative to || |K| |r| ||, is rounding: the motion r costs no energy
+#: ||K r|| relative to || |K| |r| || below which a motion r costs no energy
 FREE = 1e-10
-#: the same for motions that coordinates of few digits keep from being free: worth a closer look
+#: the same for motions held only because coordinates have few digits: these are examined further
 _NEARLY = 1e-2
-#: largest force of such a motion at any DOF, of the largest that its parts make anywhere
+#: largest force of such a motion at any DOF, relative to the largest force of its terms
 _EVERYWHERE = 3e-4
-#: steps of inverse iteration from the geometry's motions to the null vectors of K
+#: number of steps of inverse iteration from geometric motions to the null vectors of K
 _STEPS = 4
-#: part of a motion that may be lost on this way
+#: fraction of a motion that may be lost in these steps
 ASIDE = 1e-3
 
 
@@ -202,9 +202,10 @@ def turned_about(direction: str, about: FloatArray) -> FloatArray:
 
 
 def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
-    """Return how far a place moves (6,) with each of the six rigid-body motions about the origin.
+    """Return the displacement (6,) of a place in the six rigid-body motions about the origin.
 
-    By its coordinates, not by shapes: a place next to a held DOF moves with the ground too.
+    It follows from the coordinates, not from shapes: a place next to a held DOF moves with the
+    ground too.
     """
     if isinstance(at, Mapping):
         parts = [weight * place_motion(dofs, place, direction) for place, weight in at.items()]
@@ -219,7 +220,7 @@ def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
 
 
 def farness(xyz: FloatArray) -> float:
-    """Return the largest coordinate of a body, in terms of its size; at least 1."""
+    """Return the largest coordinate of a body relative to its size; at least 1."""
     size = float(np.ptp(xyz, axis=0).max()) if xyz.size else 0.0
     return max(1.0, float(np.abs(xyz).max()) / size) if size else 1.0
 
@@ -234,7 +235,7 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     for rows in bodies(K, M, dofs):
         whole = rows.size == len(dofs)
         own = part if whole else part[rows][:, rows]
-        # independent ones only: some are absent, and with few DOFs some of the six coincide
+        # only independent ones: some are missing, and with few DOFs some of the six coincide
         moved = orthonormalised(own, motions[rows], dependent="drop")
         found.append(moved if whole else np.zeros((len(dofs), moved.shape[1])))
         found[-1][rows] = moved
@@ -242,7 +243,7 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
 
 
 def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
-    """Return motions (n, r) without the little by which they stretch a structure: few digits."""
+    """Return motions (n, r) without the small stretching caused by coordinates of few digits."""
     # ``m - K^+ K m`` is the null vector of K next to m; of a large K inverse iteration finds it
     if not motions.size:
         return motions
@@ -259,7 +260,7 @@ def nearest_free(K: Matrix, motions: FloatArray) -> FloatArray:
         found = given
         for _ in range(_STEPS):
             found = solve(NULL * found)
-        # what is held has shrunk; rounding moves null vectors within their space alone
+        # held motions have shrunk; rounding moves null vectors only within their space
         kept = found[:, np.linalg.norm(found, axis=0) > 0.5 * np.linalg.norm(given, axis=0)]
         change = scale[:, None] * (given - kept @ np.linalg.lstsq(kept, given)[0])
     size = divisor(np.linalg.norm(motions, axis=0))
@@ -297,8 +298,8 @@ def _bodies_of(motions: FloatArray) -> list[tuple[IntArray, IntArray]]:
 def free_motions(
     M: Matrix, K: Matrix, motions: FloatArray, far: float, rounding: float = PRECISION
 ) -> FloatArray:
-    """Return the M-orthonormal motions of one body that cost no energy but that of `rounding`."""
-    # of entries of K, relatively; what coordinates of few digits cost is taken out
+    """Return the M-orthonormal motions of one body whose energy is at most `rounding`."""
+    # the relative rounding of the entries of K; energy due to coordinates of few digits is removed
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)
     size_of_K = Absolute(K)
@@ -309,7 +310,7 @@ def free_motions(
     free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
         return _not_held(M, K, motions, far, rounding)
-    # of the small triangle: the left factor of all DOFs would be a full square matrix
+    # decompose the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
     values[: found.size] = found
@@ -322,7 +323,7 @@ def free_motions(
     if not near.shape[1]:
         return basis
     nearly = motions @ (near / scale[:, None])
-    # those without a large force at any DOF: nothing grounds them
+    # motions without a large force at any DOF are not grounded
     nearly = nearly[:, force_parts(K, nearly) < _EVERYWHERE]
     if not nearly.shape[1]:
         return basis
@@ -347,7 +348,7 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
 
 
 def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:
-    """Return the largest force of each motion (r,), of the largest that its parts make anywhere."""
+    """Return the largest force of each motion (r,) relative to the largest of its terms."""
     rows = by_rows(K)
     weight = 1 / np.sqrt(divisor(diagonal(K)))[:, None]
     force = np.abs(weight * np.asarray(rows @ motions)).max(axis=0)
@@ -364,7 +365,7 @@ def _null_vectors(
     nearly: FloatArray,
     rounding: float,
 ) -> FloatArray:
-    """Return a basis and the null vectors of K next to nearly free motions, if there are such."""
+    """Return a basis, and null vectors of K close to nearly free motions, if there are any."""
     # by inverse iteration, `(K + s M) x' = s M x`: what the last digits of coordinates add are
     # elastic modes, which shrink by s / (lambda + s) each time, and motions without energy stay. A
     # motion that something holds, however softly, keeps its energy and is not rigid
@@ -377,7 +378,7 @@ def _null_vectors(
         for _ in range(_STEPS):
             found = orthonormalised(M, np.asarray(solve(np.asarray(M @ found))))
     except SolverError:
-        return basis  # K is indefinite: the solver of the modes says so
+        return basis  # K is indefinite, which the mode solver reports
     energy = np.asarray(found.T @ np.asarray(K @ found))
     values, mix = la.eigh(0.5 * (energy + energy.T))
     null = found @ mix[:, np.abs(values) < rounding * spread]
@@ -395,7 +396,7 @@ def _null_vectors(
 
 @dataclass(frozen=True)
 class RigidMass:
-    """What M says of the body as a whole; NaN where the DOFs do not determine it."""
+    """Mass properties of the whole body; NaN where the DOFs do not determine them."""
 
     mass: FloatArray
     center: FloatArray
@@ -436,14 +437,14 @@ def rigid_mass(M: Any, dofs: DofSet) -> RigidMass:
     return RigidMass(mass, center, inertia)
 
 
-#: relative: a rigid-body motion that the shapes of a model make up to this is one of theirs. Those
-#: of the lowest modes on springs lack the springs' stiffness over that of the modes left out, 1e-5
-#: for a suspension at 10 Hz below elastic modes at 1 kHz; held structures lack a tenth and more
+#: relative error up to which the shapes of a model contain a rigid-body motion. The lowest modes on
+#: springs have an error of the ratio of spring stiffness to that of truncated modes, 1e-5 for a
+#: suspension at 10 Hz below elastic modes at 1 kHz; held structures have 0.1 and more
 SPANNED = 1e-3
 
 
 class Structure(Protocol):
-    """A model with k coordinates, as a plant needs it: FEModel, Modes and ReducedModel are such."""
+    """Protocol of a model with k coordinates for plants: FEModel, Modes and ReducedModel."""
 
     @property
     def full_dofs(self) -> DofSet:
@@ -490,6 +491,6 @@ class Placed:
 
 
 def relative_miss(made: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return how far motions (n, r) that a model makes are from those wanted, relative to these."""
+    """Return the relative error of motions (n, r) of a model from the wanted ones."""
     size = np.linalg.norm(wanted, axis=0)
     return np.asarray(np.linalg.norm(made - wanted, axis=0) / divisor(size))

@@ -20,7 +20,7 @@ from .thick_elements import beam_parts, edge_share
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GridShape(Interpolation):
-    """What the shape functions on regular grids have in common: where a point is."""
+    """Common base of shape functions on regular grids: location of a point."""
 
     @cached_property
     def _grid(self) -> Grid:
@@ -44,13 +44,13 @@ class GridShape(Interpolation):
         self, point: FloatArray, lengths: Sequence[float], lost: Callable[[], LabelError]
     ) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
         """Return the element of a point, its coordinates (d,) from 0 to 1 and the sizes (d,)."""
-        # on an edge that is the element on the side of larger coordinates, unless it is missing
+        # on an edge, the element on the side of larger coordinates, unless it is missing
         grid = self._grid
         choices: list[list[tuple[int, float]]] = []
         for value, length, count in zip(point.tolist(), lengths, grid.counts, strict=False):
             place = min(max(value / length, 0.0), 1.0) * count
             nearest = round(place)
-            if abs(place - nearest) < 1e-9 * count:  # rounding must not decide on the side
+            if abs(place - nearest) < 1e-9 * count:  # rounding must not decide the side
                 place = float(nearest)
             index = min(int(place), count - 1)
             found = [(index, place - index)]

@@ -74,7 +74,9 @@ def chain(
     m = positive_array(masses, "masses", (None,), hint="Leave massless ones out.")
     n = m.size
     if not n:
-        raise ModelError("masses is empty: a chain needs one mass at least. Pass [1.0], say.")
+        raise ModelError(
+            "masses is empty: a chain needs at least one mass. Pass for example [1.0]."
+        )
     held = real_array(ground, "ground")
     held = np.zeros(n) + positive_array(held, "ground", (n,) if held.ndim else (), zero=True)
     k = _between_masses(stiffnesses, "stiffnesses", n)
@@ -106,7 +108,7 @@ def _laplacian(between: FloatArray, ground: FloatArray) -> sp.csc_array:
     return sp.csc_array(sp.diags_array([-between, main, -between], offsets=[-1, 0, 1]))
 
 
-#: which motions an end does not have
+#: motions that an end holds
 _ENDS = {"free": (), "pinned": ("z",), "clamped": ("z", "ry"), "guided": ("ry",)}
 
 
@@ -126,8 +128,8 @@ def beam(
     """Return a straight beam in bending along x from the origin, by Euler-Bernoulli or Timoshenko.
 
     ``rho A z'' + (E I z_xx)_xx = f``: two-node elements with cubic shape functions and consistent
-    mass. Nodes are numbered from 1; each has the DOFs z [m] and ry = -dz/dx [rad], less those that
-    its end holds. That is good for wave lengths well above ten times the height.
+    mass. Nodes are numbered from 1; each has the DOFs z [m] and ry = -dz/dx [rad], without those
+    that its end holds. The model is accurate for wave lengths well above ten times the height.
 
     With `poisson_ratio` the beam shears and its sections have inertia: ``rho A z'' = (k G A (z_x -
     t))_x``, ``rho I t'' = (E I t_x)_x + k G A (z_x - t)``, in elements that are exact in statics
@@ -159,7 +161,7 @@ def beam(
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, an end is unknown, or nothing is left to move.
+        When a number is not physical, an end is unknown, or no DOF is free.
 
     Examples
     --------
@@ -228,7 +230,7 @@ def kirchhoff_plate(
     poisson_ratio: Field,
     name: str | None = None,
 ) -> FEModel:
-    """Return a free rectangular thin plate in bending: no shear, no rotary inertia (`plate` has).
+    """Return a free thin rectangular plate in bending, without shear and rotary inertia.
 
     Four-node non-conforming elements with the complete cubic and x^3 y, x y^3 (Adini, Clough and
     Melosh), stiffness and consistent mass integrated exactly. The plate lies in the x-y plane with
@@ -277,7 +279,7 @@ def kirchhoff_plate(
     a, b = lengths[0] / counts[0], lengths[1] / counts[1]
     bending = E * h**3 / (12 * (1 - nu**2))
     shape = PlateShape((lengths[0], lengths[1]), h, (counts[0], counts[1]))
-    # sums of definite elements are definite: nothing to check again
+    # sums of definite elements are definite, so that no new check is needed
     return FEModel._proven(
         M=grid.matrix([(plate_mass(a, b), rho * h)]),
         K=grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, nu)),
@@ -308,7 +310,7 @@ def solid_block(
 
     Trilinear displacements with incompatible modes inside each element (Wilson and Taylor), so that
     bending is not locked; consistent mass. Nodes are numbered from 1, x fastest, then y, z; each
-    has the DOFs x, y, z [m]. Beside holes, nodes keep the numbers of the full block.
+    has the DOFs x, y, z [m]. With holes, nodes keep the numbers of the full block.
 
     Parameters
     ----------

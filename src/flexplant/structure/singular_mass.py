@@ -61,10 +61,10 @@ def massless_dofs(motions: FloatArray, M: Any) -> IntArray:
 def condense_massless(
     K: Any, M: Any, D: Any, motions: FloatArray, names: Callable[[IntArray], tuple[str, ...]]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
-    """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which."""
-    # where N has no inertia, `N^T K q = 0` at every frequency. It gives q of the DOFs, s, by the
-    # others, `q_s = -(N^T K)_s^-1 (N^T K)_m q_m`: exact, all finite eigenvalues stay, and the DOFs
-    # that are kept keep their meaning
+    """Return K, M, D on the motions with inertia, in n - q of the DOFs, and these DOFs."""
+    # for motions N without inertia, `N^T K q = 0` at every frequency. It determines q of the DOFs,
+    # s, from the others: `q_s = -(N^T K)_s^-1 (N^T K)_m q_m`. This is exact, all finite eigenvalues
+    # stay, and the kept DOFs keep their meaning
     n, q = motions.shape
     if n > LARGEST_FULL:
         raise ModelError(
@@ -128,8 +128,9 @@ def inertial(
             listed = ", ".join(repr(name) for name in some[:6])
             more = f" ({len(some)} in all)" if len(some) > 6 else ""
             raise ModelError(
-                f"DOFs without mass: {listed}{more}. They have no motion of their own. Condense "
-                "them, which is exact: model(massless='condense'); or give them their mass."
+                f"DOFs without mass: {listed}{more}. They follow the other DOFs statically. "
+                "Condense them, which is exact: model(massless='condense'); or give them their "
+                "mass."
             )
         K, M, D = condensed(K, M, D, without, names)
         rows = np.flatnonzero(~without)
@@ -151,9 +152,9 @@ def inertial(
     return Inertial(K, M, D, rows, notes)
 
 
-#: number of columns of K_ss^-1 K_sm at once: more of them no longer fit the cache
+#: number of columns of K_ss^-1 K_sm processed together, so that they fit the cache
 _COLUMNS = 256
-#: that many DOFs next to massless ones fill a block that no longer fits the memory comfortably
+#: largest number of DOFs next to massless ones, limited by the memory of the block that they fill
 _TOO_MANY = 10_000
 
 

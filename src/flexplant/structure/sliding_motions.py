@@ -1,4 +1,4 @@
-"""Slides: motions that cost no energy beyond those of the geometry, as drives need them."""
+"""Slides: motions without energy that are not rigid-body motions, as drives need them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from .model import FEModel
 
 
 def slides(model: FEModel) -> dict[str, FloatArray]:
-    """Return the motions without energy that no rigid-body motion makes, each named by a DOF.
+    """Return the motions without energy that are not rigid-body motions, each named by a DOF.
 
-    A carriage on a guide, a joint, a screw: what a drive moves is free. An import holds it as a
-    zero-energy motion, which `solve_modes` takes for a mechanism until it is said to be meant.
+    A drive moves a carriage on a guide, a joint or a screw, so that this motion is free. In an
+    imported model it is a zero-energy motion, which `solve_modes` refuses as a mechanism until it
+    is declared a slide.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
     if model.n_dof > DENSE_LIMIT:
         raise ModelError(
             f"slides are found of at most {DENSE_LIMIT} DOFs, the model has {model.n_dof}: reduce "
-            "it first, or pass joint_motions= of your own."
+            "it first, or pass your own joint_motions=."
         )
     scaled, scale = unit_diagonal(model.K)
     values, vectors = la.eigh(dense(scaled))
@@ -66,13 +67,14 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
 
 
 def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
-    """Return a model whose slides are meant: motions at 0 Hz of `solve_modes`, as `slides` names.
+    """Return a model whose slides are accepted as motions at 0 Hz by `solve_modes`.
 
     Parameters
     ----------
     model : FEModel
     names : sequence of str, optional
-        Those that are meant; all when not given. Others stay mechanisms, which are refused.
+        Labels of the accepted slides (see `slides`); all by default. Others stay mechanisms, which
+        are refused.
 
     Raises
     ------

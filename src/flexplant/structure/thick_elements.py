@@ -17,9 +17,9 @@ from ..arrays import FloatArray
 # exact Timoshenko beam ([FriedmanKosmatka1993]_). In a plate both carry over linearly to the
 # opposite edge: the element of [Katili1993]_ on a rectangle. f = 1 is an edge that does not shear.
 
-#: points in each direction that integrate products of two cubics exactly
+#: number of points in each direction, which integrates products of two cubics exactly
 _POINTS = 4
-#: which pairs of corners are the edges along x and along y, and the DOF and sign of their slope
+#: pairs of corners of the edges along x and along y, and the DOF and sign of their slope
 _EDGES = ((((0, 1), (2, 3)), 2, -1.0), (((0, 2), (1, 3)), 1, 1.0))
 
 
@@ -167,7 +167,7 @@ def plate_terms(
 
 
 def _collected(terms: Terms) -> Terms:
-    """Return the terms as one where all weights are numbers."""
+    """Return the sum of the terms where all weights are numbers."""
     if any(np.ndim(weight) for _, weight in terms):
         return terms
     return [(np.asarray(sum(weight * matrix for matrix, weight in terms)), 1.0)]

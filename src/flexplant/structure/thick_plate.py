@@ -89,7 +89,7 @@ def plate(
     poisson_ratio : float, (nx, ny) array or function [-]
         Above -1 and below 0.5.
     shear_factor : float, optional
-        k of the shear stiffness k G h; 5/6 of a plate whose shear stress is a parabola over the
+        k of the shear stiffness k G h; 5/6 for a plate whose shear stress is a parabola over the
         thickness. None: the plate does not shear, but its sections have inertia.
     name : str, optional
 
@@ -105,8 +105,8 @@ def plate(
 
     See Also
     --------
-    kirchhoff_plate : the thin plate; its frequencies are 3 to 5 % too high where a wave is fifteen
-        times as long as the plate is thick.
+    kirchhoff_plate : the thin plate; its frequencies are 3 to 5 % too high at a wave length of
+    fifteen times the thickness.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def plate(
     )  # fmt: skip
     grid = Grid(counts, 3, np.ones(counts[::-1], dtype=bool))
     shape = ThickPlateShape((lengths[0], lengths[1]), h, (counts[0], counts[1]), softness=soft)
-    # sums of definite elements are definite: nothing to check again
+    # sums of definite elements are definite, so that no new check is needed
     return FEModel._proven(
         M=grid.matrix(M),
         K=grid.matrix(K),

@@ -1,4 +1,4 @@
-"""Natural frequencies of matrices alone: neither names nor places of their rows are needed."""
+"""Natural frequencies of matrices without names or places of their rows."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..errors import ModelError, SolverError
 from ..sparse.lowest import lowest_modes, multifrontal_inertia
 from ..tolerances import TINY
 
-#: frequencies beyond those asked for, among which a gap to count in is looked for
+#: number of additional frequencies among which a gap for the count is searched
 _EXTRA = 4
-#: frequencies that are given at most: inverse iteration keeps all shapes at once
+#: largest number of frequencies, since inverse iteration stores all shapes
 MOST = 60
-#: residual of a shape relative to the largest forces in it
+#: largest residual of a shape relative to its largest forces
 _RESIDUAL = 1e-8
 
 
@@ -29,7 +29,8 @@ def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> Float
     values, shapes = values[order], shapes[:, order]
     if found.negative is not None or np.any(values[found.n_zero :] <= 0):
         raise ModelError(
-            "K has motions of negative energy: no stiffness of a structure. check(matrices) names "
+            "K has motions of negative energy and cannot be the stiffness of a structure. "
+            "check(matrices) names "
             "them."
         )
     values[: found.n_zero] = 0.0

@@ -16,7 +16,7 @@ from ..sparse.symmetric import diagonal
 from ..tolerances import TYPED
 from .rigid import RigidMass
 
-#: one unit of it in metres, kilograms, seconds
+#: size of each unit in metres, kilograms, seconds
 LENGTHS: Mapping[str, float] = {
     "m": 1.0,
     "dm": 0.1,
@@ -110,28 +110,33 @@ def _unit_size(given: Any, name: str, known: Mapping[str, float]) -> float:
         return positive(given, name)
     if given not in known:
         raise ModelError(
-            f"{name} {short(given)} is no unit known here: {', '.join(known)}. Pass one of these, "
+            f"{name} {short(given)} is not a known unit: {', '.join(known)}. Pass one of these, "
             f"or the size of the unit in {next(iter(known))} as a number."
         )
     return known[given]
 
 
-#: nodes that a mesh has at least; lumped models have no waves, and hardly a density
+#: least number of nodes of a mesh; lumped models have no waves and no meaningful density
 _MESH, _LUMPED = 20, (1e-5, 1e5)
 #: density [kg/m^3] in the box around all DOFs, or in the cube of its diagonal where it is flat
 _DENSITY, _FLAT = (5.0, 3e4), (1e-2, 3e4)
-#: speed of longitudinal waves [m/s] in what machines are made of, and in a plate over its density
+#: speed of longitudinal waves [m/s] in machine materials, and this speed over density for a plate
 _SPEED, _PER_DENSITY = (300.0, 2e4), (0.1, 40.0)
 #: sqrt(K_ii / M_ii) times the distance h of nodes, over the speed c, in a mesh of cubes
 _SOLID = 2.42
 #: sqrt(K_ii / M_ii) h^2 over the thickness times c, of transverse motion in a mesh of plates
 _PLATE = 2.02
-#: what the numbers may be in place of SI: factors of density and of speed that it would explain
+#: possible mistakes of units: factors of density and of wave speed that they would explain
 _UNITS = (
     (-9, 3.0, "the coordinates are in mm, the rest in SI", "dofs.replace(xyz=dofs.xyz / 1000)"),
-    (-12, 3.0, "all is in mm, t and s (N, MPa)", "converted(length='mm', mass='t')"),
+    (-12, 3.0, "all values are in mm, t and s (N, MPa)", "converted(length='mm', mass='t')"),
     (-9, 1.5, "lengths are in mm, K in N/mm, but M in kg", "divide M by 1000: mm, t, s"),
-    (-9, 0.0, "all is in mm, kg and ms (kN)", "converted(length='mm', mass='kg', time='ms')"),
+    (
+        -9,
+        0.0,
+        "all values are in mm, kg and ms (kN)",
+        "converted(length='mm', mass='kg', time='ms')",
+    ),
     (0, -1.5, "K is in N/mm, the rest in SI", "multiply K by 1000"),
     (0, 1.5, "K is 1000 times too large", "divide K by 1000"),
     (-3, 1.5, "M is in t, the rest in SI", "multiply M by 1000"),
@@ -140,7 +145,7 @@ _UNITS = (
 
 
 def unusual(given: Any, body: RigidMass) -> tuple[str, str] | None:
-    """Return what is odd about density and wave speed of FEMatrices, and what to do, or None."""
+    """Return a text on implausible density or wave speed of FEMatrices and what to do, or None."""
     # the speed follows from neighbours: `c = sqrt(K_ii / M_ii) h / 2.4` in solids, h the distance
     # of nodes. A plate of areal mass m'' that has transverse motion only shows
     # `c / density = sqrt(K_ii / M_ii) h^2 / (2 m'')`. Both come from local entries: supports do not
@@ -182,7 +187,7 @@ def unusual(given: Any, body: RigidMass) -> tuple[str, str] | None:
         return None
     within = "the box of all DOFs" if filled else "a cube of its size"
     text = f"{density:.3g} kg/m^3 in {within}" + (f", {shown}" if shown else "")
-    # of a plate the speed over the density counts, and its density is that of a thinner one
+    # for a plate the ratio of speed to density counts, and its density is that of a thinner plate
     explained = [
         (cause, step)
         for mass_power, speed_power, cause, step in _UNITS
@@ -193,7 +198,7 @@ def unusual(given: Any, body: RigidMass) -> tuple[str, str] | None:
         )
     ]
     if not explained:
-        return f"{text}: no material is like that", "K, M and coordinates in different units?"
+        return f"{text}: this fits no material", "K, M and coordinates in different units?"
     return (
         f"{text}: as if {' or '.join(cause for cause, _ in explained[:3])}",
         "; or ".join(step for _, step in explained[:3]),

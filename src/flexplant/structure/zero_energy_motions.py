@@ -1,4 +1,4 @@
-"""Motions without energy: rigid-body motions, mechanisms, what is grounded or held by rounding."""
+"""Motions without energy: rigid-body motions, mechanisms, grounded motions, effects of rounding."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal, orthonormalised
 from ..tolerances import SAME, divisor
 from .rigid import ASIDE, bodies, farness, force_free, free_motions, rigid_motions
 
-#: DOFs of a mechanism that move at least this fraction of the most moving one
+#: motion of a DOF of a mechanism, relative to the largest one, above which it is listed
 _MOVES = 0.05
 
 
 @dataclass(frozen=True)
 class ZeroEnergy:
-    """How the motions of zero energy compare with those the geometry allows."""
+    """Comparison of zero-energy motions with those that the geometry allows."""
 
     free: tuple[str, ...]
     grounded: tuple[str, ...]
@@ -95,12 +95,12 @@ def _of_bodies(
 
 
 def _metric(K: Any) -> Any:
-    """Return a mass (n, n) by which motions are normalised whose span alone counts, M or none."""
+    """Return a mass (n, n) that normalises motions of which only the span matters: M or None."""
     return sp.diags_array(divisor(np.abs(diagonal(K))), format="csc")
 
 
 def own_motions(M: Any, motions: FloatArray) -> FloatArray:
-    """Return independent motions (n, r) of a body: those of its model where M makes one."""
+    """Return independent motions (n, r) of a body, from its model where M allows one."""
     independent = _independent(motions[:, np.any(motions != 0, axis=0)])
     if M is not None:
         try:
@@ -145,7 +145,7 @@ def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     part = np.asarray(K @ R)
     full = dense(K) - part @ loaded.T
     full = full - loaded @ (R.T @ full)
-    # once more, so that what is left of K R is rounding of the result, not of the first pass
+    # again, so that the remaining K R is rounding of the result, not of the first pass
     full = full - (full @ R) @ loaded.T
     return np.asarray(0.5 * (full + full.T), dtype=np.float64)
 
@@ -168,7 +168,7 @@ def nonrigid(zero_modes: FloatArray, rigid: FloatArray, extra: int | None = None
 
 
 def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> float | None:
-    """Return the factor on the coordinates with which rotations would cost no energy, if any."""
+    """Return the factor on the coordinates that would make rotations free of energy, if any."""
     turning = dofs.kinds >= 3
     if motions.shape[1] < 6 or not turning.any() or turning.all():
         return None
@@ -185,26 +185,26 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
         # rounding of forces that cancel between stiff elements
         if rest < 1e-6 * np.linalg.norm(by_turning) and factor > 0:
             factors.append(factor)
-    # one factor, and not 1
+    # a single factor that is not 1
     if not factors or np.ptp(factors) > 1e-3 * factors[0] or abs(factors[0] - 1) < 1e-3:
         return None
     return float(np.mean(factors))
 
 
-#: relative error of the first elastic eigenvalue from which on it is worth a warning
+#: relative error of the first elastic eigenvalue above which a warning is given
 _WORTH = 1e-4
-#: relative errors of entries of K that are noticed, and that are rounding still
+#: relative errors of entries of K: reported above the first, rounding below the second
 _FINE, _COARSE = 3e-12, 1e-4
-#: rows that a motion loads, for a median of their forces
+#: least number of loaded rows for a median of their forces
 _ROWS = 12
 
 
-#: a text of this many digits loses nothing of a double
+#: number of digits with which a text represents double precision exactly
 _ALL_DIGITS = 16
 
 
 def shown_digits(K: Any, dofs: DofSet) -> int | None:
-    """Return to how many digits the entries of K are right, None where they are to more than 11."""
+    """Return the number of correct digits of the entries of K, None where it is above 11."""
     # rigid translations t cost no energy, so that `K t` is rounding: in every row, of either sign.
     # Springs to ground act in few rows, or with the motion. Errors uniform up to a relative d leave
     # `|K t|_i = 0.39 d (sum_j K_ij^2 t_j^2)^(1/2)` in the median
@@ -228,7 +228,7 @@ def shown_digits(K: Any, dofs: DofSet) -> int | None:
 
 def loss(found: Lowest, digits: int) -> float | None:
     """Return the relative error of the first elastic eigenvalue that `digits` digits allow."""
-    # `10^-digits |phi|^T |K| |phi| / lambda`: rounding each entry of K by that much
+    # `10^-digits |phi|^T |K| |phi| / lambda`: effect of rounding each entry of K
     if found.n_zero >= found.values.size:
         return None
     first = found.n_zero
@@ -236,7 +236,7 @@ def loss(found: Lowest, digits: int) -> float | None:
 
 
 def endangered(K: Any, M: Any, digits: int) -> str | None:
-    """Return what to say when the digits of K endanger the first elastic eigenvalue."""
+    """Return a text when the digits of K are too few for the first elastic eigenvalue."""
     if digits >= _ALL_DIGITS:
         return None
     with attempted("the check of the digits of K by its lowest modes", SolverError):
@@ -246,7 +246,7 @@ def endangered(K: Any, M: Any, digits: int) -> str | None:
 
 
 def verdict(error: float | None, digits: int) -> str | None:
-    """Return what to say of an error of the first elastic eigenvalue, None when it is harmless."""
+    """Return a text on an error of the first elastic eigenvalue, None when it is harmless."""
     if error is None or error <= _WORTH:
         return None
     percent = f"up to {100 * error:.2g} %" if error < 1 else "wholly"
@@ -260,7 +260,7 @@ def verdict(error: float | None, digits: int) -> str | None:
 def held_by_rounding(
     K: Any, M: Any, dofs: DofSet, digits: int, found: FloatArray | None = None
 ) -> str | None:
-    """Return what to say when only rounding of the entries of K holds rigid-body motions."""
+    """Return a text when only rounding of the entries of K holds rigid-body motions."""
     nearly = nearly_free(K, M, dofs, digits).shape[1]
     metric = _metric(K)
     if found is not None and force_free(metric, K, orthonormalised(metric, found)):
