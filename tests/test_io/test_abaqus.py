@@ -139,7 +139,7 @@ def test_rows_of_all_matrices_are_those_of_any(tmp_path):
     ("old", "new", "error", "match"),
     [
         ("12,3, 1,2", "-3,1, 1,2", ModelError, r"internal nodes \[-3\]: Lagrange"),
-        ("12,3, 1,2", "12,8, 1,2", ModelError, r"no displacement or rotation \(\[8\]"),
+        ("12,3, 1,2", "12,8, 1,2", ModelError, r"other than displacements and rotations \(\[8\]"),
         ("12,3, 1,2", "12,3, 1,x", FlexplantError, r"line 4: 'node, dof, node, dof, value'"),
         ("12,3, 1,2", "12.5,3, 1,2", FlexplantError, "line 4"),
         ("12,3, 1,2", "99999999999999999999,3, 1,2", FlexplantError, "line 4"),

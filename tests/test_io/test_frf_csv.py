@@ -125,5 +125,5 @@ def test_units_in_the_encoding_of_older_programs(tmp_path, encoding):
     assert found.inputs == ("u1", "Tür")
     assert np.array_equal(found.data, frf.data)
     (tmp_path / "damaged.csv").write_bytes(text.encode("latin-1") + b"\x00\xff")
-    with pytest.raises(FlexplantError, match="no text of UTF-8"):
+    with pytest.raises(FlexplantError, match="is not UTF-8 text"):
         read_frf_csv(tmp_path / "damaged.csv")

@@ -220,9 +220,7 @@ def test_several_matrices_with_usual_names_must_be_named(tmp_path, seed):
     scipy.io.savemat(tmp_path / "m.mat", held)
     np.savez(tmp_path / "m.npz", **held)
     for path in (tmp_path / "m.mat", tmp_path / "m.npz"):
-        with pytest.raises(
-            ModelError, match=rf"any of which may be the {kind}\. Say which"
-        ) as said:
+        with pytest.raises(ModelError, match=rf"any of which may be the {kind}\. Name one") as said:
             fx.read_matrices(path)
         assert all(repr(name) in str(said.value) for name in names[kind])
     for name in names[kind]:

@@ -175,7 +175,7 @@ def test_digits_and_names(op4, tmp_path):
     with pytest.raises(LabelError, match="no matrix 'X'"):
         read_op4_matrices(path, names="X")
     op4.write(path, {"A": K})
-    with pytest.raises(ModelError, match="none of which has a usual name"):
+    with pytest.raises(ModelError, match="but no usual name"):
         read_op4(path)
     op4.write(path, {"KAA": K * (1 + 0.1j)})
     lossy = read_op4(path)

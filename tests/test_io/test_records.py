@@ -261,13 +261,13 @@ def test_what_is_no_record_is_said(tmp_path):
         read_records(table(rows))
     with pytest.raises(FlexplantError, match="no two lines of numbers"):
         read_records(table("t,a\n12:00:01,5\n12:00:02,6\n"))
-    with pytest.raises(FlexplantError, match=r"no format of time records.*\.lvm"):
+    with pytest.raises(FlexplantError, match=r"not in a known format of time records.*\.lvm"):
         read_records(table(rows, "a.tdms"))
-    with pytest.raises(FlexplantError, match="no LabVIEW measurement file"):
+    with pytest.raises(FlexplantError, match="not a LabVIEW measurement file"):
         read_records(table(rows, "a.lvm"))
     text = lvm(None, ["a"], ["V"], [(0.0, np.ones((1, 9)))], 1e-3,
                columns="One", comma=False, point=".")  # fmt: skip
-    with pytest.raises(FlexplantError, match="9 samples are announced, fewer follow"):
+    with pytest.raises(FlexplantError, match="9 samples are expected, fewer follow"):
         read_records(table("\n".join(text.splitlines()[:-3]), "a.lvm"))
     with pytest.raises(FlexplantError, match="several grids"):
         one = np.ones(8)

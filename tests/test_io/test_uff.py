@@ -471,7 +471,7 @@ def test_foreign_files_and_a_missing_extra(tmp_path, monkeypatch):
     path = tmp_path / "x.uff"
     path.write_text("frequency [Hz], y1 <- u1 real\n")
     for reader in (read_frf_uff, read_modes_uff, read_nodes_uff):
-        with pytest.raises(FlexplantError, match="no universal file"):
+        with pytest.raises(FlexplantError, match="not a universal file"):
             reader(path)
         with pytest.raises(FileNotFoundError):
             reader(tmp_path / "none.uff")

@@ -140,7 +140,7 @@ def test_a_mode_just_outside_the_band_keeps_its_frequency(machine):
     found = identify_modes(machine.frf, band=(60.0, 600.0), **where)
     assert found.freq.max() < 600
     modes = structural_modes(found, machine.between)
-    assert "mode beside the band at 606.2" in modes.vector_dofs[0]
+    assert "mode outside the band at 606.2" in modes.vector_dofs[0]
     assert modes.vector_omega[0] == pytest.approx(machine.modes.omega[7], rel=1e-3)
     assert modes.vector_zeta[0] == pytest.approx(ZETA, rel=0.05)
     assert modes.vector_omega[1] > 1.03 * 2 * np.pi * 606
@@ -157,15 +157,15 @@ def test_what_a_measurement_does_not_say_is_refused(machine):
     with pytest.raises(ModelError, match="no input and output are at one DOF"):
         structural_modes(machine.found.replace(mass_normalised=False), machine.between)
     few = DofSet([1, 2], ["z", "z"], [[0.0, 0, 0], [1.0, 0, 0]])
-    with pytest.raises(LabelError, match="are channels at no DOF"):
+    with pytest.raises(LabelError, match="are channels without a DOF"):
         structural_modes(machine.found, few)
     with pytest.raises(ModelError, match="12 measured places cannot determine 14 modes"):
         structural_modes(machine.found, few, over=solve_modes(machine.full, count=14))
-    with pytest.warns(FlexplantWarning, match="none of the model's modes"):
+    with pytest.warns(FlexplantWarning, match="not in the span of the model's modes"):
         structural_modes(machine.found, few, over=solve_modes(machine.full, count=5))
     # no motion in 1/s^2 of positive mass
     upside = machine.found.replace(terms=-machine.found.terms, poles=machine.found.poles)
-    with pytest.raises(ModelError, match="no rigid-body motion of positive mass"):
+    with pytest.raises(ModelError, match="not a rigid-body motion with positive mass"):
         structural_modes(upside, machine.between)
     held = structural_modes(machine.found, machine.between, rigid=False)
     assert held.n_rigid == 0

@@ -458,7 +458,7 @@ def test_the_command_takes_what_its_refusals_ask_for(frf, tmp_path, capsys, monk
     strange = written("strange.uff", (8,), "EU")
     assert command.main([strange, "--continuous"]) == 1
     said = capsys.readouterr().err
-    assert "--scale 9.80665 where they are g/N, --scale 1 where they are SI." in said
+    assert "--scale 9.80665 for g/N, --scale 1 for SI." in said
     with pytest.raises(SystemExit):
         command.main([strange, "--continuous", "--scale", "3.0"])
     np.testing.assert_allclose(opened[-1][strange].data[0, 0], 3 * frf.data[0, 0], rtol=1e-5)

@@ -1,4 +1,4 @@
-"""write_c: what a sampled controller does, as one C99 file with its header, without allocation."""
+"""write_c: a sampled controller as one C99 file with its header, without allocation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..tolerances import SAME
 from ..words import flag
 from .c_text import CText
 
-#: words of C, and what its library has with the ending _t
+#: keywords of C, and names of its library with the ending _t
 _RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if
     inline int long register restrict return short signed sizeof static struct switch typedef
@@ -41,31 +41,32 @@ def write_c(
 ) -> tuple[Path, Path]:
     """Write a sampled controller as C99: one source file and its header, no allocation.
 
-    The states become blocks of two side by side, of which a compiler computes several at a time;
-    their response is compared with the controller's. Numbers have 17 digits (9 in single
-    precision), which is exact. The functions: `_reset`; `_start` with the commands that act now
-    (bumpless: steady states that give them, where the controller has such); `_output` and
-    `_update`, or `_step`. A value that is not finite holds the last outputs and raises a flag.
+    The states are transformed to blocks of two, of which a compiler computes several at a time;
+    their response is compared with that of the controller. Numbers have 17 digits (9 in single
+    precision), which is exact. The functions are `_reset`; `_start` with the present commands
+    (bumpless: it finds steady states with these commands, if they exist); `_output` and `_update`,
+    or `_step`. A value that is not finite holds the last outputs and raises a flag.
 
     Parameters
     ----------
     controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or {place: one of these}
-        Sampled. Of a ClosedLoop all blocks go to one file: in are the channels of `plant.y`, out
-        the driven actuators, then the monitored outputs. Inputs named like an output (observer,
-        `anti_windup_form`) are fed what is applied. A mapping is of controllers whose outputs
-        alone differ (feedforward, decoupling, gains after the states), linear between places; of
-        a ScheduledLoop all matrices are, its position the last input.
+        Sampled controller. All blocks of a ClosedLoop go to one file: inputs are the channels of
+        `plant.y`, outputs the driven actuators, then the monitored outputs. Inputs named like an
+        output (observer, `anti_windup_form`) get the applied commands. Controllers in a mapping
+        differ only in their outputs (feedforward, decoupling, gains after the states), which are
+        interpolated linearly between places. For a ScheduledLoop all matrices are interpolated, and
+        its position is the last input.
     path : path
         Path of the source; the header is next to it.
     name : str, optional
-        Prefix of the functions; the file's own when not given.
+        Prefix of the functions; by default the name of the file.
     limits : float, (low, high) or mapping {actuator: one of these}, optional
-        What actuators apply at most, in the units of u; commands are limited to it.
+        Limits of the actuators in the units of u, to which commands are limited.
     anti_windup : float [s], optional
-        In a ClosedLoop, as for `simulate`. For a controller alone that does not read what is
-        applied, as `recovery` for `anti_windup_form`; limits without it need Hanus' form.
+        Recovery time of a ClosedLoop as for `simulate`. For a single controller that does not read
+        the applied commands, `recovery` of `anti_windup_form`; limits without it need Hanus' form.
     schedule : str, optional
-        The input whose value is the place, of a mapping.
+        Input whose value is the place, for a mapping.
     single : bool
         Whether to compute in float instead of double.
 
@@ -77,15 +78,15 @@ def write_c(
     Raises
     ------
     AssumptionError
-        When a command depends on what is applied in the same sample, or limits need a recovery
+        When a command depends on an applied command of the same sample, or limits need a recovery
         time.
     CertificateError
         When the blocks differ from the controller, by rounding to single precision for instance.
     LabelError
         When the name is not a C identifier, or an actuator or the input of a schedule is unknown.
     ModelError
-        When the controller is continuous, the path no `.c` file, or controllers of a schedule
-        differ in more than their outputs.
+        When the controller is continuous, the path does not end in `.c`, or controllers of a
+        schedule differ in more than their outputs.
 
     Examples
     --------
@@ -134,7 +135,7 @@ def c_name(name: Any) -> str:
     valid = isinstance(name, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name)
     if not valid or name in _RESERVED:
         raise LabelError(
-            f"{short(name)} is no name that C allows for functions. Pass name= with letters, "
+            f"{short(name)} is not allowed as a function name in C. Pass name= with letters, "
             "digits and underscores."
         )
     return str(name)
@@ -164,8 +165,8 @@ def c_program(
         if schedule is not None or limits is not None or recovery is not None:
             raise ModelError(
                 "a ScheduledLoop brings its position as its last input, and its states under "
-                "limits would be of no design: leave out schedule=, limits= and anti_windup=, and "
-                "saturate outside."
+                "limits would belong to no design: leave out schedule=, limits= and "
+                "anti_windup=, and saturate outside of the function."
             )
         return _following(controller, name, flag(single, "single"))
     places, laws = _scheduled(controller, schedule, recovery, limits is not None, driven)
@@ -238,22 +239,23 @@ def _scheduled(
         ]
         if moved == ["back"]:
             raise ModelError(
-                f"limits and a schedule: what the applied command gives back to the states follows "
-                f"from the gains, and at {place:g} it is another than at {places[0]:g}; between "
-                "places the states under saturation would be of no design. Leave limits out and "
-                "saturate outside, or schedule only rows of feedforward (D)."
+                "limits and a schedule: the feedback of the applied command to the states "
+                f"follows from the gains, and differs between {place:g} and {places[0]:g}; "
+                "between places the states under saturation would belong to no design. Leave "
+                "limits out and saturate outside of the function, or schedule only rows of "
+                "feedforward (D)."
             )
         if moved:
             raise ModelError(
                 f"the controller at {place:g} differs from the first in more than its outputs "
-                f"({', '.join(moved)}): poles between places would be of no design. Schedule "
-                "what follows the states (feedforward, decoupling, gains)."
+                f"({', '.join(moved)}): poles between places would belong to no design. Schedule "
+                "only the outputs (feedforward, decoupling, gains)."
             )
     return np.array(places), laws
 
 
 def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _Law:
-    """Return a controller with what is applied fed back, and how the rest moves it."""
+    """Return a controller with fed back applied commands, and the effect of their error."""
     if isinstance(given, ClosedLoop):
         dt = given.plant.dt
         _check_rate(dt, given.controller.n_states)
@@ -271,8 +273,8 @@ def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _La
         found = _applied_law(law, len(fed), outer, np.zeros((K.n_states, len(fed))))
         if len(fed) < len(K.outputs) and limited:
             raise ModelError(
-                f"limits need all commands back, and the controller reads {fed} of {K.outputs} "
-                "only: pass the ClosedLoop, which has the actuators."
+                "limits need all applied commands as inputs, but the controller reads only "
+                f"{fed} of {K.outputs}: pass the ClosedLoop, which has the actuators."
             )
         return found
     if not limited or not K.n_states:
@@ -289,13 +291,13 @@ def _check_rate(dt: float, states: int) -> None:
 
 
 def _applied_law(law: StateSpace, nu: int, outer: Sequence[str], L: FloatArray) -> _Law:
-    """Return ``[outer; applied] -> [u; watched]`` with what is commanded applied."""
+    """Return ``[outer; applied] -> [u; watched]`` with commands applied without limits."""
     ny = len(outer)
     if np.any(law.D[:, ny:]):
         i, j = np.argwhere(law.D[:, ny:])[0]
         raise AssumptionError(
             f"{law.outputs[i]!r} depends on the applied {law.outputs[j]!r} of the same sample, "
-            "which is known after the command only. Let the block read it one sample late."
+            "which is only known after the command. Let the block read it one sample later."
         )
     Ba, known = law.B[:, ny:], (*outer, *law.outputs)
     system = law.replace(

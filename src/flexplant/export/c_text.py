@@ -132,7 +132,7 @@ static void outputs_of(const {real} *restrict x, const {real} *restrict in,
 }}
 """
 
-#: partial sums, so that a compiler may add side by side without -ffast-math
+#: partial sums, so that a compiler may vectorise without -ffast-math
 _SUM = """\
         {real} s[{lanes}] = {{{zero}}};
         const {real} *restrict row = C[first + i];
@@ -176,7 +176,7 @@ _REST = """\
     }}
 """
 
-#: both places' matrices, entry by entry linear between them
+#: matrices of both places, interpolated linearly entry by entry
 _MOVING = """\
 static void advance({real} *restrict x, const {real} *restrict in, int q, {real} part)
 {{
@@ -298,7 +298,7 @@ class CText:
         self.system, self.form, self.single, self.limits = K, form, single, limits
         self.states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
         self.driven, self.places, self.count = driven, places, max(places.size, 1)
-        #: whether A and B follow the place too
+        #: whether A and B depend on the place too
         self.moving = form.rest.ndim == 3
         rest, precision = form.rest.shape[-1], "single" if single else "double"
         error = f"blocks within {form.error:.1e} of the largest gain of each channel"
@@ -425,6 +425,6 @@ class CText:
 
 
 def _ascii(text: str) -> str:
-    """Return text that neither ends a comment nor begins one."""
+    """Return text without the marks that begin or end a comment."""
     plain = text.encode("ascii", "replace").decode().replace("\n", " ")
     return plain.replace("*/", "* /").replace("/*", "/ *")

@@ -25,7 +25,7 @@ from ..words import one_of
 from .c_code import c_name, c_program
 from .c_text import CText
 
-#: the types are those that the specification names, spelled out where they are pointers or numbers
+#: types of the specification, written out where they are pointers or numbers
 _COMMON = """\
 /* Co-simulation of {name}: samples of {dt:.17g} s, inputs held between communication points. */
 #include <stddef.h>
@@ -157,7 +157,7 @@ static int dropped(void **state)
 
 """
 
-#: what many functions share in their parameters, and bodies of those that do nothing
+#: parameters that many functions share, and bodies of functions that do nothing
 _SHORT = {
     "$C": "void *c",
     "$V": "void *c, const unsigned int *v, size_t n",
@@ -204,7 +204,7 @@ GetIntegerStatus($C, int which, int *value)
 GetBooleanStatus($C, int which, int *value)
 GetStringStatus($C, int which, const char * *value)
 """
-#: of FMI 3.0: kinds of variables that these units have none of
+#: kinds of variables of FMI 3.0 that these units do not have
 _NUMBERS_OF_THREE = {
     "Float32": "float", "Int8": "signed char", "UInt8": "unsigned char", "Int16": "short",
     "UInt16": "unsigned short", "Int32": "int", "UInt32": "unsigned int", "Int64": "long long",
@@ -309,14 +309,14 @@ def _function(line: str, prefix: str) -> str:
     return f"EXPORT {head};\n{head}\n{{\n{unused}    {lines}\n}}\n"
 
 
-#: exponents of kg, m, s, A, rad of the units that name a quantity by itself
+#: exponents of kg, m, s, A, rad in units with a name
 _NAMED = {
     "kg": (1, 0, 0, 0, 0), "m": (0, 1, 0, 0, 0), "s": (0, 0, 1, 0, 0), "A": (0, 0, 0, 1, 0),
     "rad": (0, 0, 0, 0, 1), "N": (1, 1, -2, 0, 0), "V": (1, 2, -3, -1, 0), "Hz": (0, 0, -1, 0, 0),
     "W": (1, 2, -3, 0, 0), "J": (1, 2, -2, 0, 0), "Pa": (1, -1, -2, 0, 0), "T": (1, 0, -2, -1, 0),
 }  # fmt: skip
 _FACTOR = re.compile(r"([A-Za-z]+)(?:\^(-?\d+))?")
-#: where the binary of a system lies, by version of FMI; how a shared library ends
+#: folder of the binary of a system by version of FMI, and suffix of a shared library
 _FOLDERS = {
     "linux": ("linux{bits}", "{cpu}-linux", ".so"),
     "darwin": ("darwin{bits}", "{cpu}-darwin", ".dylib"),
@@ -336,17 +336,18 @@ def write_fmu(
 ) -> Path:
     """Write a sampled plant or controller as a unit for co-simulation (FMI).
 
-    Simulink, Dymola, OpenModelica and others import it. It holds C sources (those of `write_c` and
-    the interface) and a library for this machine, where a C compiler is found. Time goes on in
-    samples: a communication step does as many as fall into it, with the inputs held. Outputs that
+    Simulink, Dymola, OpenModelica and others import it. It contains C sources (those of `write_c`
+    and the interface) and a library for this computer, if a C compiler is found. Time advances in
+    samples: a communication step computes all samples within it, with constant inputs. Outputs that
     depend on inputs of the same sample are computed when they are read.
 
     Parameters
     ----------
     system : StandardPlant, GeneralizedPlant, StateSpace, Controller or ClosedLoop
-        Sampled. Of a plant all of w, u, z and y; of a ClosedLoop its controller, as for `write_c`.
+        Sampled system. A plant has all of w, u, z and y as channels; a ClosedLoop gives its
+        controller, as for `write_c`.
     path : str or Path
-        Such as "stage.fmu", written atomically; its name is that of the model.
+        Path such as "stage.fmu", written atomically; its name is that of the model.
     version : str
         "3.0" or "2.0".
     limits, anti_windup, schedule
@@ -355,16 +356,16 @@ def write_fmu(
     Returns
     -------
     Path
-        The file. Channels keep names and units; one that is both input and output has
-        ``|y`` after its name as output.
+        Path of the file. Channels keep names and units; a channel that is both input and output
+        gets ``|y`` after its output name.
 
     Raises
     ------
     LabelError
-        When the file's name is not a C identifier, or a channel's name not one of a variable.
+        When the file's name is not a C identifier, or a channel has a name that is not allowed for
+        variables.
     ModelError
-        When the system is continuous, the path ends in anything but .fmu, or the version is
-        unknown.
+        When the system is continuous, the path does not end in .fmu, or the version is unknown.
     OSError
         When the file cannot be written.
 
@@ -394,7 +395,7 @@ def write_fmu(
     name, is_plant = target.stem, isinstance(system, AnyPlant)
     if is_plant and not system.dt:
         raise ModelError(
-            "a unit for co-simulation goes on in samples, and the plant is continuous: pass "
+            "a unit for co-simulation advances in samples, but the plant is continuous: pass "
             "plant.discretized(rate)."
         )
     program = c_program(
@@ -427,7 +428,7 @@ def write_fmu(
 
 
 def _compiled(sources: dict[str, str], name: str, version: str) -> tuple[str, bytes] | None:
-    """Return where the library for this machine lies and what it holds; None without compiler."""
+    """Return place and content of the library for this computer; None without a compiler."""
     own = os.environ.get("CC", "")
     found = next((one for one in (own, *_COMPILERS) if one and shutil.which(one)), None)
     if found is None or sys.platform not in _FOLDERS:
@@ -463,8 +464,8 @@ def variable_names(K: StateSpace) -> tuple[list[str], list[str]]:
     for name in (*K.inputs, *K.outputs):
         if name == "time" or not name.isprintable():
             raise LabelError(
-                f"a channel is named {name!r}, which no variable of a functional mock-up may be: "
-                "time is its own, and line feeds end a name. Rename the channel."
+                f"a channel is named {name!r}, which is not allowed in a functional mock-up "
+                "unit: time is reserved, and line feeds end a name. Rename the channel."
             )
     outputs = [f"{name}|y" if name in K.inputs else name for name in K.outputs]
     return list(K.inputs), outputs

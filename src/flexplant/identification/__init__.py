@@ -1,10 +1,10 @@
-"""What was measured: frequency responses, measured poles and mode shapes.
+"""Identification from measurements: frequency responses, poles and mode shapes.
 
 - `estimate_frf(inputs, outputs, rate)`: records become an `Frf` with coherence and variance.
 - `identify_modes(frf, band=)`: poles, shapes and covariance (pLSCF, then maximum likelihood).
 - `numbered(found, model, at=)`: identified modes paired with a model's, for `fx.Eigenvalues`.
-- `MeasuredModes.from_freq`: frequencies and dampings that were found elsewhere.
-- `structural_modes`: measured modes as the structure itself, where no model exists;
+- `MeasuredModes.from_freq`: frequencies and damping ratios from another source.
+- `structural_modes`: measured modes as a structure, where no model exists;
   `identify_output_only` where forces are unknown; `impact_frf` of hammer tests.
 
 >>> import flexplant as fx

@@ -12,23 +12,23 @@ from ..lti.frequency import Frf
 from .diagram import affordable, line_windows, moments_in
 from .line_weights import PreparedLines, prepared_lines
 
-#: times of the impulse response that are looked at, on either side of zero
+#: number of times of the impulse response examined on either side of zero
 TIMES = 96
 #: the main lobe of the spectrum of a Hann window over a band B ends at 2/B
 LOBE = 2.0
-#: the conjugate is used where stable modes leave at most this fraction of what they leave of the
-#: data: with noise as large as the responses both leave the same
+#: ratio of the residual of stable modes for the conjugate to that for the data, below which the
+#: conjugate is used; with noise as large as the responses both are equal
 BETTER = 0.8
-#: poles with more damping are no modes; powers of frequency for what lies outside of the band
+#: largest damping ratio of a mode; powers of frequency for modes outside of the band
 DAMPED, POWERS = 0.2, np.arange(-2, 3)
 
 
 def forward_in_time(frf: Frf, band: Any) -> Frf:
-    r"""Return an FRF of the convention exp(i omega t): the conjugate of one of exp(-i omega t).
+    r"""Return an FRF in the convention exp(i omega t), conjugated if it was in exp(-i omega t).
 
     The impulse response of a stable machine is zero before the force, that of the conjugate after
-    it. Where more energy ``\int |h(t)|^2 dt`` is before than after, the conjugate is tried once: it
-    is used when stable modes fit it better than what was given.
+    it. Where more energy ``\int |h(t)|^2 dt`` lies before than after the force, the conjugate is
+    used if stable modes fit it better than the given FRF.
     """
     ready = prepared_lines(frf, band)
     rows = ready.data.reshape(-1, ready.freq.size)
@@ -39,7 +39,7 @@ def forward_in_time(frf: Frf, band: Any) -> Frf:
     if _stable_misfit(prepared_lines(turned, band)) > BETTER * _stable_misfit(ready):
         return frf
     warn(
-        "the FRF responds before its forces act: it is of the convention exp(-i omega t), which "
+        "the FRF responds before its forces act: it uses the convention exp(-i omega t), which "
         "has the opposite sign of all imaginary parts. Its conjugate is used. Pass "
         "frf.replace(data=frf.data.conj())."
     )
@@ -47,9 +47,9 @@ def forward_in_time(frf: Frf, band: Any) -> Frf:
 
 
 def _earlier(freq: FloatArray, data: ComplexArray) -> bool:
-    """Return whether responses (n, n_freq) have more energy before zero than after, on the mean."""
-    # by the trapezoidal rule over lines of any spacing; a Hann window keeps what the ends of the
-    # band leave at zero there
+    """Return whether responses (n, n_freq) on average have more energy before zero than after."""
+    # by the trapezoidal rule over lines of any spacing; a Hann window confines the effect of the
+    # band ends to times near zero
     step, band = np.gradient(freq), freq[-1] - freq[0]
     rows = data * np.sin(np.pi * (freq - freq[0]) / band) ** 2
     size = np.linalg.norm(rows, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The stabilisation diagram: poles over model orders, which of them stay, and their selection.
+"""The stabilisation diagram: poles over model orders, stable ones, and their selection.
 
 [Peeters2004]_; [Cauberghe2004]_ (constraint).
 """
@@ -31,7 +31,7 @@ from ..tolerances import TINY
 from ..words import several
 from .line_weights import PreparedLines
 
-#: flags of a pole, each including the ones before
+#: flags of a pole; each includes the previous ones
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
 
 
@@ -42,10 +42,10 @@ class PoleSelection(Value):
     Parameters
     ----------
     poles : (m,) complex array [rad/s]
-        With positive imaginary parts.
+        Poles with positive imaginary parts.
     participation : (n_in, m) complex array
-        How each input (each output, where those are fewer) excites them; independent columns
-        distinguish repeated poles.
+        Participation of each input (or output, where those are fewer) in each pole; independent
+        columns distinguish repeated poles.
 
     Examples
     --------
@@ -64,7 +64,9 @@ class PoleSelection(Value):
     def __post_init__(self) -> None:
         super().__post_init__()
         if np.any(self.poles.imag <= 0) or not np.all(np.any(self.participation, axis=0)):
-            raise ModelError("poles need positive imaginary parts, and some participation each.")
+            raise ModelError(
+                "poles need positive imaginary parts, and each needs a non-zero participation."
+            )
 
     def __len__(self) -> int:
         return int(self.poles.size)
@@ -79,22 +81,24 @@ class PoleSelection(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StabilisationDiagram(Value):
-    """Poles of all model orders, and whether each was there at the order before.
+    """Poles of all model orders, and whether each was present at the previous order.
 
     Parameters
     ----------
     orders : (n,) int array
         Model order of each pole.
     poles : (n,) complex array [rad/s]
-        Stable ones inside the band.
+        Stable poles inside the band.
     flags : (n,) int array
-        0: new, 1: its frequency was there before, 2: its damping too, 3: its shape too (stable).
+        0: new pole, 1: same frequency as at the previous order, 2: same damping too, 3: same shape
+        too (stable).
     tracks : (n,) int array
-        Poles that continue each other over the orders share a number.
+        Number of the track of a pole; a pole that continues over the orders keeps its number.
     shapes, participation : (n_out, n), (n_in, n) complex array
-        Of each pole, of unit length; exchanged where there are fewer outputs than inputs.
+        Shapes and participation vectors of unit length; exchanged where there are fewer outputs
+        than inputs.
     band : (2,) array [Hz]
-        Where a pole counts.
+        Band of the listed poles.
     """
 
     orders: IntArray
@@ -127,16 +131,16 @@ class StabilisationDiagram(Value):
         return np.asarray(-self.poles.real / np.abs(self.poles), dtype=np.float64)
 
     def automatic(self, *, presence: float = 0.5) -> PoleSelection:
-        """Return the poles that stay over the orders.
+        """Return the poles that are stable over the orders.
 
-        A track counts that is stable at a share `presence` of the orders from its first to the
-        highest one, but at least at four. All poles come from the order at which most tracks
-        are present, so that the participation vectors of repeated poles belong together.
+        A track is accepted when it is stable at a fraction `presence` of the orders from its first
+        to the highest one, and at least at four. All poles are taken from the order with most
+        tracks, so that the participation vectors of repeated poles belong together.
 
         Parameters
         ----------
         presence : float
-            Between 0 and 1.
+            Fraction of the orders, between 0 and 1.
         """
         presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
         known = np.unique(self.orders)
@@ -150,24 +154,25 @@ class StabilisationDiagram(Value):
         if not kept:
             where = f"over the orders {known[0]} to {known[-1]}" if known.size else "in the band"
             raise SolverError(
-                f"no pole stays {where}: take a band where resonances stand out of the noise, some "
-                "widths of them wide (few lines afford few orders), or pick poles by hand with "
+                f"no pole is stable {where}: use a band where resonances exceed the noise, "
+                "several resonance widths wide (few lines allow few orders), or pick poles by "
+                "hand with "
                 "diagram.select(freq=[...])."
             )
         return self._chosen(kept)
 
     def select(self, freq: Sequence[float] | FloatArray) -> PoleSelection:
-        """Return the poles nearest to some frequencies, as read off the diagram.
+        """Return the poles closest to some frequencies read from the diagram.
 
         Parameters
         ----------
         freq : (m,) array [Hz]
-            A frequency given twice picks two poles there.
+            Frequencies of the poles; a frequency given twice picks two poles there.
 
         Raises
         ------
         ModelError
-            When there are no frequencies, or no pole lies within 3 % of one.
+            When `freq` is empty, or no pole lies within 3 % of a frequency.
         """
         wanted = real_array(freq, "freq", (None,))
         if not wanted.size:
@@ -176,7 +181,7 @@ class StabilisationDiagram(Value):
         centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
         lengths = np.array([np.sum(self.tracks == track) for track in known])
         away: Any = np.abs(centres[None, :] / np.maximum(wanted, TINY)[:, None] - 1.0)
-        # a long track is meant rather than a short one slightly nearer
+        # a long track is preferred to a short one that is slightly closer
         cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
         if cost.shape[1] < wanted.size:
             raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")
@@ -184,8 +189,8 @@ class StabilisationDiagram(Value):
         lost = wanted[columns < 0].tolist()
         if lost:
             raise ModelError(
-                f"no pole of its own within 3 % of {lost} Hz: look at "
-                "plot.stabilisation(diagram), raise the orders or leave these out."
+                f"no separate pole within 3 % of {lost} Hz: look at plot.stabilisation(diagram), "
+                "raise the orders or leave these out."
             )
         return self._chosen(known[columns].tolist())
 
@@ -236,7 +241,7 @@ def built_diagram(
 def _continued_poles(
     old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
 ) -> tuple[IntArray, IntArray]:
-    """Return which old pole each new one continues, -1 for none, and the flags of the new ones."""
+    """Return the old pole that each new one continues, or -1, and the flags of the new ones."""
     tol_freq, tol_damping, tol_mac = tolerances
     f_old, f_new = np.abs(old.poles), np.abs(new.poles)
     z_old, z_new = -old.poles.real / f_old, -new.poles.real / f_new
@@ -253,14 +258,14 @@ def _continued_poles(
     flag = np.max(near * 1 + damped * 1 + stable * 1, axis=1)
     distance = np.abs(new.poles[:, None] - old.poles) / (f_old + TINY)
     cost = np.where(stable, distance, np.where(near, 10.0 + distance, 1e3))
-    # a pole whose damping jumps is followed, but is not stable
+    # a pole whose damping jumps continues a track, but is not stable
     return assigned(cost, most=100.0), flag
 
 
-#: part of the unit circle that the band is laid around; the rest separates its two ends
+#: fraction of the unit circle that the band occupies; the rest separates its two ends
 ARC = 0.9
-#: poles on the circle this near to each other are one that is repeated; the reciprocal condition
-#: from which normal equations are solved as they are
+#: distance on the circle below which poles count as repeated; reciprocal condition number above
+#: which normal equations are solved directly
 REPEATED, REGULAR = 1e-9, 1e-11
 
 
@@ -287,10 +292,10 @@ class Moments:
 
     .. math:: e_o(f) = w_o(f)\,\bigl(B_o(z_f) - H_o(z_f) A(z_f)\bigr).
 
-    The band is laid around the unit circle, ``z = exp((s - s_0) \Delta t)``, where powers of z
-    are nearly orthogonal: no other basis is needed for high orders, and coefficients are complex
-    so that no order is spent on the conjugate poles outside the band. Every block of the
-    normal equations is Toeplitz, and all orders share its moments.
+    The band is laid around the unit circle, ``z = exp((s - s_0) \Delta t)``, where powers of z are
+    nearly orthogonal, so that high orders need no other basis. Coefficients are complex, so that no
+    order is used for the conjugate poles outside the band. Every block of the normal equations is
+    Toeplitz, and all orders share its moments.
     """
 
     def __init__(
@@ -308,25 +313,25 @@ class Moments:
         T = np.einsum("of,oif,ojf,fk->ijk", squares, data.conj(), data, powers, optimize=True)
         n, m = order + 1, self.n_in
         toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + order
-        #: of A alone; columns, of what follows too: coefficient r of A, channel i
+        #: moments of A; column: coefficient r of A, channel i
         self.big = T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
-        # powers of z on most of the circle: well conditioned, whatever the data. Lower orders are
-        # leading blocks, of a triangle's inverse too
+        # powers of z on most of the circle are well conditioned for all data. Lower orders are
+        # leading blocks, also of the inverse of a triangle
         triangles = np.linalg.cholesky(R[:, toeplitz])
         self.inverse = np.array([la.solve_triangular(L, np.eye(n), lower=True) for L in triangles])
         coupled = S[:, :, toeplitz].transpose(0, 2, 3, 1).reshape(self.n_out, n, n * m)
-        #: per output L^{-1} S, with which B is eliminated
+        #: for each output L^{-1} S, which eliminates B
         self.taken = self.inverse @ coupled
 
     def solve(self, order: int, wanted: Callable[[ComplexArray], BoolArray]) -> OrderPoles:
-        """Return the poles of one order that are wanted; shapes are made of these alone."""
+        """Return the wanted poles of one order; shapes are computed for these only."""
         A, B = self.fraction(order)
         # in v = 1/z the polynomial is monic: its companion matrix needs no inverse
         m = self.n_in
         companion = np.eye(order * m, k=-m, dtype=np.complex128)
         companion[:m] = -A[1:].transpose(1, 0, 2).reshape(m, order * m)
         v = np.linalg.eigvals(companion)
-        # poles at zero: the leading coefficient is singular but for rounding
+        # poles at zero: the leading coefficient is singular except for rounding
         z = 1.0 / v[np.abs(v) > 1e-8]
         poles = np.log(z) / self.step + 1j * self.centre
         keep = wanted(poles)
@@ -349,8 +354,8 @@ class Moments:
 
     def fraction(self, order: int) -> tuple[ComplexArray, ComplexArray]:
         """Return A (order + 1, n_in, n_in) with A_0 = I and B (n_out, order + 1, n_in)."""
-        # this constraint makes the mathematical poles unstable and leaves the physical ones stable,
-        # which is what makes the stabilisation diagram clear [Cauberghe2004]_
+        # this constraint makes the mathematical poles unstable and keeps the physical ones stable,
+        # which makes the stabilisation diagram clear [Cauberghe2004]_
         n, m = order + 1, self.n_in
         taken = self.taken[:, :n, : n * m]
         rows = taken.reshape(-1, n * m)
@@ -363,7 +368,7 @@ class Moments:
 
 def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0."""
-    # those of a pole that is repeated but for rounding are independent
+    # null vectors of a pole that is repeated except for rounding are independent
     U, _, Vh = np.linalg.svd(matrices)
     alike = np.abs(z[:, None] - z) < REPEATED
     first = np.sum(np.cumsum(alike, axis=1) == 0, axis=1)
@@ -376,27 +381,28 @@ def _solve_hermitian(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
     factor, info = la.lapack.zpotrf(matrix)
     if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > REGULAR:
         return np.asarray(la.lapack.zpotrs(factor, right)[0])
-    # data without noise leave orders above the true one undetermined: the smallest solution then
+    # data without noise do not determine orders above the true one: the smallest solution is used
     return np.asarray(la.lstsq(matrix, right, cond=1e-13, lapack_driver="gelsd")[0])
 
 
-#: the highest model order by default, and the lines that each order is to have then
+#: default highest model order, and least number of lines per order
 HIGHEST, LINES_OF_ORDER = 40, 4
-#: references times parts of the band from which every other order is enough: each is a large
-#: eigenvalue problem
+#: number of references times parts of the band above which only every second order is used, since
+#: each order is a large eigenvalue problem
 MANY = 4
-#: quantile of the gaps between lines that counts as their widest: a tenth of them may be wider
+#: quantile of the gaps between lines that counts as the widest gap: a tenth may be wider
 _WIDE = 0.9
-#: the most poles of a diagram's order, conjugates included: an eigenvalue problem of this size
+#: largest number of poles of an order, conjugates included, which is the size of the eigenvalue
+#: problem
 POLES = 100
 
 
 def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
-    """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
+    """Return the orders, by default as many as the lines allow; ModelError if they are too high."""
     parts = line_windows(ready)
     fewest = min(_resolved(ready.freq[seen]) for _, seen in parts)
     if orders is None:
-        # four orders at least are compared, which twenty lines afford
+        # at least four orders are compared, for which twenty lines are enough
         references = ready.data.shape[1]
         top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1, max(POLES // references, 10)))
         return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
@@ -411,7 +417,7 @@ def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
 
 def _resolved(freq: FloatArray) -> int:
     """Return the number of evenly spaced lines with the resolution of the widest gaps."""
-    # polynomials are determined only where lines are; single lines that were left out do no harm
+    # polynomials are determined only where lines exist; single missing lines do not matter
     gap = float(np.quantile(np.diff(freq), _WIDE))
     return min(freq.size, round(float(freq[-1] - freq[0]) / gap) + 1)
 
@@ -430,9 +436,10 @@ def checked_orders(orders: Iterable[int]) -> list[int]:
     return listed
 
 
-#: lines of a part, and the share of it that is used beyond each of its ends
+#: number of lines of a part, and fraction of it that is used beyond each of its ends
 LINES, OVERLAP = 400, 0.25
-#: poles this share of the band outside of it are looked for: they bend the responses inside
+#: distance outside of the band, relative to it, within which poles are searched, since they affect
+#: the responses inside
 MARGIN = 0.04
 
 
@@ -460,7 +467,7 @@ def line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
 def diagram_of(
     ready: PreparedLines, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
 ) -> StabilisationDiagram:
-    """Return the diagrams of all parts as one; a track belongs where its median lies."""
+    """Return the diagrams of all parts as one; a track belongs to the part with its median."""
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
@@ -489,7 +496,7 @@ def diagram_of(
 
 
 def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
-    """Return the same with weights from what matrix fractions of high order leave."""
+    """Return the same with weights from the residual of matrix fractions of high order."""
     now = ready
     n_out, n_in, n_freq = ready.data.shape
     for _ in range(2):
@@ -509,7 +516,7 @@ def moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
 
 
 def _in_band(poles: ComplexArray, *, low: float, high: float, max_zeta: float) -> BoolArray:
-    """Return which poles count in a part of the band."""
+    """Return which poles are counted in a part of the band."""
     freq = np.abs(poles) / (2 * np.pi)
     zeta, edge = -poles.real / np.abs(poles), MARGIN * (high - low)
     keep = (freq > max(low - edge, 0.5 * low)) & (freq < high + edge)

@@ -1,4 +1,4 @@
-"""From time records to frequency responses, and whether feedback biases them."""
+"""Frequency responses from time records, with a test for bias by feedback."""
 
 from __future__ import annotations
 
@@ -16,32 +16,35 @@ from ..words import members
 from .periodic import Periodic, averages_advised, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
 
-#: samples next to zero lag where delays between channels and the taper act
+#: number of samples next to zero lag that delays between channels and the taper affect
 GUARD = 8
-#: share of the segment's lags that is used: beyond, what rings longer than it folds back
+#: fraction of the lags of a segment that is used: beyond it, longer vibrations fold back
 LOOKED = 0.25
-#: lines over which power is averaged: at a quarter of the lags some ten are independent
+#: number of lines over which power is averaged: with a quarter of the lags about ten are
+#: independent
 STRETCH = 41
-#: share of the band above which the taper leaves rounding
+#: fraction of the band above which only rounding remains after the taper
 HIGHEST = 0.7
-#: power over that of noise there: chi-square of 20 degrees of freedom passes 4 once in 10^8
+#: ratio of the power to that of noise: chi-square with 20 degrees of freedom exceeds 4 with
+#: probability 1e-8
 SEEN = 16.0
-#: share of the response below which it is leakage of the window or the channels' filters
+#: fraction of the response below which it is leakage of the window or of channel filters
 LEAST = 0.05
 
 
 def feedback_warned(frf: Frf) -> None:
-    r"""Warn of an FRF that responds before its input acts: feedback biases it.
+    r"""Warn of an FRF that responds before its input acts, because feedback biases it.
 
     With ``u = r - K y`` and noise v on y the direct estimate tends to
 
     .. math:: S_{yu} S_{uu}^{-1} = \frac{G S_{rr} - K^* S_{vv}}{S_{rr} + |K|^2 S_{vv}}
 
-    whose K^* acts before its input: an impulse response at negative times
-    ([PintelonSchoukens2012]_, section 2.6.4). Noise through a set-point's controller alone, ``u = K
-    (r - y)``, biases by 1/K, which is causal and not seen. Lines are taken with s^2 and a taper, so
-    that neither rigid-body modes nor the end of the band spread over all lags; of Hann-windowed
-    segments only: others fold what rings on at the end of a segment to these times.
+    where K^* acts before its input: it has an impulse response at negative times
+    ([PintelonSchoukens2012]_, section 2.6.4). When set-points are the only excitation,
+    ``u = K (r - y)``, noise gives a bias of 1/K, which is causal and not detected. Lines are
+    multiplied by s^2 and a taper, so that neither rigid-body modes nor the end of the band spread
+    over all lags. The test applies to Hann-windowed segments only: with others, vibrations at the
+    end of a segment fold to these times.
     """
     import scipy.ndimage as ndi
 
@@ -62,7 +65,7 @@ def feedback_warned(frf: Frf) -> None:
     power = np.zeros(spectrum.shape)
     power[..., 1:-1] = frf.variance * weight**2
     seen = np.abs(np.fft.rfft(np.fft.irfft(spectrum, size) * window)) ** 2
-    # independent lines: their power is spread by that of the window's spectrum
+    # number of independent lines, from the width of the window's spectrum
     spread = np.abs(np.fft.fft(window) / size) ** 2
     both = np.concatenate([power, power[..., -2:0:-1]], axis=-1)
     noise = np.fft.irfft(np.fft.rfft(both) * np.fft.rfft(spread), size)[..., : n + 2]
@@ -80,9 +83,9 @@ def feedback_warned(frf: Frf) -> None:
     warn(
         f"the records were made in closed loop: near {frf.freq[f]:.4g} Hz "
         f"{share[o, i, f + 1]:.1%} of the response, {np.sqrt(ratio[o, i, f + 1]):.2g} times its "
-        "noise, come before the input acts, which "
-        "noise that returns through a controller does. The direct estimate S_yu/S_uu is biased "
-        "there towards -1/K, by at least this share, and poles with it. Record the excitation or "
+        "noise, come before the input acts. Noise that returns through a controller has this "
+        "effect. The direct estimate S_yu/S_uu is biased "
+        "there towards -1/K, by at least this fraction, and so are poles. Record the excitation or "
         "set-point and pass reference=, or use whole periods, identification.Periodic(...)."
     )
 
@@ -110,59 +113,58 @@ def estimate_frf(
     r"""Return the FRFs from inputs to outputs, with coherence and variance per line.
 
     ====================  ==========================================================
-    ``H1Estimator(...)``  S_yu S_uu^-1: noise on the outputs, open loop
-    ``H2Estimator(...)``  S_yy S_uy^-1: noise on the inputs
-    ``HvEstimator(...)``  total least squares: noise on both
-    ``Periodic(...)``     Y U^-1 of mean periods: no leakage, noise on both
-    with ``reference=r``  S_yr S_ur^-1: under feedback (joint input-output)
-    `impact_frf`          blows of a hammer, found in the record
+    ``H1Estimator(...)`` S_yu S_uu^-1: noise on the outputs, open loop ``H2Estimator(...)`` S_yy
+    S_uy^-1: noise on the inputs ``HvEstimator(...)`` total least squares: noise on both
+    ``Periodic(...)`` Y U^-1 of mean periods: no leakage, noise on both with ``reference=r`` S_yr
+    S_ur^-1: under feedback (joint input-output) `impact_frf` hammer blows, found in the record
     ====================  ==========================================================
 
-    A machine that floats is measured under feedback, where noise finds its way back to the
-    inputs and H1 is biased towards ``-1/K``. References r that are not correlated with the noise
-    give the process sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the
-    plant is their quotient (the three-point method): r is an excitation added to the commands, or
-    set-points, one for each input. Periodic signals average the noise away first, with as many
-    experiments as inputs with and without r. Inputs are what acts on the machine: the commands and
-    the excitation added to them.
+    A levitated machine is measured under feedback, where noise returns to the inputs and H1 is
+    biased towards ``-1/K``. References r that are not correlated with the noise give the process
+    sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the plant is their
+    quotient (the three-point method): r is an excitation added to the commands, or set-points, one
+    for each input. Periodic signals reduce the noise first; they need as many experiments as
+    inputs, with and without r. The inputs are the signals that act on the machine: the commands
+    plus the added excitation.
 
     Parameters
     ----------
     inputs : (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping
-        What acts on the machine; a mapping {name: (n_time,) or (n_exp, n_time)} names them.
+        Signals that act on the machine; a mapping {name: (n_time,) or (n_exp, n_time)} names them.
     outputs : (n_out, n_time) or (n_exp, n_out, n_time) array, or mapping
-        What was measured, the same way.
+        Measured signals, in the same form.
     rate : float [Hz]
     reference : array or mapping, optional
-        The excitation added inside the loop, one signal per input.
+        Excitation added inside the loop, one signal per input.
     method : H1Estimator, H2Estimator, HvEstimator or Periodic
-        How to average; ``H1Estimator()`` by default.
+        Method of averaging; ``H1Estimator()`` by default.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the outputs are; `Frf.converted` changes it.
+        Quantity of the outputs; `Frf.converted` changes it.
 
     Returns
     -------
     Frf
         With `coherence` (multiple, the same for all inputs), `variance` E|error|^2 of every entry
-        and `correlation` of the errors of different outputs; the last three are None where a
-        single period says nothing about noise; with the `resolution`, and the `window` and
-        `overlap` of segments.
+        and `correlation` of the errors of different outputs; these three are None for a single
+        period, which has no information on noise. It also stores the `resolution`, and the `window`
+        and `overlap` of segments.
 
     Warns
     -----
     FlexplantWarning
-        When an output keeps one value for longer than quantisation explains: a drop-out. Without a
-        reference, when the machine seems to respond before its inputs act: noise returns through a
-        controller, and biases the estimate (set-points as the only excitation bias it without that
-        sign: pass reference= in closed loop always); with one, at lines where the inputs are mostly
-        noise. When averages of segments are taken of inputs that repeat (`Periodic`) or are pulses
-        (`impact_frf`). With `Periodic`: when the inputs do not repeat after the stated period, or a
-        transient has not died away, with the periods to discard.
+        When an output keeps one value for longer than quantisation explains (drop-out). Without a
+        reference: when the machine seems to respond before its inputs act, since noise returns
+        through a controller and biases the estimate. (When set-points are the only excitation, the
+        bias is not detected: always pass reference= in closed loop.) With a reference: at lines
+        where the inputs are mostly noise. When segments are averaged although inputs repeat (use
+        `Periodic`) or are pulses (use `impact_frf`). With `Periodic`: when the inputs do not repeat
+        after the stated period, or a transient has not decayed, with the number of periods to
+        discard.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When records do not belong together, are too short, or inputs are dependent.
+        When records do not match, are too short, or inputs are dependent.
 
     References
     ----------
@@ -210,21 +212,22 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
     .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
 
-    Noise of an output is the same whichever input shakes, so that variances are of product form:
-    a few repetitions are averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``.
-    The correlation of the errors of two outputs is pooled over the inputs. How well the variance
-    is known (`freedom`) follows from R, the inputs and how many outputs err independently.
+    The noise of an output does not depend on the excited input, so that variances have product
+    form: the few repetitions are averaged to
+    ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``. The correlation of the errors of two
+    outputs is pooled over the inputs. The degrees of freedom of the variance (`freedom`) follow
+    from R, the inputs and the number of outputs with independent errors.
 
-    Give `multisine` another `rng` for each run: what is the same in every run, quantisation without
-    dither with the same signal, is not in the spread, and the variance 28 to 300 times too small.
-    Of a machine that drifts between runs give `identify_modes` the runs themselves: their mean
-    shows broader resonances, off by more than its deviations.
+    Use another `rng` of `multisine` for each run. With the same signal, quantisation without dither
+    is equal in every run and not part of the spread, and the variance is 28 to 300 times too small.
+    If the machine drifts between runs, pass the runs separately to `identify_modes`: their mean has
+    broader resonances, with errors larger than its standard deviations.
 
     Parameters
     ----------
     repeated : iterable of at least two Frf
-        Of the same channels, frequencies and quantity, with independent noise; four or more
-        for weights that are worth something.
+        Measurements of the same channels, frequencies and quantity, with independent noise; at
+        least four for useful weights.
 
     Raises
     ------
@@ -273,9 +276,9 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
 def _freedom(correlation: ComplexArray, size: FloatArray, spare: int, n_in: int) -> float:
     """Return the complex degrees of freedom of variances of product form."""
-    # to first order the relative variances of the three means add up, those they share taken out:
-    # `1/nu = (1/n_in + 1/n_e - 1/(n_in n_e)) / (R - 1)`, with the number of outputs that err
-    # independently, `n_e = (sum_a s_a)^2 / sum_ab |C_ab|^2 s_a s_b`
+    # to first order the relative variances of the three means add up, minus their common part:
+    # `1/nu = (1/n_in + 1/n_e - 1/(n_in n_e)) / (R - 1)`, with the number of outputs with
+    # independent errors, `n_e = (sum_a s_a)^2 / sum_ab |C_ab|^2 s_a s_b`
     power = np.mean(size**2, axis=1)
     chance = 1.0 / (spare * n_in)  # mean |C|^2 of independent errors
     alike = np.mean(np.abs(correlation) ** 2, axis=2)
@@ -287,7 +290,7 @@ def _freedom(correlation: ComplexArray, size: FloatArray, spare: int, n_in: int)
 
 def repetitions(repeated: Iterable[Frf]) -> tuple[Frf, ...]:
     """Return measurements of the same channels at the same frequencies, checked."""
-    why = "One measurement says nothing about its noise: pass two or more."
+    why = "One measurement has no information on its noise: pass two or more."
     frfs = members(repeated, Frf, "repeated measurements", why, least=2)
     first = frfs[0]
     for frf in frfs[1:]:

@@ -1,4 +1,4 @@
-"""The stages of an identification: first poles, a first fit, a refinement, the gate, the answer."""
+"""The stages of an identification: first poles, first fit, refinement, selection, result."""
 
 from __future__ import annotations
 
@@ -52,24 +52,24 @@ from .pole_test import (
 from .refine import Exhausted, Lines, PoleFit, Products, pivoted, refined, scaled_inverse
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
 
-#: half-widths beside a pole within which another one may stand for the same resonance
+#: distance from a pole, in half-widths, within which another one may belong to the same resonance
 BESIDE = 3.0
 
 
 def gated(
     fit: PoleFit, steps: int, *, alone: bool, compare: bool
 ) -> tuple[PoleFit, IntArray, tuple[Rejected, ...]]:
-    """Return the fit without poles that are none, the places of those reported, and the others."""
-    # twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at
-    # the edge of the band or is mains remains in it, not reported. Poles chosen by hand (not
-    # `alone`) are not merged
+    """Return the fit without spurious poles, the places of reported poles, and the others."""
+    # twins, and poles without information, are removed from the fit one by one; poles at the edge
+    # of the band or of mains remain in it, but are not reported. Poles chosen by hand (not `alone`)
+    # are not merged
     listed: list[Rejected] = []
     while (found := _needless(fit, steps, alone, compare)) is not None:
         place, reason = found
         listed.append(rejection(fit, place, reason))
         if fit.m == 1:
             raise SolverError(
-                f"no pole is left: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
+                f"no pole remains: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
                 "longer, or average more."
             )
         fit = _without(fit, place, steps)
@@ -89,9 +89,10 @@ def _without(fit: PoleFit, place: int, steps: int) -> PoleFit:
 def steady(
     fit: PoleFit, reported: IntArray, apart: Disagreement
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
-    """Return which poles outputs (or inputs) that disagree share, and the others."""
-    # one beside another, whose damping at one output is not known from zero (95 %), stands for what
-    # they differ by; of one whose mean damping is known no better, nothing is known
+    """Return the poles that inconsistent outputs (or inputs) share, and the others."""
+    # a pole close to another one, with a damping at one output that is not significantly above zero
+    # (95 %), represents their difference; a pole with a mean damping known no better is without
+    # information
     damping, m = -fit.poles.real, fit.m
     beside = np.array([
         np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
@@ -102,7 +103,7 @@ def steady(
     side = fit.lines.side
     reasons = (
         f"without information: over the {side} the deviation of its damping exceeds it",
-        f"not shared by the {side}: its damping differs by as much as it is",
+        f"not shared by the {side}: its damping differs by its own size",
     )
     lost = reported[(differs | unknown)[reported]]
     listed = [rejection(fit, int(k), reasons[int(differs[k])]) for k in lost]
@@ -113,22 +114,22 @@ def steady(
 
 
 def _none_left(listed: Sequence[Rejected]) -> SolverError:
-    """Return the error of an answer without poles."""
+    """Return the error for a result without poles."""
     return SolverError(
-        "no pole is left within the band: "
+        "no pole remains within the band: "
         + "; ".join(f"{f:.5g} Hz is {why}" for f, _, why in listed[:3])
         + ". Widen the band, measure longer, or average more."
     )
 
 
 def rejection(fit: PoleFit, k: int, reason: str) -> Rejected:
-    """Return the line of a list of what is not reported."""
+    """Return an entry of the list of poles that are not reported."""
     pole = complex(fit.poles[k])
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
 
 
 def _needless(fit: PoleFit, steps: int, alone: bool, compare: bool) -> tuple[int, str] | None:
-    """Return a pole that is to be left out, and why."""
+    """Return a pole to be left out, and the reason."""
     size, worse = np.abs(fit.poles), max(1.0, fit.misfit) * fit.lines.inflation
     variance = np.diag(scaled_inverse(fit.gradient()[0]))[: 2 * fit.m] * worse
     std = np.sqrt(variance).reshape(2, -1)
@@ -141,7 +142,7 @@ def _needless(fit: PoleFit, steps: int, alone: bool, compare: bool) -> tuple[int
         return None
 
     def is_shared(place: int) -> bool:
-        # true where there is no fit without it
+        # true where no fit without it exists
         with attempted("a fit without one of its poles", SolverError):
             least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
             return shared(_without(fit, place, steps), fit, least)
@@ -155,12 +156,12 @@ def _needless(fit: PoleFit, steps: int, alone: bool, compare: bool) -> tuple[int
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
     for place in lesser(fit, fit.shapes) if compare else []:
         if not is_shared(place):
-            return place, f"not shared by the {fit.lines.side}: it stands for what they differ by"
+            return place, f"not shared by the {fit.lines.side}: it represents their difference"
     return None
 
 
 def lesser(fit: PoleFit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
-    """Return the weaker poles beside others (of vectors of so high a MAC), the weakest first."""
+    """Return the weaker of neighbouring poles with a MAC above a limit, the weakest first."""
     height, found = strength(fit), []
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
@@ -171,9 +172,9 @@ def lesser(fit: PoleFit, vectors: ComplexArray, alike: float = 0.0) -> list[int]
 
 
 def single(lines: Lines, fit: PoleFit, vectors: ComplexArray, steps: int) -> PoleFit:
-    """Return the fit of lines, of one pole a resonance, whose participation are these vectors."""
-    # rows that disagree give each resonance several poles of one participation (or, exchanged,
-    # shape). It is held: poles that the rows do not share would bend it
+    """Return the fit of lines with one pole per resonance and the given participation vectors."""
+    # inconsistent rows give each resonance several poles with one participation (or shape, if
+    # exchanged). It is held fixed, since poles that the rows do not share would change it
     keep = np.delete(np.arange(fit.m), lesser(fit, vectors, ALIKE))
     start = pivoted(lines, fit.poles[keep], vectors[:, keep])
     now = start.poles, start.participation
@@ -181,7 +182,7 @@ def single(lines: Lines, fit: PoleFit, vectors: ComplexArray, steps: int) -> Pol
 
 
 def _rejection(lines: Lines, pole: complex) -> str | None:
-    """Return why a pole of the fit is not reported, None where it is."""
+    """Return the reason why a pole of the fit is not reported, None where it is reported."""
     freq, width = abs(pole) / (2 * np.pi), -2.0 * pole.real / (2 * np.pi)
     low, high = float(lines.freq[0]), float(lines.freq[-1])
     spacing = float(np.median(np.diff(lines.freq)))
@@ -194,45 +195,46 @@ def _rejection(lines: Lines, pole: complex) -> str | None:
     return None
 
 
-#: what poles of their own may belong to, beside outputs and inputs
+#: what may have separate poles, in addition to outputs and inputs
 RUNS = "runs"
-#: of an identification, for its bar: the diagram, twice fit and growth, the answer
+#: number of steps of the progress bar: the diagram, fit and extension twice, the result
 STAGES = 6
-#: changes of one kind that are accepted, and poles that a fit may have
+#: largest number of accepted changes of one kind, and of poles of a fit
 MOST, MOST_POLES = 6, 60
-#: lines apart that poles at peaks have: a peak that is no resonance of a linear machine is
-#: explained badly, and what is left of it is no other pole; and lines that a peak has beside it on
-#: either side, where the edge of the band shows one flank only
+#: least distance, in lines, of poles at peaks: a peak that is not a linear resonance is explained
+#: badly, and its remainder is not another pole; and number of lines required on either side of a
+#: peak, since only one flank is visible at the edge of the band
 REGION, FLANK = 20, 5
-#: power of the largest line for the middle one's, of a response that stands out: of noise in one
-#: channel, the largest of a million lines is 20 times the middle one
+#: ratio of the power of the largest line to the median line above which a response counts as
+#: significant: for noise in one channel, the largest of a million lines has a ratio of 20
 STANDS_OUT = 20.0
-#: values of the FRF times (poles times references) squared, the products of a step of the fit, up
-#: to which it is made without a request: some seconds altogether
+#: number of operations of a step (values of the FRF times (poles times references) squared) up to
+#: which the fit is made without a request: a few seconds in total
 UNASKED = 5e7
-#: products that a refinement without a request may take in all, a minute or two
+#: total number of operations of a refinement without a request, one or two minutes
 BUDGET = 5e10
-#: multiplications of a whole fit and of a first answer for those of a step, on average
+#: operations of a whole fit and of a first result relative to those of a step, on average
 _REFINED, _FIRST = 6e3, 200.0
-#: misfit of a first answer that is warned of: deviations are enlarged by its square root
+#: misfit of a first result above which a warning is given: deviations are enlarged by its square
+#: root
 LARGE = 4.0
-#: steps that compare fits: the diagram's poles are off by more than noise makes them
+#: number of steps before fits are compared, since the poles of the diagram have errors beyond noise
 QUICK = 2
 
 
 @dataclass(frozen=True)
 class Task:
-    """What an identification is to do, checked."""
+    """Checked settings of an identification."""
 
     frf: Frf
     runs: int
-    #: residual terms of modes below the band; of modes above, None where the data choose
+    #: number of residual terms of modes below the band; of modes above, None where the data decide
     lower: int
     upper: int | None
     hold: float | None
     labels: Mapping[str, str]
-    #: what may have poles of its own (outputs, inputs, runs), empty where the data are to say it,
-    #: and which of its rows were measured together
+    #: what may have separate poles (outputs, inputs, runs), empty where the data decide, and which
+    #: rows were measured together
     side: str
     together: tuple[IntArray, ...]
     refine: bool | None
@@ -241,7 +243,7 @@ class Task:
     budget: Products = field(default_factory=Products)
 
     def lines(self, ready: PreparedLines) -> Lines:
-        """Return lines with all residual terms: no pole is kept or moved to stand in for one."""
+        """Return lines with all residual terms, so that no pole replaces a residual term."""
         rows = RUNS if self.side == RUNS and ready.side == "outputs" else ready.side
         return Lines(
             *(ready.freq, ready.data, ready.weight, self.lower),
@@ -257,13 +259,13 @@ class Task:
 
 
 class _Begin(NamedTuple):
-    """The poles that a fit begins with."""
+    """The start poles of a fit."""
 
     poles: PoleSelection
     diagram: StabilisationDiagram | None = None
-    #: the diagram's own choice, which a fit may add to and take from
+    #: whether the diagram chose the poles; a fit may then add and remove poles
     alone: bool = False
-    #: of peaks, which no fit makes better
+    #: whether the poles are those of peaks, which no fit improves
     at_peaks: bool = False
 
 
@@ -290,7 +292,7 @@ def identified(
     if start is not None and start.participation.shape[0] != references:
         raise ShapeError(
             f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
-            f"has {references}: make the diagram from the same channels."
+            f"has {references}: compute the diagram from the same channels."
         )
     listed = affordable(orders, ready)
     if not ready.known:
@@ -307,7 +309,8 @@ def identified(
     ) as bar:
         bar.advance()
         expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
-        # one step is as near to a machine as noise is; what outputs disagree in needs more
+        # after one step the error is as small as the noise; differences between outputs need more
+        # steps
         judged = refine is not False and not begin.at_peaks
         quick = QUICK if judged else int(begin.alone)
         fit, weaker = _first_fit(task.lines(ready), begin.poles, begin.alone, quick)
@@ -318,7 +321,7 @@ def identified(
         elif refine is None and costly:
             reason = f"refine=True for more, {work:.1e} operations a step"
         elif differ:
-            reason = f"a refinement comes no nearer to poles that {now.lines.side} do not share"
+            reason = f"a refinement does not improve poles that {now.lines.side} do not share"
         else:
             now, reason = _second(task, now, begin.alone, bar)
         found = _answered(task, now, begin, weaker, reason, differ)
@@ -328,7 +331,7 @@ def identified(
 
 
 def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
-    """Return the poles that stay over the orders of the diagram, else those of the peaks."""
+    """Return the poles that are stable over the orders of the diagram, else those of the peaks."""
     diagram = diagram_of(ready, orders, (0.01, 0.05, 0.95), 0.2)
     try:
         return _Begin(diagram.automatic(), diagram, alone=True)
@@ -341,11 +344,11 @@ def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
         if found is None:
             raise
     warn(
-        "no pole stays over the orders of the stabilisation diagram: the poles are those "
+        "no pole is stable over the orders of the stabilisation diagram: the poles are those "
         + (
-            "of the highest peaks, their damping is no more than its order of magnitude "
-            "and their deviations are half a width of the resonance. A transient that has "
-            "not decayed or a single run looks so: average over more runs."
+            "of the highest peaks, their damping is only an order of magnitude, and their "
+            "deviations are half a width of the resonance. A transient that has not decayed or a "
+            "single run may be the cause: average over more runs."
             if peaks
             else "nearest the largest response. Widen the band, or choose from the diagram "
             "by hand (start=)."
@@ -355,7 +358,7 @@ def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
 
 
 def _by_rows(task: Task, now: _Stage, alone: bool, judged: bool) -> tuple[_Stage, bool]:
-    """Return the fit of shared poles where outputs, inputs or runs disagree, and whether they do.
+    """Return the fit of shared poles if outputs, inputs or runs disagree, and whether they do.
 
     Inputs that disagree are compared with inputs and outputs exchanged.
     """
@@ -366,7 +369,7 @@ def _by_rows(task: Task, now: _Stage, alone: bool, judged: bool) -> tuple[_Stage
         fit = less if outputs_disagree(less, fit.cost) else fit
     differ = judged and outputs_disagree(fit)
     asked = task.side not in ("", lines.side)
-    # more than noise is left, or poles stand beside each other
+    # the residual is more than noise, or poles lie close to each other
     odd = fit.misfit > NOISE or bool(lesser(fit, fit.shapes, ALIKE))
     open_ = not task.side and judged and not differ and len(fit.participation) > 1
     if asked or (open_ and odd):
@@ -383,7 +386,7 @@ def _second(task: Task, first: _Stage, alone: bool, bar: Progress) -> tuple[_Sta
     try:
         return _likeliest_fit(task, first, alone, bar), ""
     except Exhausted:
-        return first, f"more is left than shared poles explain after {BUDGET:.0e} operations"
+        return first, f"shared poles do not explain the data after {BUDGET:.0e} operations"
     finally:
         task.budget.most = np.inf
 
@@ -391,9 +394,9 @@ def _second(task: Task, first: _Stage, alone: bool, bar: Progress) -> tuple[_Sta
 def _answered(
     task: Task, now: _Stage, begin: _Begin, weaker: tuple[Rejected, ...], reason: str, differ: bool
 ) -> IdentifiedModes:
-    """Return the modes of a fit that pass the gate; `reason`: why it was not refined."""
+    """Return the accepted modes of a fit; `reason`: why it was not refined."""
     ready, lines, settled = now.ready, now.lines, not reason
-    # poles that outputs are to share are known where a refinement, or own fits, were made
+    # poles that outputs share are known after a refinement or after separate fits
     compare = settled or differ
 
     count = task.steps if settled else QUICK * int(compare)
@@ -408,7 +411,7 @@ def _answered(
             reported, others = steady(fit, reported, apart)
             fit = PoleFit(lines, apart.poles, fit.participation, fit.pivots)
             rejected += others
-    # a first answer may leave some misfit, but not so much that deviations are twice as large
+    # a first result may have some misfit, but deviations must not be enlarged to the double
     if compare or task.budget.done > BUDGET or (begin.alone and fit.misfit > LARGE):
         odd = None if apart is None else (apart.size, lines.side, _odd(task.frf, lines, apart))
         warned(unexplained(fit), odd)
@@ -427,18 +430,18 @@ def _answered(
 
 
 def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
-    """Return which output, input or run is off by far more than the others, empty where none is."""
+    """Return the output, input or run that deviates far more than the others, else empty."""
     if apart.odd is None:
         return ""
     place, off = apart.odd
     names = frf.inputs if lines.side == "inputs" else frf.outputs
     who = f"run {place + 1}" if lines.side == RUNS else names[int(lines.parts[place][0])]
-    return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
+    return f"{who} deviates by {100 * off:.2g} %, far more than the others: check it. "
 
 
 def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
-    """Return the diagram's pole nearest the largest response, None where nothing stands out."""
-    # in a narrow band, which affords few orders, outputs that disagree have no stable poles
+    """Return the diagram's pole closest to the largest response, None without a clear peak."""
+    # in a narrow band, which allows few orders, inconsistent outputs have no stable poles
     power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
     inner = slice(FLANK, -FLANK)
     place = int(np.argmax(power[inner]))
@@ -450,9 +453,9 @@ def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection 
 
 
 def _at_peaks(lines: Lines) -> PoleSelection | None:
-    """Return poles at the peaks of a response that no stable poles explain, as a grid finds them.
+    """Return poles at the peaks of a response without stable poles, found on a grid.
 
-    Where the phase rises through a resonance (a transient, a record of one run) none is stable.
+    Where the phase rises through a resonance (a transient, a record of one run), no pole is stable.
     """
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
@@ -476,15 +479,15 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
 ) -> tuple[PoleFit, tuple[Rejected, ...]]:
-    """Return the fit near the poles chosen, with all residual terms and no search for others."""
-    # of more poles than are requested the strongest are kept; the others are returned too
+    """Return the fit near the chosen poles, with all residual terms and no search for others."""
+    # if there are more poles than requested the strongest are kept; the others are returned too
     if not alone:
         fit = PoleFit(lines, chosen.poles, chosen.participation)
         now = fit.poles, fit.participation
         return (refined(lines, *now, steps=steps, strict=False) if steps else fit), ()
     fit = supported(lines, chosen.poles, chosen.participation)
     height = strength(fit)
-    height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
+    height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # only one of two poles of one resonance counts
     places = np.argsort(-height, kind="stable")
     keep, others = np.sort(places[: lines.most]), places[lines.most :]
     weaker = tuple(rejection(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
@@ -507,7 +510,7 @@ def _likeliest_fit(task: Task, first: _Stage, alone: bool, bar: Progress) -> _St
     for _ in range(1 if ready.known else 2):
         lines = task.lines(ready)
         start = supported(lines, poles, part) if alone else pivoted(lines, poles, part)
-        # poles that turn out to be none may keep it from settling: judged at the end
+        # spurious poles may prevent convergence, which is therefore judged at the end
         fit = refined(
             lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
         )

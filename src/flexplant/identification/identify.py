@@ -1,4 +1,4 @@
-"""From measured FRFs to poles, mode shapes and their covariance."""
+"""Poles, mode shapes and their covariance from measured FRFs."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from .identification_stages import MOST_POLES, RUNS, Task, identified
 from .line_weights import prepared_lines
 from .result import IdentifiedModes, of_segments
 
-#: most residual terms on one side of the band: powers of a frequency beyond tell no more apart in
-#: double precision
+#: largest number of residual terms on one side of the band: higher powers of a frequency cannot be
+#: distinguished in double precision
 MOST_TERMS = 20
 
 
@@ -48,26 +48,27 @@ def stabilisation_diagram(
     Parameters
     ----------
     frf, band
-        As for `identify_modes`. Velocity and acceleration are integrated; no quantity is taken for
-        displacement.
+        As for `identify_modes`. Velocity and acceleration are integrated; an FRF without a quantity
+        counts as displacement.
     orders : iterable of int, optional
         Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
-        of the lines, or to 100 poles; every other one where many references make each costly.
+        of the lines, or to 100 poles; every second one where many references make each costly.
     tolerances : (float, float, float)
-        Relative change of frequency and of damping from one order to the next, and the MAC,
-        for a pole to be called stable.
+        Relative change of frequency and of damping from one order to the next, and the MAC, below
+        which a pole counts as stable.
     max_zeta : float
-        Poles with more damping are left out.
+        Largest damping ratio of a pole.
 
     Returns
     -------
     StabilisationDiagram
-        Choose with `.automatic()` or `.select(freq=[...])`; draw with `plot.stabilisation`.
+        Diagram; `.automatic()` or `.select(freq=[...])` choose poles, `plot.stabilisation` draws
+        it.
 
     Raises
     ------
     ModelError
-        When the band holds less than 20 lines, or orders or tolerances are out of range.
+        When the band has less than 20 lines, or orders or tolerances are out of range.
 
     References
     ----------
@@ -90,7 +91,9 @@ def stabilisation_diagram(
             "tolerances are (frequency, damping, MAC), positive, the MAC below 1, got "
             f"{tolerances!r}."
         )
-    top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
+    top = between(
+        max_zeta, "max_zeta", 0.0, 1.0, "With 1 or more nothing oscillates: pass for example 0.2."
+    )
     ready = prepared_lines(forward_in_time(frf, band), band)
     listed = None if orders is None else checked_orders(orders)
     if not ready.known:
@@ -118,76 +121,78 @@ def identify_modes(
     """Return poles, mode shapes and their covariance from measured FRFs.
 
     ``found = fx.identify_modes(frf, band=(50.0, 800.0), dofs={"y1": "41:z"})``: `found.freq` [Hz],
-    `found.zeta` and `found.shapes` are the answer, `found.rejected` says which poles were left out
-    and why, and `fx.plot.identified` draws it beside the measurement.
-    ``fx.Eigenvalues(fx.numbered(found, drawing))`` is what `update` takes. Poles come from a
-    stabilisation diagram and a maximum likelihood fit, without choices to make; `start=` takes
-    poles picked by eye. Modes outside the band are accounted for; what the
-    fit does not explain is warned of, with its frequency. How it works: `algorithms`.
+    `found.zeta` and `found.shapes` are the result, `found.rejected` lists the poles that were left
+    out with the reason, and `fx.plot.identified` draws the result together with the measurement.
+    ``fx.Eigenvalues(fx.numbered(found, model))`` is the input of `update`. Poles come from a
+    stabilisation diagram and a maximum likelihood fit, without choices by the user; `start=`
+    accepts poles picked by eye. Modes outside the band are taken into account, and a warning names
+    frequencies that the fit does not explain. The method is described in `algorithms`.
 
     Parameters
     ----------
     frf : Frf, or list of Frf
-        Measured, or runs of the same channels between which the machine may have drifted (a mean of
-        these shows broader resonances, and hides it): poles are then means over the runs, with
-        deviations from how these differ.
-        With a variance, errors are weighted by it and the covariance follows from it (and from the
-        correlation between outputs, and between lines by the window, where known); without, both
-        come from what the fit leaves, averaged over 41 lines.
+        Measured FRF, or several runs with the same channels between which the machine may have
+        drifted (a mean of the runs would have broader resonances). Poles are then means over the
+        runs, with deviations from their differences. With a variance, errors are weighted by it and
+        the covariance follows from it (and from the correlation between outputs, and between lines
+        by the window, where known); without a variance, both come from the residual of the fit,
+        averaged over 41 lines.
     band : (low, high) [Hz], optional
-        What to fit and report; all by default.
+        Frequency band of the fit and of the reported modes; all lines by default.
     orders : iterable of int, optional
-        Of the stabilisation diagram, whose default it is.
+        Model orders of the stabilisation diagram, with the same default.
     start : PoleSelection, optional
         Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
     lower : int
         Number of residual terms of rigid-body modes and modes below the band.
     upper : int, optional
-        Number of those of modes above; when not given 3, and up to 25 where the data require them:
-        with too few the poles are biased by a standard deviation before the misfit shows it.
+        Number of residual terms of modes above the band. None: 3, and up to 25 where the data
+        require them. With too few terms, the poles are biased by a standard deviation before the
+        misfit shows it.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
-        sampled plant. Modes above half the rate are then seen folded, as broad ones of several per
-        cent of damping, where no filter keeps them out.
+        sampled plant. Modes above half the rate then appear folded, as broad modes with several per
+        cent of damping, unless a filter removes them.
     dofs : mapping {channel: DOF label}, optional
-        Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
-        input and an output share a DOF.
+        DOFs of outputs and inputs. They label the shapes, which are mass-normalised where an input
+        and an output share a DOF.
     setups : lists of channels, optional
-        Which outputs (or which inputs) were measured together, where a sensor (or a hammer) roved:
-        poles may differ from one to the next. Each by itself when not given.
+        Groups of outputs (or inputs) that were measured together, when a sensor (or a hammer) was
+        moved: poles may differ between groups. None: every channel is a separate group.
     refine : bool, optional
-        Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
-        times (poles times references) squared up to 5e7 at each step, 5e10 in all) and worth it:
-        not where outputs disagree, which poles of their own explain and shared ones do not. False
-        takes about a second.
+        Whether to fit by maximum likelihood. None: where it is cheap (values of the FRF times
+        (poles times references) squared up to 5e7 at each step, 5e10 in total) and useful; it is
+        not useful where separate poles of the outputs explain the data and shared ones do not.
+        False takes about a second.
     most : int
-        Poles that the fit may have, the strongest; others of the diagram are in `rejected`.
+        Largest number of poles of the fit, the strongest ones; others of the diagram are in
+        `rejected`.
     max_iterations : int
-        Of the fit.
+        Largest number of iterations of the fit.
     progress : bool, optional
-        A bar of the stages: None shows one on a terminal for work of more than two seconds, and
-        anywhere when a costly refinement is requested, with its cost.
+        Whether to show a progress bar. None: on a terminal for work of more than two seconds, and
+        always when a costly refinement is requested, with its cost.
 
     Returns
     -------
     IdentifiedModes
-        A `MeasuredModes`, sorted by frequency, without mode numbers (see `numbered`). Its
-        covariance is enlarged by the misfit where that exceeds one.
+        `MeasuredModes` sorted by frequency, without mode numbers (see `numbered`). The covariance
+        is enlarged by the misfit where the misfit exceeds one.
 
     Warns
     -----
     FlexplantWarning
-        When the residual of a stretch of lines is more than noise: a missed or merged mode; or
-        when a resonance is narrower than half a line of Hann-windowed segments, or than about four
-        where the window is not fitted through; when the FRF is of the convention exp(-i omega t),
-        whose conjugate is then used.
+        When the residual of a group of lines is more than noise (a missed or merged mode); when a
+        resonance is narrower than half a line of Hann-windowed segments, or than about four lines
+        where the fit does not include the window; when the FRF uses the convention exp(-i omega t),
+        so that its conjugate is used.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When an argument is out of range or does not belong to this FRF.
+        When an argument is out of range or does not match this FRF.
     SolverError
-        When no pole is found, or the fit does not settle.
+        When no pole is found, or the fit does not converge.
 
     References
     ----------
@@ -217,9 +222,7 @@ def identify_modes(
             rate = None if hold is None else positive(hold, "hold")
             high = float(ready.freq[-1])
             if rate is not None and high > rate / 2 * (1 + ROUNDING):
-                raise ModelError(
-                    f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together."
-                )
+                raise ModelError(f"a hold at {rate:g} Hz does not match lines up to {high:g} Hz.")
             if start is not None:
                 instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
             side, together = _checked_sides(setups, runs)
@@ -255,7 +258,7 @@ def _checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
 
 
 def _checked_sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArray, ...]]:
-    """Return what may have poles of its own where that was said, and which rows go together."""
+    """Return what may have separate poles, if stated, and which rows belong together."""
     frf, count = runs[0], len(runs)
     if setups is None:
         if count == 1:
@@ -266,7 +269,7 @@ def _checked_sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArra
     for side, names in (("outputs", frf.outputs), ("inputs", frf.inputs)):
         if flat == sorted(names) and len(listed) > 1 and all(listed):
             if count > 1:
-                raise ModelError("setups= are those of one measurement, got several: give one.")
+                raise ModelError("setups= needs a single measurement, got several: give one.")
             return side, tuple(np.array([names.index(name) for name in one]) for one in listed)
     raise LabelError(
         f"setups are two lists or more that hold each of the outputs {short(list(frf.outputs))}, "

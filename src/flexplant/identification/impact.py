@@ -1,4 +1,4 @@
-"""Impact tests: blows of a hammer found in records, and the damping of their window taken out."""
+"""Impact tests: hammer blows found in records, and removal of the window's damping."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from .line_weights import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, error_statistics, records
 
-#: a pulse is this many deviations of the force's noise high: one of 10^8 samples of noise is
+#: least height of a pulse in standard deviations of the force's noise: one of 10^8 samples exceeds
+#: it
 NOISE = 6.0
-#: median of |x| of normal noise times this is its deviation
+#: ratio of the standard deviation of normal noise to the median of |x|
 NORMAL = 1.4826
-#: number of equal samples at a channel's extreme value that are a limit, where one of the two steps
-#: before them is larger than this number of quanta. As many equal samples at a smooth peak,
-#: ``p - c t^2``, have c of at most a quantum, and steps of ``3 c`` and ``5 c`` before them, with a
-#: quantum of rounding
+#: number of equal samples at the extreme value of a channel that indicate clipping, and number of
+#: quanta that one of the two preceding steps must exceed. The same number of equal samples at a
+#: smooth peak, ``p - c t^2``, means that c is at most a quantum, with preceding steps of ``3 c``
+#: and ``5 c`` plus a quantum of rounding
 FLAT, STEEP = 3, 6.0
-#: the window ends at exp(-4), 2 %, by default: resonances are 1.3 lines wide at least
+#: exponent of the window's end, exp(-4) = 2 %, by default: resonances are at least 1.3 lines wide
 WINDOWS = 4.0
-#: complex degrees of freedom of a variance, averaged over lines where there are few blows
+#: complex degrees of freedom of a variance, reached by averaging over lines when blows are few
 FREEDOM = 8
 
 
@@ -41,15 +42,15 @@ class Blow(Value):
     Parameters
     ----------
     input : str
-        The channel of its force.
+        Channel of the force.
     time : float [s]
-        When its pulse begins.
+        Time at which the pulse begins.
     peak : float
         Largest force, in the unit of the record.
     experiment : int
-        In which record, from 0.
+        Number of the record, from 0.
     reason : str
-        Why it is refused, empty where it is not.
+        Reason why it is refused, or empty.
 
     Examples
     --------
@@ -66,20 +67,20 @@ class Blow(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImpactTest(Value):
-    """FRFs of blows, made by `impact_frf`: as their window damps them.
+    """FRFs of an impact test by `impact_frf`, with the damping of the window.
 
     Parameters
     ----------
     frf : Frf
         ``H(s + 1/decay)`` at ``s = i omega``: every pole has moved by ``-1/decay``. The window
-        makes errors of neighbouring lines depend on each other, of which fits know nothing: its
-        variance is enlarged by `dependence`, so that a mean over lines has that of its errors.
+        correlates the errors of neighbouring lines, which fits do not model. The variance is
+        therefore enlarged by `dependence`, so that a mean over lines has the correct variance.
     used, refused : sequences of Blow
-        The blows averaged, and those that were not, with their reasons.
+        Averaged blows, and refused blows with the reason.
     segment : float [s]
         Length of record after each blow.
     decay : float [s]
-        Time constant of the window; infinite: none.
+        Time constant of the window; infinite without a window.
 
     Examples
     --------
@@ -118,40 +119,41 @@ class ImpactTest(Value):
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
         r"""Return modes identified from `frf` without the window's damping.
 
-        Poles whose damping beyond the window is within its deviation go to `rejected`. Force and
-        responses times ``exp(-t/tau)`` are those of ``H(s + 1/tau)``: poles move by
-        -1/tau exactly, residues not at all. Of noise white in time, a fit of
-        ``g = t exp(-(a + 1/tau) t)``, a pole's derivative, has the variance
+        Poles whose damping beyond the window is within its deviation are moved to `rejected`. Force
+        and responses times ``exp(-t/tau)`` belong to ``H(s + 1/tau)``: poles move by exactly
+        -1/tau, and residues do not change. For white noise, a fit of ``g = t exp(-(a + 1/tau) t)``,
+        the derivative of a pole, has the variance
 
         .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
             \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
 
-        times that of independent lines, without the enlarged variance of `frf`; residues the same
-        without the cube.
+        relative to that of independent lines, without the enlarged variance of `frf`; for residues
+        the same without the cube.
 
         Parameters
         ----------
         found : IdentifiedModes
-            From `identify_modes` of `frf`.
+            Result of `identify_modes` for `frf`.
 
         Raises
         ------
         ModelError, SolverError
-            When the window's damping was taken out of them before, or no pole has damping beyond
-            it, and its deviation.
+            When the damping of the window was removed before, or no pole has damping beyond it and
+            its deviation.
         """
         instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):
             return found
         if found.undamped:
             raise ModelError(
-                "the window's damping is out of these modes already: pass identify_modes(test.frf)."
+                "the window's damping is already removed from these modes: pass "
+                "identify_modes(test.frf)."
             )
         shift = 1.0 / self.decay
         rate = -(found.poles.real + shift)
         known = np.zeros(rate.size) if found.std is None else found.std.real
         mains = [mains_multiple(freq, 1.0 / self.segment) for freq in found.freq.tolist()]
-        # a line of mains has none: by chance it is beyond one deviation in one of six
+        # a mains line has no damping, but exceeds one deviation by chance in one of six cases
         least = known * np.where([one is None for one in mains], 1.0, 2.0)
         damped = np.flatnonzero((rate > 0) & (rate > least))
         listed = [(f, z - shift / (2 * np.pi * f), why) for f, z, why in found.rejected]
@@ -162,8 +164,9 @@ class ImpactTest(Value):
             listed.append((float(found.freq[k]), float(rate[k] / abs(found.poles[k])), why))
         if not damped.size:
             raise SolverError(
-                f"no pole has damping beyond the window's {shift:.3g} rad/s: they are disturbances "
-                "of one frequency, or the segments are too short. Take longer ones, segment=."
+                f"no pole has damping beyond the window's {shift:.3g} rad/s: they are "
+                "disturbances with a single frequency, or the segments are too short. Use "
+                "longer ones, segment=."
             )
         kept, rate = found.select(damped.tolist()), rate[damped]
         share = (rate + shift) / (rate + 2 * shift)
@@ -197,44 +200,44 @@ def impact_frf(
 ) -> ImpactTest:
     r"""Return the FRFs of an impact test, ``G = sum(Y F^*) / sum(F F^*)`` over its blows.
 
-    Blows are the pulses of the force in long records. Each has a segment of its own, in which the
-    force beside the pulse is set to zero (the force window) and force and responses are multiplied
-    by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.corrected` takes it out).
-    What rings on at its end changes residues and no pole. Left out are blows with another one in
-    their segment, clipped ones, and those cut off by the end of the record. Before a record that
-    begins with a blow the machine is taken to be at rest.
+    Blows are the pulses of the force in long records. Each blow has a separate segment, in which
+    the force outside of the pulse is set to zero (force window), and force and responses are
+    multiplied by ``exp(-t/decay)``. This moves all poles by -1/decay (`ImpactTest.corrected`
+    reverses it). Vibration that remains at the end of a segment changes residues but no pole. Blows
+    are left out if their segment contains another blow, if they are clipped, or if the record ends
+    too early. The machine is assumed to be at rest before a record that begins with a blow.
 
     Parameters
     ----------
     force : (n_time,), (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping by name
-        The hammer's force, a channel for each point that is struck; those that are not are zero.
+        Force of the hammer, one channel for each struck point; zero for points that are not struck.
     response : array or mapping
-        What was measured, as for `estimate_frf`.
+        Measured responses, as for `estimate_frf`.
     rate : float [Hz]
     segment : float [s]
         Length of record for each blow; its inverse is the resolution.
     decay : float [s], optional
-        Time constant of the exponential window: a quarter of the segment by default, infinite
-        for none.
+        Time constant of the exponential window: a quarter of the segment by default, infinite for
+        no window.
     level : float
-        Share of the largest force of a record above which a pulse begins, between 0 and 1.
+        Fraction of the largest force of a record above which a pulse begins, between 0 and 1.
     limits : mapping {channel: value}, or float, optional
-        Full scale of channels, or of all: a blow that reaches it is refused. A channel without one
-        is at its limit where it stays at its extreme value after a steep rise, unless this is the
-        level at which it rests; ``limits=1e9`` switches that test off. Outputs that keep one value
-        are warned of.
+        Full scale of each channel, or of all channels: a blow that reaches it is refused. A channel
+        without a limit counts as clipped where it stays at its extreme value after a steep rise,
+        unless this is its value at rest; ``limits=1e9`` disables this test. A warning names outputs
+        that keep one value.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the responses are.
+        Quantity of the responses.
 
     Returns
     -------
     ImpactTest
-        With the FRF, its coherence, variance and correlation, and the blows used and refused.
+        FRF with coherence, variance and correlation, and the used and refused blows.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When records do not belong together, or an input has no blow that can be used.
+        When records do not match, or an input has no blow that can be used.
 
     References
     ----------
@@ -314,7 +317,7 @@ def _averaged(
     resolution: float,
     names: dict[str, Any],
 ) -> Frf:
-    """Return H1 over the blows (n_blow, ...) of each input; noise is what they leave together."""
+    """Return H1 over the blows (n_blow, ...) of each input; noise is their common residual."""
     import scipy.ndimage as ndi
 
     power = np.array([np.sum(np.abs(one) ** 2, axis=0) for one in F])
@@ -334,7 +337,7 @@ def _averaged(
         inverse = np.einsum("if,ij->fij", 1.0 / power, np.eye(len(F)))
         variance, correlation = error_statistics(left, inverse)
         if not np.all(variance > 0):
-            variance = correlation = None  # no noise at all: nothing to weight by
+            variance = correlation = None  # no noise at all, hence no weights
         seen = np.stack([np.sum(np.abs(y) ** 2, axis=0) for y in Y], axis=1)
         coherent = np.abs(np.stack(cross, axis=1)) ** 2
         coherence = np.clip(coherent / np.maximum(power[None] * seen, TINY), 0.0, 1.0)
@@ -354,7 +357,7 @@ def _averaged(
 def _blows(
     data: Records, f: FloatArray, e: int, level: float, length: int, full: Mapping[str, float]
 ) -> Iterator[tuple[Blow, int, int, tuple[int, int]]]:
-    """Yield the blows of experiment e: input, where the segment begins, samples before, width."""
+    """Yield the blows of experiment e: input, start of the segment, samples before, width."""
     largest = float(np.abs(f).max())
     pulses = sorted(
         (begin, end, i)
@@ -362,7 +365,7 @@ def _blows(
         for begin, end in _pulses(force, level, largest)
     )
     before = 2 + max((end - begin for begin, end, _ in pulses), default=0)
-    # a force rests nearly all the time, within its noise; what a response does between is not known
+    # a force is at rest nearly all the time, within its noise; for responses this is not known
     rest = NOISE * NORMAL * np.median(np.abs(f[e]), axis=1)
     limited = _limited(data.u[e], data.inputs, full, rest)
     limited |= _limited(data.y[e], data.outputs, full, np.zeros(len(data.outputs)))
@@ -382,7 +385,7 @@ def _blows(
 
 
 def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, int]]:
-    """Return where pulses begin and end; those nearer than the width of one are one pulse."""
+    """Return start and end of pulses; pulses closer than the width of one are merged."""
     size = float(np.abs(force).max())
     noise = NORMAL * float(np.median(np.abs(force)))
     high = np.flatnonzero(np.abs(force) > max(level * size, NOISE * noise))
@@ -399,7 +402,7 @@ def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, 
 
 
 def _unusable(begins: list[int], k: int, start: int, length: int, n_time: int, rate: float) -> str:
-    """Return why a blow cannot be used, nothing where it can."""
+    """Return the reason why a blow cannot be used, empty where it can."""
     if k and begins[k] < begins[k - 1] + length - (begins[k] - start):
         return f"a blow came {(begins[k] - begins[k - 1]) / rate:.3g} s before"
     if k + 1 < len(begins) and begins[k + 1] < start + length:
@@ -412,9 +415,9 @@ def _unusable(begins: list[int], k: int, start: int, length: int, n_time: int, r
 def _limited(
     signals: FloatArray, names: tuple[str, ...], full: Mapping[str, float], rest: FloatArray
 ) -> dict[str, Any]:
-    """Return {channel: samples at the limit of its range}, of those that ever are.
+    """Return {channel: samples at the limit of its range} for channels with such samples.
 
-    `rest` is how far from their medians signals (n, n_time) may be at rest.
+    `rest` is the largest deviation of signals (n, n_time) from their median at rest.
     """
     found = {}
     for name, signal, near in zip(names, signals, rest.tolist(), strict=True):
@@ -423,7 +426,7 @@ def _limited(
         else:
             at = np.zeros(signal.size, dtype=np.bool_)
             steps = np.abs(np.diff(signal))
-            # the quantum of a converter; without one the rounding of the numbers
+            # the quantum of a converter, or the rounding of the numbers
             quantum = float(np.diff(np.unique(signal)).min(initial=np.inf))
             for extreme in (signal.max(), signal.min()):
                 if abs(extreme - np.median(signal)) > near:
@@ -445,7 +448,7 @@ def _flat_runs(extreme: Any, steps: FloatArray, steep: float) -> Any:
 
 
 def _dependence(damped: float) -> float:
-    """Return x coth(x) of T/tau; 1 without a window."""
+    """Return x coth(x) for x = T/tau; 1 without a window."""
     return damped / float(np.tanh(damped)) if damped else 1.0
 
 

@@ -1,4 +1,4 @@
-"""Which lines count how much: from the variance of a measurement, or from what a fit left over."""
+"""Weights of lines, from the variance of a measurement or from the residual of a fit."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ..errors import ModelError
 from ..lti.frequency import Frf
 from ..words import instance
 
-#: lines over which what a fit leaves is averaged to a variance
+#: number of lines over which the residual of a fit is averaged to a variance
 WINDOW = 41
 #: frequencies [Hz] of mains
 MAINS = (50.0, 60.0)
-#: width of a resonance in lines below which a disturbance of one frequency looks the same
+#: width of a resonance in lines below which it looks like a disturbance with a single frequency
 NARROW = 0.5
-#: lines beside a mains multiple that windows spread it over, and those up to which it is compared
+#: number of lines over which windows spread a mains multiple, and of lines for the comparison
 SPREAD, COMPARED = 2, 8
-#: probability that noise anywhere in the band passes for mains
+#: probability that noise anywhere in the band is taken for mains
 CHANCE = 1e-3
 
 #: frequency [Hz], damping ratio and the reason why a pole, or a line, is not reported
@@ -39,11 +39,11 @@ class PreparedLines:
     known: bool  # whether the weights come from a variance
     swapped: bool
     line_correlation: sp.csr_array | None = None  # of errors of different lines
-    mains: tuple[Rejected, ...] = ()  # whose lines are left out
+    mains: tuple[Rejected, ...] = ()  # mains whose lines are left out
 
     @property
     def side(self) -> str:
-        """What the first axis is."""
+        """Name of the first axis."""
         return "inputs" if self.swapped else "outputs"
 
     @property
@@ -61,7 +61,7 @@ class PreparedLines:
 
     @property
     def inflation(self) -> float:
-        """By how much the variance of a mean over many lines exceeds that of independent ones."""
+        """Ratio of the variance of a mean over many lines to that of independent lines."""
         if self.line_correlation is None:
             return 1.0
         return float(np.median(self.line_correlation.sum(axis=1)))
@@ -90,7 +90,7 @@ class PreparedLines:
         return np.asarray(mean / mean.max())
 
     def over_runs(self, count: int) -> PreparedLines:
-        """Return the mean of so many runs, stacked along the first axis."""
+        """Return the mean of `count` runs that are stacked along the first axis."""
         data = np.mean(self.data.reshape(count, -1, *self.data.shape[1:]), axis=0)
         power = np.sum(self.weight.reshape(count, *data.shape) ** -2.0, axis=0)
         C, n = self.correlation, len(data)
@@ -100,30 +100,30 @@ class PreparedLines:
 
     def from_errors(self, power: FloatArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from the squared errors of a rough fit."""
-        # at sharp peaks such a fit leaves more than noise; the median does not see them
+        # at sharp peaks the residual of such a fit exceeds the noise; the median ignores them
         import scipy.ndimage as ndi
 
-        # row by row: of one axis SciPy is five times as fast
+        # row by row: SciPy is five times as fast with one axis
         rows = power.reshape(-1, power.shape[2])
         median = np.array([ndi.median_filter(row, WINDOW, mode="nearest") for row in rows])
         return self._weighted(median.reshape(power.shape) / np.log(2.0), fitted_share)
 
     def from_residuals(self, error: ComplexArray, fitted_share: float) -> PreparedLines:
-        """Return the same with weights from what a fit left, averaged over lines."""
+        """Return the same with weights from the residual of a fit, averaged over lines."""
         import scipy.ndimage as ndi
 
         power = ndi.uniform_filter1d(np.abs(error) ** 2, WINDOW, axis=2, mode="nearest")
         return self._weighted(power, fitted_share)
 
     def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:
-        # 1e-13 of an amplitude: data without noise have no other error than rounding
+        # 1e-13 of an amplitude: data without noise only have rounding errors
         floor = 1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True)
         variance = np.maximum(power / (1.0 - fitted_share), floor)
         return replace(self, weight=np.sqrt(2.0 / variance))
 
 
 def prepared_lines(frf: Any, band: Any) -> PreparedLines:
-    """Return what is fitted of an FRF, checked."""
+    """Return the checked data of an FRF for a fit."""
     instance(frf, Frf, "frf", "Pass estimate_frf(...) of records, or Frf(freq, data).")
     low, high = checked_band(band, frf.freq)
     inside = (frf.freq >= low) & (frf.freq <= high) & (frf.freq > 0)
@@ -147,7 +147,7 @@ def prepared_lines(frf: Any, band: Any) -> PreparedLines:
         power = np.abs(data) ** 2
         if not np.all(np.any(power, axis=2)):
             raise ModelError("a channel of the FRF is zero at all lines: leave it out.")
-        # relative errors above the median response, absolute ones below: a start, no more
+        # start weights: relative errors above the median response, absolute ones below
         variance = 1e-4 * (power + np.median(power[power > 0]) * 1e-2)
     weight = np.sqrt(2.0 / variance) / np.abs(factor)
     data = data * factor
@@ -161,7 +161,7 @@ def prepared_lines(frf: Any, band: Any) -> PreparedLines:
 
 
 def mains_multiple(freq: float, spacing: float) -> str | None:
-    """Return which multiple of mains lies within half a line of a frequency, None of none."""
+    """Return the multiple of mains within half a line of a frequency, or None."""
     for mains in MAINS:
         number = round(freq / mains)
         if number and abs(freq - number * mains) < spacing / 2:
@@ -170,7 +170,7 @@ def mains_multiple(freq: float, spacing: float) -> str | None:
 
 
 def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
-    """Return the same without the lines at which some responses hold mains, seen as windows do."""
+    """Return the same without lines at which some responses contain mains, spread by windows."""
     freq, keep = ready.freq, np.ones(ready.freq.size, dtype=bool)
     spacing = float(np.median(np.diff(freq)))
     at = {
@@ -203,8 +203,8 @@ def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
 
 def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) -> BoolArray:
     """Return which of some lines hold a disturbance of the frequency in their middle."""
-    # the lines aside are fitted by `(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in lines,
-    # g of a resonance nearby: one of half-width w in the middle has the height `|r|/w`, a
+    # the neighbouring lines are fitted by `(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in
+    # lines, g of a resonance nearby: one of half-width w in the middle has the height `|r|/w`, a
     # disturbance no r; through a Hann window it has side lobes of `1/(\pi d^3)` of its height
     middle = d.size // 2
     near = np.abs(np.arange(d.size) - middle) <= SPREAD
@@ -219,7 +219,7 @@ def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) 
     left = rows[:, ~near] - (X @ c[..., None])[..., 0]
     noise = np.linalg.norm(left, axis=1) / np.sqrt(free)
     deviation = noise[:, None] * np.sqrt(np.sum(np.abs(inverse) ** 2, axis=2))
-    # with so many complex degrees of freedom |e|^2 exceeds x with (1 + x/free)^-free
+    # with `free` complex degrees of freedom |e|^2 exceeds x with probability (1 + x/free)^-free
     least = np.sqrt(free * np.expm1(-np.log(chance / len(rows)) / free))
     off = np.abs(rows - c[:, :3] @ smooth.T / (1.0 + c[:, 4:] * d))
     height = least * np.hypot(noise, deviation[:, 0])

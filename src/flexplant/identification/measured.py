@@ -1,4 +1,4 @@
-"""Poles that were measured, and which modes they belong to."""
+"""Measured poles and the modes to which they belong."""
 
 from __future__ import annotations
 
@@ -26,16 +26,15 @@ class MeasuredModes(Value):
     Parameters
     ----------
     poles : (m,) complex array [rad/s]
-        One of each conjugate pair, with either sign of the imaginary part (the paper prints the
-        negative one); stored with the positive one.
+        One pole of each conjugate pair, with either sign of the imaginary part (the paper prints
+        the negative one); stored with the positive one.
     modes : sequence of m int, optional
-        The number of each mode in the model, from 1, rigid-body modes included. Updating needs
-        them.
+        Number of each mode in the model, counted from 1 with rigid-body modes. Updating needs them.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
         Variance E|d lambda|^2 of each pole, its real and imaginary parts equally uncertain and
         independent, or the covariance matrix of [Re lambda; Im lambda]; stored as the latter.
     shapes : (n, m) complex array, optional
-        The mode shapes at n measured DOFs; conjugated where the pole is.
+        Mode shapes at n measured DOFs; conjugated where the pole is.
     dofs : sequence of n str, optional
         Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
 
@@ -44,7 +43,7 @@ class MeasuredModes(Value):
     ShapeError, ModelError, LabelError
         When lengths differ, or only one of shapes and dofs is given; poles are not finite, real
         (overdamped or rigid) or unstable, a shape is zero or not finite, or the covariance is not
-        positive definite; mode numbers are not whole from 1, or numbers or labels appear twice.
+        positive definite; mode numbers are not integers from 1, or numbers or labels appear twice.
 
     Examples
     --------
@@ -58,7 +57,7 @@ class MeasuredModes(Value):
     shapes: ComplexArray | None = field(default=None, kw_only=True)
     dofs: tuple[str, ...] | None = field(default=None, kw_only=True)
 
-    if TYPE_CHECKING:  # what comes in is anything array-like
+    if TYPE_CHECKING:  # the input is any array-like object
 
         def __init__(
             self,
@@ -92,9 +91,9 @@ class MeasuredModes(Value):
         freq_std: npt.ArrayLike | None = None,
         zeta_std: npt.ArrayLike | None = None,
     ) -> MeasuredModes:
-        """Return modes of measured frequencies and dampings, ``lambda = omega (-zeta + i zeta_d)``.
+        """Return modes from measured frequencies and damping: ``omega (-zeta + i zeta_d)``.
 
-        Here ``zeta_d = sqrt(1 - zeta^2)``; standard deviations are carried over to first order.
+        Here ``zeta_d = sqrt(1 - zeta^2)``; standard deviations are propagated to first order.
 
         Parameters
         ----------
@@ -103,9 +102,9 @@ class MeasuredModes(Value):
         zeta : float or (m,) array
             Damping ratios, 0 or more and below 1.
         modes : sequence of m int, optional
-            Their numbers in the model.
+            Mode numbers in the model.
         freq_std, zeta_std : float or (m,) arrays [Hz, 1], optional
-            Standard deviations, independent of each other; both or none.
+            Independent standard deviations; give both or neither.
 
         Raises
         ------
@@ -129,7 +128,8 @@ class MeasuredModes(Value):
             return MeasuredModes(poles, modes=modes)
         if freq_std is None or zeta_std is None:
             raise ModelError(
-                "give freq_std= and zeta_std=, or neither: one alone is no covariance."
+                "give both freq_std= and zeta_std=, or neither: one alone does not determine a "
+                "covariance."
             )
         spread = [
             np.diag(np.broadcast_to(real_array(s, "a standard deviation"), f.shape) ** 2)
@@ -165,24 +165,24 @@ class MeasuredModes(Value):
 
     @property
     def std(self) -> ComplexArray | None:
-        """Standard deviations of the poles, of the real part + i of the imaginary one [rad/s]."""
+        """Standard deviations of the poles [rad/s]: real part + i times imaginary part."""
         if self.covariance is None:
             return None
         deviation = np.sqrt(np.diag(self.covariance))
         return np.asarray(deviation[: len(self)] + 1j * deviation[len(self) :])
 
     def select(self, poles: Iterable[int]) -> Self:
-        """Return some of the poles, with all that is known of them, in the order given.
+        """Return some of the poles with all their data, in the given order.
 
         Parameters
         ----------
         poles : iterable of int
-            Their places, from 0.
+            Positions of the poles, from 0.
 
         Raises
         ------
         LabelError, ModelError
-            When a place is no whole number, there is no such pole, or it is given twice.
+            When a position is not an integer, does not exist or is given twice.
         """
         if not several(poles):
             raise LabelError(f"select takes a list of places of the poles, got {short(poles)}.")
@@ -218,8 +218,8 @@ def _checked_poles(value: Any) -> ComplexArray:
             )
         if pole.imag == 0:
             raise ModelError(
-                f"pole {i} is {pole:g}, a real one (overdamped, or of a rigid-body mode): a mode "
-                "with an oscillation is needed to compare. Give poles in rad/s with their "
+                f"pole {i} is {pole:g}, a real one (overdamped, or of a rigid-body mode), but an "
+                "oscillating mode is needed. Give poles in rad/s with their "
                 "imaginary part, or leave this one out."
             )
         if pole.real > 0:
@@ -240,7 +240,7 @@ def _checked_poles(value: Any) -> ComplexArray:
 
 
 def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
-    real_array(value, "modes")  # refuses what is no array of numbers
+    real_array(value, "modes")  # refuses anything but an array of numbers
     numbers = np.asarray(value)
     if numbers.ndim != 1 or numbers.size != count:
         raise ShapeError(
@@ -255,7 +255,8 @@ def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
     twice = sorted({number for number in listed if listed.count(number) > 1})
     if twice:
         raise LabelError(
-            f"modes {twice} have more than one pole each: a mode has one. Average repeated "
+            f"modes {twice} have more than one pole each, but a mode has one pole. Average "
+            "repeated "
             "measurements, or give each its own MeasuredModes."
         )
     return listed
@@ -285,7 +286,7 @@ def _checked_shapes(
     if shapes is None and dofs is None:
         return None, None
     if shapes is None or dofs is None or isinstance(dofs, str):
-        raise ShapeError("shapes= and the list dofs= of their rows' labels belong together.")
+        raise ShapeError("shapes= and dofs=, the labels of their rows, must be given together.")
     labels = tuple(str(label) for label in dofs)
     array = complex_array(shapes, "shapes", (len(labels), poles.size))
     check_names(labels, "dofs")
@@ -294,7 +295,8 @@ def _checked_shapes(
     return np.where(poles.imag < 0, array.conj(), array), labels
 
 
-#: modes of a model nearer than this share are one family, whose shapes are known as a span only
+#: relative distance of frequencies below which modes of a model form one family, whose shapes are
+#: only known as a span
 FAMILY = 5e-3
 
 
@@ -307,43 +309,43 @@ def numbered(
     least_mac: float = 0.7,
     partial: bool = False,
 ) -> MeasuredModes:
-    r"""Return measured modes with the numbers of the model's modes that they are.
+    r"""Return measured modes with the numbers of the corresponding modes of a model.
 
     Pairs minimise the sum of ``(ln(f / f_model) / tolerance)^2 + 1 - MAC`` (Hungarian method),
 
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
-    over the measured DOFs; for repeated modes of the model (within 0.5 %) it is the MAC with the
-    nearest shape of their span, which cannot distinguish them: they are numbered by frequency, and
-    where fewer poles than modes of one frequency are measured, by the lowest numbers.
+    over the measured DOFs. For repeated modes of the model (within 0.5 %) it is the MAC with the
+    closest shape of their span, which does not distinguish them: they are numbered by frequency.
+    Where fewer poles than modes of one frequency are measured, they get the lowest numbers.
 
     Parameters
     ----------
     measured : MeasuredModes
-        With shapes, or paired by frequency alone.
+        Measured modes; without shapes they are paired by frequency only.
     model : Modes, or a model with `.modes()`
-        Its modes are numbered from 1, rigid-body modes included.
+        Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
-        Where the rows of the shapes are, along z at a point unless a sensor says otherwise; the
-        sensors of ports; by default their labels are DOFs of the model.
+        Places of the rows of the shapes: along z at a point unless a sensor gives another
+        direction; or Ports, for their sensors. By default the labels are DOFs of the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float
         Smallest MAC in a pair.
     partial : bool
-        Leave out poles without a partner instead of refusing them: modes above half the
-        sampling rate fold into the band of a sampled measurement, and no model has them there.
+        Whether to leave out poles without a partner instead of raising an error: modes above half
+        the sampling rate fold into the band of a sampled measurement, where the model has no mode.
 
     Returns
     -------
     MeasuredModes
-        Of the same kind, in the same order, with `modes`.
+        Modes of the same kind, in the same order, with `modes`.
 
     Raises
     ------
     ModelError, LabelError
-        When a pole has no partner (all of them, when `partial`), an argument is out of range, or a
-        shape's row is not known to the model.
+        When a pole has no partner (with `partial`, when no pole has one), an argument is out of
+        range, or the model does not have the place of a row.
 
     References
     ----------
@@ -378,7 +380,7 @@ def numbered(
         worst = lost[0]
         near = elastic[int(np.argmin(distance[worst]))]
         raise ModelError(
-            f"no mode of the model of its own within {width:.0%} and a MAC of {least_mac:g} for "
+            f"no separate mode of the model within {width:.0%} and with a MAC of {least_mac:g} for "
             f"the poles at {[round(float(measured.freq[i]), 2) for i in lost[:6]]} Hz; nearest to "
             f"the first is mode {near + 1} at {modes.freq[near]:.5g} Hz with a MAC of "
             f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
@@ -391,7 +393,7 @@ def numbered(
 
 
 def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
-    """Give the numbers of each family of modes to its poles by frequency; rounding chose else."""
+    """Assign mode numbers to the poles of each family of modes by frequency."""
     free = sorted(pairs, key=lambda i: pairs[i])
     while free:
         first = pairs[free[0]] - 1
@@ -399,7 +401,7 @@ def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -
         free = free[len(family) :]
         taken, numbers = set(pairs.values()), []
         for number in [pairs[i] for i in family]:
-            # the lowest free one of the modes of its frequency
+            # the lowest free mode with its frequency
             taken.discard(number)
             equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= SPLIT) + 1
             numbers.append(next(int(n) for n in equal if n not in taken))

@@ -1,4 +1,4 @@
-"""What a linear machine does not explain: outputs that disagree, misfit that is smooth."""
+"""Model errors: outputs that disagree, and misfit that is smooth over frequency."""
 
 from __future__ import annotations
 
@@ -11,41 +11,44 @@ from ..modes.matching import mac_matrix
 from ..tolerances import TINY
 from .refine import PoleFit, scaled_inverse
 
-#: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
+#: MAC above which two shapes count as equal: they differ by less than the effect of a neighbouring
+#: mode
 ALIKE = 0.9
-#: half-widths (geometric mean of two poles) within which poles of different shapes may be one
-#: resonance; and a bandwidth, where the weaker one is the broader: what is left of a circle that is
-#: not straight is broad, a resonance on a broad background is not
+#: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
+#: may be one resonance; one bandwidth where the weaker pole is the broader: the remainder of a
+#: distorted circle is broad, a resonance on a broad background is not
 WITHIN, BANDWIDTH = 1.5, 2.0
-#: part of a misfit that is most of it: a missed mode leaves about half, a shift less than 1e-3
+#: fraction of a misfit that counts as most of it: a missed mode leaves about half, a shift less
+#: than 1e-3
 MOSTLY = 0.9
-#: misfit near a pole, with its correlation over lines, up to which it is noise
+#: misfit near a pole, including its correlation over lines, up to which it counts as noise
 NOISE = 1.5
-#: standard deviations by which chi-square may exceed its degrees of freedom by chance
+#: number of standard deviations by which chi-square may exceed its degrees of freedom
 LIMIT = 3.0
-#: part of a misfit that is left by poles of one's own with the participation of shared ones
+#: fraction of a misfit that remains with separate poles and shared participation
 NEXT_TO_NONE = 1e-3
-#: halvings of the interval of a variance: to nine digits
+#: number of bisections for a variance with nine digits
 BISECTIONS = 30
-#: the damping of an output's own pole for its usual one beyond which it is another thing: what a
-#: sensor adds changes frequencies, hardly the damping
+#: ratio of the damping of an output's own pole to the usual one above which it is a different pole:
+#: the mass of a sensor changes frequencies, but hardly the damping
 BROAD = 3.0
-#: deviations of the outputs' frequencies beyond which one output is another machine's
+#: number of deviations of the frequencies above which an output counts as an outlier
 ODD = 6.0
-#: lines, or half-widths, beside a pole over which misfit is compared
+#: distance from a pole, in lines and in half-widths, over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
 
 def own_cost(fit: PoleFit) -> float:
-    """Return the cost of fits of each output alone, with poles of its own."""
+    """Return the cost of separate fits of each output, with separate poles."""
     return sum(one.cost for one in fit.own)
 
 
 def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
-    """Return whether poles of each output's own leave noise alone, shared ones far more.
+    """Return whether separate poles leave only noise, and shared poles far more.
 
-    And less than another fit, of more poles, does (`least`). Where the shared poles are is known
-    then by how the outputs differ, not by the misfit that a refinement lowers.
+    The remainder must also be less than that of another fit with more poles (`least`). The
+    uncertainty of shared poles then follows from the differences between outputs, not from the
+    misfit that a refinement reduces.
     """
     lines, (n_out, m) = fit.lines, fit.shapes.shape
     parts = len(lines.parts)
@@ -63,7 +66,7 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
 
 
 def coherence(fit: PoleFit, pole: complex) -> float:
-    """Return by how much more a misfit near a pole lowers the cost by chance than noise does."""
+    """Return the factor by which a misfit near a pole lowers the cost more than noise does."""
     # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over
     # neighbouring lines: misfit that is smooth over some of them counts as one error
     lines = fit.lines
@@ -85,17 +88,17 @@ def coherence(fit: PoleFit, pole: complex) -> float:
 
 
 def strength(fit: PoleFit) -> FloatArray:
-    """Return the height of each resonance, weighted as the lines are."""
+    """Return the height of each resonance with the weights of the lines."""
     power = np.sum(fit.lines.weight**2, axis=(1, 2)) / fit.lines.freq.size
     height = np.sqrt(power @ np.abs(fit.shapes) ** 2) / -fit.poles.real
     return np.asarray(height * np.linalg.norm(fit.participation, axis=0))
 
 
 def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
-    """Return two poles within a bandwidth with the same shape and participation, the weak one last.
+    """Return two poles within a bandwidth with equal shape and participation, the weaker last.
 
-    One resonance that is no straight circle (leakage, amplitude) looks so; with one input two modes
-    do too, unless they leave nothing but noise of a known variance.
+    One resonance with a distorted circle (leakage, amplitude) looks like this. With one input two
+    modes look the same, unless the residual is only noise of a known variance.
     """
     height = strength(fit)
     alike = [mac_matrix(vectors, vectors) > ALIKE for vectors in (fit.shapes, fit.participation)]
@@ -118,11 +121,11 @@ def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """By how much outputs differ in the frequencies (relative), and their mean poles (m,).
+    """Relative differences of frequencies between outputs, and their mean poles (m,).
 
     `spread` (2 m,) of [Re lambda; Im lambda] is the deviation of an output from them, `deviation`
-    their own, `correlation` over the outputs. `odd` is the one output (or set-up) that is off by
-    far more than the others, and by how much (relative), where there is one.
+    their own, `correlation` over the outputs. `odd` is an output (or set-up) that deviates far more
+    than the others, with its relative deviation, if there is one.
     """
 
     size: float
@@ -139,21 +142,22 @@ class Disagreement:
 
 
 def disagreement(fit: PoleFit, least: float, excess: float) -> Disagreement | None:
-    """Return by how much the outputs of a fit differ, and the mean of their own poles."""
-    # None where poles of their own lower the cost by less than `least`, or do not explain nearly
-    # all of the cost's `excess` over that of noise: something else is wrong then
+    """Return the differences between outputs of a fit, and the mean of their separate poles."""
+    # None where separate poles lower the cost by less than `least`, or do not explain nearly all of
+    # the `excess` of the cost over that of noise, which then has another cause
     if len(fit.lines.parts) == 1:
         return None
     own = fit.own
     if fit.cost - own_cost(fit) < max(least, MOSTLY * excess):
         return None
     places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
-    # an output that hardly sees a mode may have its own pole anywhere: known no better than there
+    # an output that hardly sees a mode may have its pole anywhere, with a correspondingly large
+    # variance
     parted = [fit.at_rows(rows) for rows in fit.lines.parts]
     seen, alone = (np.array([_variance(one) for one in fits]) for fits in (parted, own))
     elsewhere, broad = (np.tile(squares, 2) for squares in _strayed(fit, own))
     variance = np.maximum(seen, alone) + elsewhere
-    # the spread is that of all outputs, broad poles too: it shows which poles are not shared
+    # the spread includes all outputs and broad poles, since it shows which poles are not shared
     spread = random_effects(places, variance)[1]
     mean, _, deviation, weighted = random_effects(places, variance + broad)
     power = np.sqrt(np.sum(weighted**2, axis=0))
@@ -169,16 +173,16 @@ def disagreement(fit: PoleFit, least: float, excess: float) -> Disagreement | No
 
 
 def _variance(one: PoleFit) -> FloatArray:
-    """Return the variances (2 m,) of a fit's poles, its participation held."""
+    """Return the variances (2 m,) of the poles of a fit with its participation held fixed."""
     N = one.gradient()[0][: 2 * one.m, : 2 * one.m]
     return np.asarray(one.lines.inflation * np.diag(scaled_inverse(N)))
 
 
 def _strayed(fit: PoleFit, own: list[PoleFit]) -> tuple[FloatArray, FloatArray]:
-    """Return the squares (n, m) of how far own poles are that stand for something else."""
-    # first of those that came nearer to another shared pole, then of those that are much broader
-    # than in most outputs: where an output hardly sees a mode, its pole becomes a part of the
-    # smooth remainder
+    """Return the squared distances (n, m) of separate poles that represent something else."""
+    # first poles that are closer to another shared pole, then poles that are much broader than in
+    # most outputs: where an output hardly sees a mode, its pole becomes a part of the smooth
+    # remainder
     poles = np.array([one.poles for one in own])
     away = np.abs(poles[:, :, None] - fit.poles)
     other = np.argmin(away, axis=2) != np.arange(fit.m)
@@ -195,13 +199,14 @@ def random_effects(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     r"""Return means over the first axis, sqrt(t), the means' deviations and weighted differences.
 
-    Each of n values x has a variance v of its own about a place of its own, and places have the
-    variance t about the mean sought: with :math:`w = 1/(v + t)` it is
+    Each of n values x has a separate variance v about a separate true value, and true values have
+    the variance t about the wanted mean: with :math:`w = 1/(v + t)` it is
     :math:`\mu = \sum w x / \sum w`, of variance :math:`1/\sum w`. t is the one at which
     :math:`\sum w (x - \mu)^2` is the median of chi-square with n - 1 degrees of freedom
-    ([PauleMandel1982]_ take its mean, which is too small a t more often than not), zero where it is
-    less at zero already. Where t is not zero it is known from :math:`(\sum w)^2/\sum w^2` outputs,
-    as the mean is: deviations are enlarged by Student's factor, so that 1.96 of them hold 95 %.
+    ([PauleMandel1982]_ use its mean, which usually makes t too small); it is zero where the sum is
+    smaller at zero. Where t is not zero it follows from :math:`(\sum w)^2/\sum w^2` outputs, as
+    does the mean. Deviations are enlarged by Student's factor, so that an interval of 1.96
+    deviations contains 95 %.
     """
     from scipy.special import chdtri, stdtrit
 

@@ -1,4 +1,4 @@
-"""Output-only identification: modes of a machine that shakes by itself, with their uncertainty."""
+"""Output-only identification: modes from ambient vibration, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
 from .spectra import signals
 
-#: periods of the lowest frequency over which covariances are used where no lags are given
+#: number of periods of the lowest frequency over which covariances are used by default
 PERIODS = 2.0
 #: largest damping ratio of a pole
 HEAVY = 0.2
-#: frequencies of a mode in two parts of the record differ by less than this
+#: largest relative difference of a frequency between two parts of the record
 NEAR = 0.1
-#: and of a mode at two orders; its frequency's standard deviation is below this, its damping's
-#: below the latter part of it: poles of noise vary more
+#: the same between two orders; largest relative standard deviation of frequency and of damping:
+#: noise poles vary more
 SAME, LOOSE = 0.02, 0.6
-#: differences to the next order of a stable pole, and its MAC with it
+#: largest differences between orders for a stable pole, and least MAC
 TOLERANCES = (0.01, 0.3, 0.9)
 
-#: what a bar calls the pieces of the record
+#: label of the progress bar
 PARTS = "parts of the record"
 
 
@@ -42,7 +42,7 @@ def identify_output_only(
     blocks: int = 20,
     progress: bool | None = None,
 ) -> MeasuredModes:
-    r"""Return poles and shapes from responses alone, the excitation not measured.
+    r"""Return poles and shapes from responses only, without a measured excitation.
 
     Covariance-driven stochastic subspace identification: with covariances
     :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation,
@@ -50,45 +50,47 @@ def identify_output_only(
     .. math:: H = \begin{bmatrix} R_1 & R_2 & \cdots \\ R_2 & R_3 & \cdots \\ \vdots & & \ddots
         \end{bmatrix} = O\,C, \quad O = [C;\ C A;\ C A^2;\ \ldots],
 
-    so that the leading singular vectors of H give O up to its basis, its shift A, and
-    :math:`\lambda = rate\,\ln \mu(A)`. Poles that stay over the orders are chosen, at the lowest
-    order that has most of them: more states add noise. White noise of the sensors is in
+    so that the leading singular vectors of H give O up to its basis, its shift gives A, and
+    :math:`\lambda = rate\,\ln \mu(A)`. Poles that are stable over the orders are chosen at the
+    lowest order that has most of them, since more states add noise. White noise of the sensors is
+    in
     :math:`R_0` only, which is not used. H without each of some blocks of the record (a jackknife)
     gives the covariance of each pole, made larger by (b - 1)/(b - 3) of b blocks: squares of errors
-    over deviations, of Student's distribution, are then 1 in the mean.
-    Poles whose frequency varies by more than 2 %, or whose damping by more than 60 %, are noise and
-    left out. A rotating part or a mains hum appears as a mode of next to no damping, excitation
-    that is not white as modes of its own.
+    over deviations, of Student's distribution, are then 1 in the mean. Poles whose frequency varies
+    by more than 2 % or whose damping varies by more than 60 % count as noise and are left out. A
+    rotating part or mains hum appears as a mode with almost no damping, and excitation that is not
+    white as additional modes.
 
     Parameters
     ----------
     outputs : (n_channel, n_time) array or mapping {name: (n_time,) array}
-        Displacements, velocities or accelerations, (n_exp, n_channel, n_time) of several records.
+        Displacements, velocities or accelerations; (n_exp, n_channel, n_time) for several records.
     rate : float [Hz]
-        Of sampling; ten times the band's end at most, or covariances hold little: decimate first.
+        Sampling rate; at most ten times the upper end of the band, otherwise decimate first.
     band : (low, high) [Hz]
-        Where modes are wanted.
+        Frequency band of the modes.
     orders : iterable of int, optional
-        Numbers of states; 4 to 40 in twos when not given.
+        Numbers of states; 4, 6, ..., 40 by default.
     lags : int, optional
-        Block rows and columns of H; two periods of the lowest frequency when not given.
+        Number of block rows and columns of H; two periods of the lowest frequency by default.
     blocks : int
-        In which the record is cut, from 8; each should be longer than the slowest decay.
+        Number of blocks of the record, at least 8; each should be longer than the slowest decay.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------
     MeasuredModes
-        Sorted by frequency, without mode numbers; shapes at the channels, their largest entry 1
-        (the excitation is not known, so neither is their scale). The covariance is that of each
-        pole by itself.
+        Sorted by frequency, without mode numbers; shapes at the channels, with a largest entry of
+        1, since the scale is unknown without the excitation. The covariance is given for each pole
+        separately.
 
     Raises
     ------
     ModelError, ShapeError, SolverError
-        When an argument is out of range, the record is too short, or no pole stays over the orders
-        and over the record.
+        When an argument is out of range, the record is too short, or no pole is stable over the
+        orders and over the record.
 
     References
     ----------
@@ -202,13 +204,13 @@ def _jackknife(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, 
     centred = moved - moved.mean(axis=0)
     spread = np.array([centred.real, centred.imag]) * np.sqrt(1 - 1 / len(again))
     std = np.sqrt(np.sum(spread**2, axis=1))
-    # not a number where one is lost
+    # NaN where a pole is missing
     small = (std[1] < SAME * np.abs(found.poles)) & (std[0] < LOOSE * -found.poles.real)
     return spread, np.flatnonzero(small)
 
 
 def _like(found: OrderPoles, other: OrderPoles) -> ComplexArray:
-    """Return the poles of another result that are those found, by frequency and shape, or NaN."""
+    """Return the poles of another result that match, by frequency and shape, or NaN."""
     moved = np.full(found.poles.size, np.nan + 0j)
     if not other.poles.size:
         return moved

@@ -1,4 +1,4 @@
-"""Periodic excitation: no leakage, and the noise is what changes from period to period."""
+"""Periodic excitation: no leakage, and noise from the changes between periods."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ..store import Value, checked
 from ..tolerances import TINY, TYPED
 from .spectra import Records, error_statistics
 
-#: a line counts as excited when the weakest direction of the inputs is not this much below the rest
+#: relative size of the weakest direction of the inputs above which a line counts as excited
 EXCITED = 1e-3
-#: share of an output's power that is rounding, not noise
+#: fraction of the power of an output that counts as rounding
 ROUNDING = 1e-28
 
 
@@ -28,11 +28,11 @@ class Periodic(Value):
     Parameters
     ----------
     period : float [s]
-        A whole number of samples; its inverse is the resolution.
+        Period, an integer number of samples; its inverse is the resolution.
     discard : int
-        Periods at the start that are dropped, for transients to die out.
+        Number of periods at the start that are dropped, while transients decay.
     band : (low, high) [Hz], optional
-        Lines to use; by default all lines that are excited.
+        Band of the lines that are used; by default all excited lines.
 
     References
     ----------
@@ -55,14 +55,15 @@ class Periodic(Value):
 def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     r"""Return ``G = Y X^H (U X^H)^-1`` from the mean periods; X is U, or R of a reference.
 
-    With one experiment per input this is Y U^-1. Noise e = y - G u is what changes between
-    periods. It is read off the lines of all P periods together that lie between those of one,
-    where periodic signals have nothing; the mean C_e of the P - 1 nearest gives the variance
+    With one experiment per input this is Y U^-1. Noise e = y - G u is the part that changes between
+    periods. It is found at the lines of all P periods together that lie between those of one
+    period, where periodic signals have no power; the mean C_e of the P - 1 nearest gives the
+    variance
 
     .. math:: \sigma^2_{oi} = [C_e]_{oo}\,\bigl[(U U^H)^{-1}\bigr]_{ii}
 
-    ([PintelonSchoukens2012]_, section 2.7). A drift leaks as much into these as into the mean;
-    into the spectrum of each period up to P times more, in power.
+    ([PintelonSchoukens2012]_, section 2.7). A drift leaks equally into these lines and into the
+    mean; into the spectrum of each period it leaks up to P times more power.
     """
     n_exp, n_in, n_time = data.u.shape
     samples = round(method.period * data.rate)
@@ -136,14 +137,14 @@ def frf_of_periods(
     coherence: FloatArray | None = None
     left, freedom = _noise_spectrum(Y, U, G, periods)
     if freedom > 0:
-        # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
+        # part of the inputs due to the excitation: U X^H (X X^H)^-1 X U^H
         inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
         variance, correlation = error_statistics(left, inverse)
         power = np.mean(np.abs(Y[:, :, 0]) ** 2, axis=(0, 2))
         if not np.all(np.einsum("foo->fo", left).real > ROUNDING * power):
             variance = correlation = None  # no noise at all: nothing to weight by
         else:
-            # the share of the outputs' power in a period that is not noise
+            # the fraction of the outputs' power in a period that is not noise
             noise = np.einsum("foo->of", left).real
             whole = np.mean(np.abs(y) ** 2, axis=2).T + (periods - 1) * noise
             share = np.clip(1.0 - periods * noise / np.maximum(whole, TINY), 0.0, 1.0)
@@ -163,9 +164,9 @@ def frf_of_periods(
 
 
 def offsets(periods: int) -> tuple[Any, FloatArray]:
-    """Return offsets j of lines kP + j, zero first, and how much each counts for the noise at k."""
+    """Return offsets j of lines kP + j, zero first, and their weights for the noise at k."""
     near = np.arange(1, periods // 2 + 1)
-    # half way to the next line of a period: each has half of it
+    # half way to the next line of a period: each line has half the weight
     weight = np.where(2 * near == periods, 0.5, 1.0)
     both = np.concatenate([[0], near, -near])
     return both, np.concatenate([[0.0], weight, weight])
@@ -188,7 +189,7 @@ def _each_period(signals: FloatArray, samples: int) -> ComplexArray:
 
 
 def _mean_spectra(spectra: ComplexArray) -> ComplexArray:
-    """Return those of the mean period (lines, n_channel, n_exp)."""
+    """Return spectra of the mean period (lines, n_channel, n_exp)."""
     return np.asarray(spectra[:, :, 0].transpose(2, 1, 0))
 
 
@@ -229,16 +230,16 @@ def multisine(
     periods : int
         Repetitions.
     band : (low, high) [Hz], optional
-        Excited lines; all below half the rate by default.
+        Band of excited lines; all below half the rate by default.
     rms : float
-        Of each signal.
+        RMS value of each signal.
     rng : int or Generator, optional
-        Of the phases.
+        Random generator of the phases, or its seed.
 
     Returns
     -------
     (count, count, n_time) array
-        By experiment, input and time.
+        Signals by experiment, input and time.
 
     Raises
     ------
@@ -280,25 +281,26 @@ def multisine(
     return np.asarray(np.tile(waves, (1, 1, int(periods))))
 
 
-#: samples of a signal that memory holds
+#: largest number of samples of a signal, limited by memory
 MOST_SAMPLES = 10**9
 
 
-#: power of the inputs' lines over what lies between them below which they are not periodic
+#: ratio of the power of the inputs' lines to that between lines below which they are not periodic
 PERIODIC = 10.0
-#: a period counts as better when the inputs repeat after it with this share of the difference
+#: ratio of the difference of the inputs after another period below which that period counts as
+#: better
 BETTER = 0.25
-#: differences below this share of the inputs are rounding or the last digit of a file
+#: relative difference of the inputs below which it is rounding or the last digit of a file
 SAME = 1e-6
-#: periods and lines (3 and 9) over which a transient is looked for
+#: number of periods and of lines (3 and 9) over which a transient is searched
 MOST, STRETCHES = 12, (3, 9)
-#: share of the response that a transient from rest has at least
+#: least fraction of the response in a transient from rest
 LEAST = 0.5
-#: share of the largest one within so many lines that it has at least
+#: least fraction of the largest transient within this number of lines
 PEAK, NEAR = 0.03, 61
-#: shares of a transient that may be left after a period; a slower one looks like drift
+#: fractions of a transient that may remain after a period; a slower transient looks like drift
 RADII = (0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.86)
-#: standard deviations of the noise of the mean that it biases the mean by, at least
+#: least bias of the mean in standard deviations of its noise
 VISIBLE = 2.0
 #: probability of a false alarm anywhere
 CHANCE = 1e-3
@@ -322,9 +324,10 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     best = int(lags[np.argmin(change[lags])])
     if here > SAME and change[best] < BETTER * here:
         warn(
-            f"the inputs repeat after {best} samples, {best / rate:.6g} s, better than after the "
-            f"stated period of {samples} samples (they change by {np.sqrt(change[best]):.2g} and "
-            f"{np.sqrt(here):.2g} of their size): period= or rate is wrong, and the FRF with it. "
+            f"the inputs repeat after {best} samples, {best / rate:.6g} s, more exactly than "
+            f"after the stated period of {samples} samples (they change by "
+            f"{np.sqrt(change[best]):.2g} and "
+            f"{np.sqrt(here):.2g} of their size): period= or rate is wrong, and so is the FRF. "
             f"If the period is right the rate is {rate * best / samples:.6g} Hz."
         )
         return False
@@ -335,8 +338,8 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     if ratio < PERIODIC:
         warn(
             f"the inputs are not periodic: at half of the lines or more their power is "
-            f"{10 * np.log10(ratio):.1f} dB of what lies between the lines, where periodic "
-            "signals have nothing. Check period= and rate; random excitation needs "
+            f"{10 * np.log10(ratio):.1f} dB relative to that between the lines, where periodic "
+            "signals have no power. Check period= and rate; random excitation needs "
             "identification.H1Estimator(...), blows of a hammer "
             "identification.impact_frf(...), noise that comes back through a "
             "controller reference= or more periods."
@@ -345,14 +348,14 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     return True
 
 
-#: share of the inputs' power by which periodic ones change from period to period, at most
+#: largest relative change of the power of periodic inputs between periods
 REPEATED = 1e-3
 #: mean fourth power over squared power of pulses that fill 1/60 of a record; noise has 3
 PULSES = 60.0
 
 
 def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
-    """Warn where the averages of segments suit the inputs worse than another method does."""
+    """Warn where another method suits the inputs better than averages of segments."""
     power = np.mean(x**2, axis=2)
     peaked = np.mean(x**4, axis=2)[power > 0] / power[power > 0] ** 2
     if peaked.size and peaked.min() > PULSES:
@@ -373,9 +376,9 @@ def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
 
 
 def _period(x: FloatArray) -> int:
-    """Return the shortest period of at most half the record [samples], 0 where there is none."""
+    """Return the shortest period of at most half the record [samples], 0 if not periodic."""
     change = _differences(x)[: x.shape[2] // 2 + 1]
-    # neighbouring samples of slow signals are alike too
+    # neighbouring samples of slow signals are similar too
     apart = np.flatnonzero(change > 0.5)
     if not apart.size:
         return 0
@@ -399,11 +402,11 @@ def _differences(x: FloatArray) -> FloatArray:
 
 
 def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard: int) -> None:
-    """Warn of the slowest decay of what periods leave, where it biases their mean."""
+    """Warn of a slowly decaying transient that biases the mean of the periods."""
     # at line k period p is `S_k + tau_k z^p` with `z = exp(lambda T)`, the same for all lines,
     # outputs and experiments that a mode reaches. Over a grid of z the energy that this explains of
     # the periods' spread is compared with the rest by an F-test
-    import scipy.ndimage as ndi  # both cost a tenth of a second that few need
+    import scipy.ndimage as ndi  # slow imports that few users need
     from scipy.stats import f as fisher
 
     first = max(0, min(discard, e.shape[2] - 4))
@@ -429,7 +432,8 @@ def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard
     centred = powers - powers.mean(axis=1, keepdims=True)
     size = np.sum(np.abs(centred) ** 2, axis=1)
     pattern = np.einsum("zp,zq->zpq", centred.conj(), centred).reshape(z.size, -1)
-    worst = (0, 0, 0.0, 0.0)  # periods more to discard, the line, what is left after one, the bias
+    # more periods to discard, the line, the fraction that remains after one period, the bias
+    worst = (0, 0, 0.0, 0.0)
     for length in STRETCHES:
         if length > freq.size:
             break
@@ -440,15 +444,16 @@ def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard
         explained = (pattern @ local.T).real / size[:, None]
         best = np.argmax(explained, axis=0)
         mine = explained[best, np.arange(freq.size)]
-        # a line that explains all leaves rounding
+        # a line that explains everything leaves rounding
         rest = np.maximum(total - mine, 1e-12 * total) / (count - 2)
         freedom = 2.0 * length * e.shape[0] * outputs
         limit = fisher.isf(CHANCE / (freq.size * z.size), freedom, freedom * (count - 2))
-        # of the whole record's first period: a transient from rest is of the response's size
+        # relative to the first period of the whole record: a transient from rest is as large as the
+        # response
         tau = mine / size[best]
         start = tau * np.abs(z[best]) ** (-2.0 * first)
         power: Any = ndi.uniform_filter1d(seen, **ones) * length
-        # between resonances slow vibration made by noise looks like a decay
+        # between resonances slow vibration caused by noise looks like a decay
         peak = mine > PEAK * ndi.maximum_filter1d(mine, NEAR)
         bias = tau * np.abs(mean[best]) ** 2 / (rest / kept)
         for k in np.flatnonzero(
@@ -461,9 +466,9 @@ def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard
     more, line, decay, off = worst
     if more:
         warn(
-            f"a transient has not died away in the periods kept: near {freq[line]:.4g} Hz "
-            f"{decay:.0%} of it is left after a period, and biases the FRF by {off:.2g} "
+            f"a transient has not decayed in the kept periods: near {freq[line]:.4g} Hz "
+            f"{decay:.0%} of it remains after a period and biases the FRF by {off:.2g} "
             "standard deviations of its noise; damping and the number of modes would be wrong. "
             f"Measure {more} periods more and discard {discard + more}, "
-            f"discard={discard + more}, or shake so long before recording."
+            f"discard={discard + more}, or excite the machine for this time before recording."
         )

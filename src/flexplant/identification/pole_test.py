@@ -1,4 +1,4 @@
-"""Which poles and terms the data support: changes are proposed, and accepted by one criterion."""
+"""Poles and terms that the data support: changes are proposed and accepted by one criterion."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..errors import SolverError, attempted, warn
 from .model_error import coherence, own_cost, twin_poles
 from .refine import Lines, PoleFit, pivoted, refined
 
-#: probability that noise anywhere in the band passes for a pole
+#: probability that noise anywhere in the band is taken for a pole
 CHANCE = 1e-3
-#: probability that noise passes for outputs that disagree: real ones do by far more
+#: probability that noise is taken for outputs that disagree; real differences are far larger
 ALARM = 1e-9
 
 
 def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
-    """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
+    """Remove, one by one, poles that noise may explain; SolverError when no pole remains."""
     least = gain_due_of_pole(lines)
     fit = pivoted(lines, poles, part)
     kept, now = list(range(poles.size)), fit.cost
@@ -35,8 +35,8 @@ def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
     kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
     if not kept:
         raise SolverError(
-            f"no resonance between {lines.freq[0]:.4g} and {lines.freq[-1]:.4g} Hz stands out of "
-            "the noise: what the poles of the diagram explain could be chance. Move or widen the "
+            f"no resonance between {lines.freq[0]:.4g} and {lines.freq[-1]:.4g} Hz exceeds the "
+            "noise: the poles of the diagram may be due to chance. Move or widen the "
             "band, measure longer, or pick poles by hand with "
             "identification.stabilisation_diagram(frf).select(freq=[...])."
         )
@@ -54,9 +54,9 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
 
 
 def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
-    """Return whether other lines than the two that gain most bear a pole out."""
-    # by a chi-square of four degrees, the pole and its size: a disturbance of one frequency, or a
-    # variance that is too small there, changes other lines by chance only
+    """Return whether lines other than the two with most gain confirm a pole."""
+    # by a chi-square test of four degrees of freedom, the pole and its size: a disturbance with a
+    # single frequency, or a variance that is too small there, changes other lines only by chance
     before, after = (
         np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
         for model in (less, more)
@@ -67,40 +67,41 @@ def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
 
 
 def gain_due(lines: Lines, count: int, chance: float) -> float:
-    """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile."""
-    # errors that neighbouring lines share have `inflation` times the power of independent ones
+    """Return the decrease of the cost by noise for additional parameters: a chi-square quantile."""
+    # correlated errors of neighbouring lines have `inflation` times the power of independent ones
     from scipy.special import chdtri
 
     return lines.inflation * float(chdtri(count, chance))
 
 
 def gain_due_of_pole(lines: Lines) -> float:
-    """Return by how much a pole must lower the cost, wherever in the band it is."""
-    # its pole, shape and participation are 2 (n_out + n_in) numbers. One kept in vain costs little;
-    # one left out biases its neighbours by up to the root of this
+    """Return the decrease of the cost that a pole anywhere in the band must reach."""
+    # its pole, shape and participation are 2 (n_out + n_in) numbers. A superfluous pole costs
+    # little; a missing pole biases its neighbours by up to the root of this
     n_out, n_in, n_freq = lines.data.shape
     return gain_due(lines, 2 * (n_out + n_in), CHANCE / n_freq)
 
 
-#: half the distance at which a pole is taken apart, in parts of its damping
+#: half the distance at which a pole is split, relative to its damping
 APART = 0.5
-#: numbers of residual terms of modes above the band: as few, and where these leave more than noise
+#: numbers of residual terms of modes above the band: the first, or more if the residual exceeds
+#: noise
 UPPER, MORE = (3, 5, 7, 9), (25, 17, 13)
-#: probability that noise passes for a residual term: one too many costs next to nothing, one too
-#: few is a bias
+#: probability that noise is taken for a residual term: a superfluous term costs almost nothing, a
+#: missing one is a bias
 FEW = 0.1
-#: what a weak pole must lower the cost by elsewhere
+#: decrease of the cost that a weak pole must reach at another place
 GAIN = 0.1
-#: a pole is weak whose cost is less than so many times the least that is required of one
+#: ratio to the required decrease of the cost below which a pole counts as weak
 WEAK = 4.0
-#: damping ratio above which a pole is no mode, and how much broader than all a new one may be
+#: largest damping ratio of a mode, and largest width of a new pole relative to all others
 BROADEST, BROADER = 0.2, 1.1
-#: rivals that are refined, and the part of what is required that they must gain before
+#: number of rivals that are refined, and fraction of the required gain that they need before
 RIVALS, BEFORE = 3, 0.25
 
 
 class Trial(NamedTuple):
-    """A changed fit before it is refined, its gain then, and by how much it must lower the cost."""
+    """A changed fit before refinement, its gain, and the required decrease of the cost."""
 
     lines: Lines
     poles: ComplexArray
@@ -109,9 +110,9 @@ class Trial(NamedTuple):
     least: float
 
 
-#: the rivals of each place at which something may be changed, the best ones first
+#: rivals of each place of a possible change, the best ones first
 Proposals: TypeAlias = Iterable[list[Trial]]
-#: what proposes one kind of change
+#: function that proposes one kind of change
 Kind: TypeAlias = Callable[[PoleFit], Proposals]
 
 
@@ -119,9 +120,10 @@ def improved(
     fit: PoleFit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
 ) -> PoleFit:
     """Return the fit with the changes that lower its cost by more than noise does."""
-    # each kind proposes changes, until none is accepted or so many are: refined, it lowers the cost
-    # by what it must, no pole becomes broader than a mode, and a pole more is borne out by several
-    # lines. `rough`: a fit that leaves nothing but rounding is changed no more
+    # each kind proposes changes, until none is accepted or the limit is reached. A change is
+    # accepted if after refinement it lowers the cost as required, no pole becomes broader than a
+    # mode, and several lines confirm an additional pole. `rough`: a fit whose residual is only
+    # rounding is not changed further
     for propose, most in kinds:
         for _ in range(most):
             if rough and _is_exact(fit):
@@ -160,10 +162,10 @@ def _accepted(fit: PoleFit, trial: Trial, steps: int) -> PoleFit | None:
 
 
 def shared(fit: PoleFit, more: PoleFit, least: float) -> bool:
-    """Return whether the outputs share what a pole more explains, beyond what else they are off by.
+    """Return whether the outputs share what an additional pole explains, beyond other errors.
 
-    It is to lower the cost by what it must, or by the `coherence` of what is left near it; where
-    outputs do not agree on the poles, also that of fits with poles of their own at each.
+    The pole must lower the cost as required, or by the `coherence` of the residual near it; where
+    outputs do not agree on the poles, it must also lower the cost of fits with separate poles.
     """
     lines, new = fit.lines, newest_pole(fit, more)
     least = max(least, gain_due_of_pole(lines) * coherence(more, more.poles[new]))
@@ -179,14 +181,14 @@ def shared(fit: PoleFit, more: PoleFit, least: float) -> bool:
 
 
 def _disagrees(fit: PoleFit) -> bool:
-    """Return whether poles of their own at each output lower the cost by more than noise does."""
+    """Return whether separate poles at each output lower the cost by more than noise does."""
     return fit.cost - own_cost(fit) >= gain_due_of_own_poles(fit)
 
 
 def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
-    """Return whether a few outputs, with poles of their own, prove the pole more already."""
-    # most poles are: fits of the other outputs, which take most of the time, are not made then.
-    # Outputs that gain most by the pole are asked first
+    """Return whether a few outputs with separate poles already prove the additional pole."""
+    # this holds for most poles and saves the fits of the other outputs, which take most of the
+    # time. Outputs that gain most by the pole come first
     before, after = (
         [sum(float(fit.bases[o][1] @ fit.bases[o][1]) for o in rows) for rows in fit.lines.parts]
         for fit in (fit, more)
@@ -209,20 +211,21 @@ def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
 
 
 def newest_pole(fit: PoleFit, more: PoleFit) -> int:
-    """Return which pole of a fit of more poles is farthest from those before."""
+    """Return the pole of a larger fit that is farthest from the previous poles."""
     away = [np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]
     return int(np.argmax(away))
 
 
 def gain_due_of_own_poles(fit: PoleFit) -> float:
-    """Return by how much poles of their own at each output must lower the cost."""
+    """Return the decrease of the cost that separate poles at each output must reach."""
     count = 2 * fit.m * (len(fit.lines.parts) - 1)
     return max(1.0, fit.misfit) * gain_due(fit.lines, max(1, count), ALARM)
 
 
 def unwindowed(fit: PoleFit) -> Proposals:
-    """Propose lines that are not seen through the window of segments."""
-    # H2, Hv and bursts that end within a segment are not, H1 of an input that is white nearby is
+    """Propose lines without the effect of a window of segments."""
+    # H2, Hv and bursts that end within a segment have no such effect; H1 with a locally white input
+    # has
     if fit.lines.segment is not None:
         plain = replace(fit.lines, segment=None)
         yield [Trial(plain, fit.poles, fit.participation, np.inf, 0.0)]
@@ -254,14 +257,15 @@ def _refit_terms(fit: PoleFit, upper: int, chance: float) -> Trial:
 
 
 def fewer_terms(fit: PoleFit) -> Proposals:
-    """Propose the fewest residual terms that the data let pass."""
+    """Propose the smallest number of residual terms that the data allow."""
     trials = (_refit_terms(fit, upper, FEW) for upper in UPPER if upper < fit.lines.upper)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
 def more_terms(fit: PoleFit) -> Proposals:
-    """Propose more residual terms where the data require them, as many as the lines afford."""
-    # folded modes are weak and broad: what few terms leave of them is not seen, but biases
+    """Propose more residual terms where the data require them, as many as the lines allow."""
+    # folded modes are weak and broad: their remainder with few terms is not visible, but causes a
+    # bias
     lines = fit.lines
     afforded = [u for u in MORE if u > lines.upper and lines.freq.size >= 8 * (u + lines.lower)]
     trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded)
@@ -269,10 +273,10 @@ def more_terms(fit: PoleFit) -> Proposals:
 
 
 def split_proposals(fit: PoleFit) -> Proposals:
-    r"""Propose to take those poles apart that are two.
+    r"""Propose to split poles that are two poles.
 
-    A pole of two modes, repeated or so close that one pole passes for both, requires residues
-    of rank two (several inputs), or for a pole of its own at each output (one input):
+    A pole of two modes, which are repeated or so close that one pole replaces both, requires
+    residues of rank two (several inputs), or for a separate pole at each output (one input):
 
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
@@ -284,7 +288,7 @@ def split_proposals(fit: PoleFit) -> Proposals:
 def _more_poles(
     fit: PoleFit, poles: ComplexArray, part: ComplexArray, instead: int | None = None
 ) -> Trial:
-    """Return the trial of a fit with one pole more, or with two instead of one."""
+    """Return the trial of a fit with an additional pole, or with two instead of one."""
     least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
     gain = fit.cost - fit.cost_with(poles, part, instead)
     now = (fit.poles, fit.participation) if instead is None else fit.rest(instead)
@@ -299,13 +303,13 @@ def _pairs(fit: PoleFit, k: int) -> Iterator[Trial]:
     yield _more_poles(fit, np.append(pole + delta, pole - delta), np.hstack([own, own]), k)
     others = np.asarray(la.null_space(own.conj().T), dtype=np.complex128)
     for other in others.T:
-        # a little of its own, so that the fit is free to turn both
+        # a small separate change, so that the fit can change both directions
         yield _more_poles(fit, pole, other[:, None] * la.norm(own) + 1e-3 * own)
 
 
 def relocated(fit: PoleFit) -> Proposals:
     """Propose other places for weak poles, within seven half-widths."""
-    # the likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest
+    # the likelihood of a hardly visible mode has several peaks; a fit reaches the closest one
     rises = fit.rises(list(range(fit.m)))
     for k, pole in enumerate(fit.poles):
         light = -pole.real <= 0.05 * abs(pole)
@@ -318,7 +322,7 @@ def relocated(fit: PoleFit) -> Proposals:
             cost = fit.cost_with(poles[[k]], fit.participation[:, [k]], instead=k)
             trials.append((cost, abs(shift), poles))
         best = sorted(trials, key=lambda trial: trial[0])[:RIVALS]
-        # refined, it is to lower the cost: where it begins it does so seldom
+        # it must lower the cost after refinement; at its start it seldom does
         yield [
             Trial(fit.lines, poles, fit.participation, np.inf, GAIN)
             for _, shift, poles in best
@@ -327,42 +331,43 @@ def relocated(fit: PoleFit) -> Proposals:
 
 
 def missed_poles(fit: PoleFit) -> Proposals:
-    """Propose a pole at the highest peaks of what is left, single lines apart."""
+    """Propose a pole at the highest peaks of the residual; single lines are treated separately."""
     for peak in [peak for peak in unexplained(fit) if not peak.isolated][:TRIED]:
         yield [_more_poles(fit, *_pole_at(fit, peak))]
 
 
-#: lengths [lines] of the stretches that are examined
+#: lengths [lines] of the examined groups of lines
 STRETCHES = (3, 9, 27, 81)
-#: of each length the highest so many, and the peaks at which a pole is tried
+#: number of highest groups of each length, and number of peaks at which a pole is tried
 PLACES, TRIED = 4, 6
-#: standard deviations of a stretch's chi-square above which it is not explained
+#: number of standard deviations of chi-square above which a group counts as not explained
 LIMIT = 6.0
-#: damping ratios tried for a missed pole, beside the widths that its stretch suggests
+#: damping ratios tried for a missed pole, in addition to the width of its group
 DAMPING = (0.0005, 0.002, 0.008, 0.03)
-#: data without noise leave rounding, which is no noise either
+#: data without noise leave rounding, which does not count as noise
 ROUNDING = 1e-9
-#: and without noise, what is left is seldom a mode where it is less than this share of the response
+#: without noise, fraction of the response below which the residual is seldom a mode
 SHARE = 0.01
-#: lines around a peak, and standard deviations of their sum without the two highest, of a mode
+#: for a mode: number of lines around a peak, and standard deviations of their sum without the two
+#: highest
 AROUND, NEARBY = 6, 2.5
 
 
 @dataclass(frozen=True)
 class Peak:
-    """A stretch of lines that is not explained: its middle [Hz], width [Hz] and height [sigma]."""
+    """A group of unexplained lines: its centre [Hz], width [Hz] and height [sigma]."""
 
     freq: float
     width: float
     height: float
-    isolated: bool = False  # one or two lines, and noise alone around them
+    isolated: bool = False  # one or two lines with only noise around them
 
 
 def unexplained(fit: PoleFit) -> list[Peak]:
-    """Return the stretches whose residual is more than noise, each once, the highest first."""
+    """Return the groups of lines whose residual exceeds noise, each once, the highest first."""
     # over L lines of c channels the sum of `2 |e|^2/\sigma^2` is chi-square with 2 c L degrees of
-    # freedom. Its middle and spread are also taken from all stretches (median, median absolute
-    # deviation): an estimated variance is off everywhere, a missed pole is off in one place
+    # freedom. Its centre and spread are also taken from all groups (median, median absolute
+    # deviation): an estimated variance is wrong everywhere, a missed pole only in one place
     lines, model = fit.lines, fit.model
     if _is_exact(fit):
         return []
@@ -381,7 +386,7 @@ def unexplained(fit: PoleFit) -> list[Peak]:
         spread = 1.4826 * float(np.median(np.abs(total - middle)))
         free = lines.freedom(fit.m) / power.size * length
         spread = max(spread, middle / free * np.sqrt(2.0 * free * lines.inflation))
-        # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
+        # chi-square is skewed, its cube root is not (Wilson and Hilferty, 1931)
         height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
         if noiseless:
             share = total / np.convolve(measured, ones, mode="valid")
@@ -407,8 +412,9 @@ def unexplained(fit: PoleFit) -> list[Peak]:
 
 
 def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
-    """Return whether a peak is one or two lines and nothing around them."""
-    # a disturbance, or a mode narrower than the lines are apart; others show at the neighbours too
+    """Return whether a peak consists of one or two lines with nothing around them."""
+    # a disturbance, or a mode narrower than the distance of lines; other modes are visible at the
+    # neighbours too
     aside = max(0, (AROUND - length + 1) // 2)
     near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
     share = near.size / length
@@ -417,10 +423,10 @@ def _isolated(power: FloatArray, first: int, length: int, middle: float, spread:
 
 
 def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
-    """Whether a response at single lines is off by more than its estimated variance explains."""
-    # with nu complex degrees of freedom `|e|^2/\sigma^2` exceeds x by chance with probability
-    # `(1 + x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, nu without
-    # limit, understates: one variance in hundreds comes out several times too small
+    """Whether the error of a response at single lines exceeds its estimated variance."""
+    # with nu complex degrees of freedom `|e|^2/\sigma^2` exceeds x by chance with probability `(1 +
+    # x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, with infinite nu,
+    # understates: one in hundreds of variances is several times too small
     nu = lines.variance_freedom
     if nu is None:
         return True
@@ -436,7 +442,7 @@ def _is_exact(fit: PoleFit) -> bool:
 
 
 def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
-    """Whether neighbouring lines are off alike nearly everywhere: noise does not do that."""
+    """Whether neighbouring lines have similar errors nearly everywhere, unlike noise."""
     error = (lines.data - model) * lines.weight
     alike = np.sum(error[..., 1:] * error[..., :-1].conj(), axis=(0, 1)).real
     power = np.sum(np.abs(error) ** 2, axis=(0, 1))
@@ -447,8 +453,8 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
 
 def _pole_at(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
     """Return the pole and participation that explain a peak best."""
-    # of frequencies across the peak and some damping ratios; the participation is the leading right
-    # singular vector of what the pole has in common with the residual
+    # among frequencies across the peak and some damping ratios; the participation is the leading
+    # right singular vector of the product of the pole with the residual
     lines = fit.lines
     error = (lines.data - fit.model) * lines.weight**2
     best, pole, part = -1.0, 0j, fit.participation[:, :1]
@@ -467,31 +473,34 @@ def _pole_at(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
 
 
 def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
-    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree."""
-    # these by how much, what they are, and which one is off by far more than the others
+    """Warn of groups of lines without a pole, of single lines, or of outputs that disagree."""
+    # for the last: their difference, their kind, and one that deviates far more than the others
     stretches = [peak for peak in left if not peak.isolated]
     if apart is not None:
         warn(
             f"{apart[1]} disagree on the frequencies by {100 * apart[0]:.2g} % (standard "
-            "deviation), which explains most of what is more than noise: a sensor or a hammer that "
-            "moves and has mass, an amplitude or a temperature that changed between measurements. "
-            f"{apart[2]}Poles are means over the {apart[1]}, their deviations come from how these "
+            "deviation), which explains most of the misfit: a moved sensor or hammer with mass, "
+            "or an amplitude or temperature that changed between measurements. "
+            f"{apart[2]}Poles are means over the {apart[1]}, with deviations from how these "
             "differ."
         )
     elif stretches:
         warn(
-            f"more than noise is left near {_peak_list(stretches)}: a mode may be missed or merged "
-            "there, and its neighbours be off by more than their stated deviation. Look at "
+            f"the residual exceeds the noise near {_peak_list(stretches)}: a mode may be missed "
+            "or merged there, and the errors of its neighbours may exceed their stated "
+            "deviation. Look at "
             "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
             "band."
         )
     single = [peak for peak in left if peak.isolated]
     if single and apart is None:
         warn(
-            f"single lines hold more than noise, with noise alone around them: {_peak_list(single)}"
-            ". No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
-            "variance from few segments looks so, and so does a mode narrower than the lines are "
-            "apart. Measure with longer segments to distinguish them, or average more."
+            "single lines contain more than noise, with only noise around them: "
+            f"{_peak_list(single)}"
+            ". No pole was fitted to them: a disturbance with a single frequency (mains, a pump) "
+            "or a variance from few segments looks like this, and so does a mode narrower than "
+            "the distance of lines. Measure with longer segments to distinguish them, or average "
+            "more."
         )
 
 

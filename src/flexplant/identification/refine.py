@@ -15,32 +15,33 @@ from ..errors import SolverError, counted
 from ..tolerances import RANK, TINY
 from .terms import axis, pole_terms, residual_terms
 
-#: largest entry of a participation vector beside the one held at 1
+#: largest entry of a participation vector relative to the one held at 1
 RUNAWAY = 5.0
-#: squares of the standard deviations by which a full step may still move a fit that has settled
+#: squares of the standard deviations by which a full step may still change a converged fit
 FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
-#: steps after which a fit may be given up, and how often the gain of a full step is waited for
+#: number of steps after which a fit may be given up, and multiple of the gain of a full step for
+#: this
 TRIAL_STEPS, GAINS_AHEAD = 4, 20.0
-#: steps of a fit of one output: its poles begin near
+#: number of steps of a fit of one output, whose start poles are close
 OWN = 20
-#: least damping ratio of a pole, and how many times farther from zero than the highest line it may
-#: be: there it is a constant to a hundredth, and with a hold its exponential still a number
+#: least damping ratio of a pole, and its largest distance from zero relative to the highest line:
+#: there the pole is a constant within 1 %, and with a hold its exponential does not overflow
 LEAST, FARTHEST = 1e-7, 100.0
 
 
-class Exhausted(Exception):  # noqa: N818 - no error: the first answer stands
-    """A refinement takes more products than it may."""
+class Exhausted(Exception):  # noqa: N818 - not an error: the first result is kept
+    """A refinement exceeds its allowed number of operations."""
 
 
 @dataclass
 class Products:
-    """Products that fits took so far, and how many they may take."""
+    """Number of operations of fits so far, and the allowed number."""
 
     most: float = np.inf
     done: float = 0.0
 
     def add(self, count: float) -> None:
-        """Count some more; Exhausted where these are too many."""
+        """Count more operations; raise Exhausted above the limit."""
         self.done += count
         if self.done > self.most:
             raise Exhausted
@@ -48,7 +49,7 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """What is fitted: responses, their weights, and what residual terms may explain."""
+    """Data of a fit: responses, their weights, and residual terms."""
 
     freq: FloatArray
     data: ComplexArray  # (n_out, n_in, n_freq)
@@ -66,17 +67,17 @@ class Lines:
     #: poles that a fit may have
     most: int = 1000
     work: Products = field(default_factory=Products)
-    #: what the first axis of the data is, and which of its rows were measured together
+    #: name of the first axis of the data, and which of its rows were measured together
     side: str = "outputs"
     setups: tuple[IntArray, ...] = ()
 
     @property
     def parts(self) -> tuple[IntArray, ...]:
-        """The rows that may have poles of their own: those of a set-up together, else each."""
+        """Groups of rows that may have separate poles: the rows of a set-up, otherwise each row."""
         return self.setups or tuple(np.arange(len(self.data))[:, None])
 
     def freedom(self, m: int) -> float:
-        """Return the expected cost of a fit with m poles: real data less real parameters."""
+        """Return the expected cost of a fit with m poles: number of data minus parameters."""
         # where errors of lines are correlated each parameter fits `inflation` times as much of them
         n_out, n_in, _ = self.data.shape
         used = n_out * n_in * (self.lower + self.upper) + 2 * m * (n_out + n_in)
@@ -85,7 +86,7 @@ class Lines:
     def of_rows(self, rows: IntArray) -> Lines:
         """Return the lines of some outputs."""
         some = replace(self, data=self.data[rows], weight=self.weight[rows], setups=())
-        # what the residual terms take is known
+        # the part of the residual terms is known
         some.__dict__["smooth_bases"] = [self.smooth_bases[o] for o in rows]
         some.__dict__["goals"] = [self.goals[o] for o in rows]
         return some
@@ -109,7 +110,7 @@ class Lines:
 
     @cached_property
     def goals(self) -> list[FloatArray]:
-        """Per output the weighted data (n_in 2 n_freq,) that no residual term explains."""
+        """Per output the weighted data (n_in 2 n_freq,) without the residual terms."""
         found = []
         for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
             found.append(_off(Q, _real_and_imag(data * w)[:, None, :]).ravel())
@@ -134,13 +135,12 @@ def refined(
         + \frac{\bar\psi_{ok} \bar l_{ik}}{s - \bar\lambda_k} + \sum_p E_{oip} g_p(s),
 
     the maximum likelihood one when the weights are those of circular Gaussian errors. Shapes psi
-    and residual terms E are linear and eliminated at each step ([GolubPereyra2003]_;
-    the Jacobian of [Kaufman1975]_); poles and participation l, one entry of each
-    column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
-    to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
-    up: as soon as twenty times what a full step would gain is not enough. `poles_only`: the
-    participation stays as it is, and poles are found to half a standard deviation. `first`: the
-    `pivoted` fit at these poles, where it was made already.
+    and residual terms E are linear and eliminated at each step ([GolubPereyra2003]_; the Jacobian
+    of [Kaufman1975]_); poles and participation l, one entry of each column held at 1, are found by
+    Levenberg-Marquardt: to a tenth of a standard deviation, or to 3e-3 of one where the fit is to
+    be `fine`. A fit that cannot fall `below` a cost is given up as soon as twenty times the gain of
+    a full step is not enough. `poles_only`: the participation is held fixed, and poles are found to
+    half a standard deviation. `first`: the `pivoted` fit at these poles, if it exists already.
     """
     now = pivoted(lines, poles, participation) if first is None else first
     participation, pivots = now.participation, now.pivots
@@ -153,13 +153,13 @@ def refined(
         N, g = now.gradient()
         size = np.sqrt(np.maximum(np.diag(N), TINY))
         scaled, slope = N / np.outer(size, size), g / size
-        # a pole outside the band may come to the axis: it stays there, the others go on
+        # a pole outside the band may reach the axis: it stays there, the others continue
         held = np.flatnonzero((poles.real >= -1.01 * LEAST * poles.imag) & (g[: poles.size] > 0))
         if poles_only:
             held = np.concatenate([held, np.arange(2 * poles.size, g.size)])
         scaled[held], scaled[:, held], slope[held] = 0.0, 0.0, 0.0
         scaled[held, held] = 1.0
-        # what a full step would gain: a damped one is short, and says nothing of being there
+        # the gain of a full step: a damped step is short and does not show convergence
         predicted = float(slope @ _damped_step(scaled, slope, 1e-8))
         better, gained = None, 0.0
         for _ in range(12):
@@ -172,22 +172,22 @@ def refined(
                 if gained >= 0:
                     break
             better = None
-            # tenfold up to a step that helps, from the least that changes anything
+            # by factors of ten until a step improves the fit, from the smallest effective damping
             damping = max(10.0 * damping, 1e-8)
         if better is None:
             break
         poles, participation = trial
         now, damping = better, damping / 10.0
         if np.abs(participation).max() > RUNAWAY:
-            # the entry held at 1 is next to none: another is held
+            # the entry held at 1 is relatively small: another one is held
             now = pivoted(lines, poles, participation)
             participation, pivots = now.participation, now.pivots
-        # a step of so few standard deviations of what is left is none
+        # a step of this fraction of a standard deviation counts as converged
         if predicted <= enough * now.cost / (2 * lines.data.size):
             break
         if number >= TRIAL_STEPS and now.cost - GAINS_AHEAD * predicted > below:
             raise unsettled(poles.size, number)
-        # a gain of rounding, thrice; or all that is there is explained, to 1e-12 of an amplitude
+        # three gains of rounding size; or everything is explained to 1e-12 of an amplitude
         idle = idle + 1 if gained <= 1e-12 * now.cost else 0
         if idle >= 3 or (idle and damping <= 1e-3) or now.cost <= 1e-24 * power:
             break
@@ -198,7 +198,7 @@ def refined(
 
 
 def scaled_inverse(N: FloatArray) -> FloatArray:
-    """Return the inverse of a normal matrix, that of what is not determined zero."""
+    """Return the inverse of a normal matrix, zero in undetermined directions."""
     size = np.sqrt(np.maximum(np.diag(N), TINY))
     return np.asarray(la.pinvh(N / np.outer(size, size), rtol=RANK) / np.outer(size, size))
 
@@ -214,8 +214,8 @@ def pivoted(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> P
 def unsettled(count: int, steps: int) -> SolverError:
     """Return the error of a fit that does not converge."""
     return SolverError(
-        f"the refinement of {counted(count, 'pole')} did not settle within {steps} steps: leave "
-        "out poles that do not stand out of the noise, or narrow the band."
+        f"the refinement of {counted(count, 'pole')} did not converge within {steps} steps: "
+        "leave out poles that do not exceed the noise, or narrow the band."
     )
 
 
@@ -240,7 +240,7 @@ class PoleFit:
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error
         self.bases: list[tuple[FloatArray, FloatArray]] = []
-        #: by place in `lines.parts`, the fits of single outputs that were made so far
+        #: fits of single outputs made so far, by position in `lines.parts`
         self.alone: dict[int, PoleFit] = {}
         self.cost = 0.0
         columns = self._stacked(self.plus, self.minus, participation)
@@ -267,7 +267,7 @@ class PoleFit:
 
     @property
     def misfit(self) -> float:
-        """The cost by that of noise of the stated variance."""
+        """The cost relative to that of noise with the stated variance."""
         return self.cost / self.lines.freedom(self.m)
 
     def rest(self, place: int) -> tuple[ComplexArray, ComplexArray]:
@@ -275,9 +275,9 @@ class PoleFit:
         return np.delete(self.poles, place), np.delete(self.participation, place, axis=1)
 
     def rises(self, kept: list[int]) -> FloatArray:
-        """Return by how much the cost of some poles rises when each of them is left out."""
+        """Return the increase of the cost when each of some poles is left out."""
         # with the least-squares coefficients x and the inverse V of the normal matrix, leaving out
-        # the two of a pole costs `x^T V^-1 x` of its own entries
+        # the two of a pole costs `x^T V^-1 x` of their entries
         both, total = np.array([*kept, *(k + self.m for k in kept)]), np.zeros(len(kept))
         for right, (Q, _), (R, _) in zip(self.lines.goals, self.bases, self.triangles, strict=True):
             half = la.pinv(la.qr(R[:, both], mode="economic")[1], rtol=0.0)
@@ -326,7 +326,7 @@ class PoleFit:
         return self.alone[place]
 
     def of_rows(self, rows: IntArray, below: float = np.inf) -> PoleFit:
-        """Return the fit of some outputs alone: poles of their own, the participation of all."""
+        """Return a separate fit of some outputs, with the common participation."""
         first = self.at_rows(rows)
         return refined(
             *(first.lines, self.poles, self.participation),
@@ -338,7 +338,7 @@ class PoleFit:
         )
 
     def at_rows(self, rows: IntArray) -> PoleFit:
-        """Return what this fit is at some outputs."""
+        """Return the part of this fit at some outputs."""
         part: PoleFit = object.__new__(PoleFit)
         part.lines, part.alone, part.m = self.lines.of_rows(rows), {}, self.m
         part.poles, part.participation, part.pivots = self.poles, self.participation, self.pivots
@@ -374,7 +374,7 @@ class PoleFit:
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
 
     def _moving(self, o: int) -> FloatArray:
-        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, 2 m of a single input."""
+        """Return the derivatives (n_in, 4 m, 2 n_freq) of rows; 2 m for a single input."""
         # with Re and Im of the poles, then with those of the participation of the row's own input
         shape = self.shapes[o][:, None]
         l = self.participation[:, :, None]  # noqa: E741
@@ -388,7 +388,7 @@ class PoleFit:
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
-        """Per input which of the 4 m columns of its rows are parameters, and which ones."""
+        """Per input, which of the 4 m columns of its rows are parameters, and their numbers."""
         # Re and Im of the poles, then the participation, input by input, without the pivots
         m, k = self.m, np.arange(self.m)
         found = []
@@ -403,7 +403,8 @@ class PoleFit:
 
     def _jacobian(self, o: int) -> FloatArray:
         """Return J (n_in 2 n_freq, n_parameters) of an output."""
-        # `J = D - Q Q^T D` with how the rows of each input move, D, and the basis Q of the shapes
+        # `J = D - Q Q^T D` with the derivatives D of the rows of each input and the basis Q of the
+        # shapes
         n_in = self.participation.shape[0]
         Q = self.bases[o][0]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
@@ -420,11 +421,11 @@ class PoleFit:
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
-        """J^T J and J^T e, and per output what the shapes take of J, Q^T D."""
+        """J^T J and J^T e, and per output the projection Q^T D on the shapes."""
         # `J^T J = D^T D - (Q^T D)^T Q^T D` and `J^T e = D^T e`, summed over the inputs, whose rows
-        # feel only their own participation; Q of the residual terms and of the shapes, which are
-        # free of them, as e is. J itself is formed where the difference would lose more than the
-        # least damping of a step makes up for
+        # depend only on their participation. Q is the basis of the residual terms and of the
+        # shapes, which are orthogonal to them, as e is. J itself is formed where the difference
+        # would lose more digits than the least damping of a step allows
         n_in = self.participation.shape[0]
         count = 2 * self.participation.size
         self.lines.work.add(self.lines.data.size * count**2)
@@ -458,7 +459,7 @@ class PoleFit:
             yield split[:, 0] + 1j * split[:, 1]
 
     def maps(self) -> list[tuple[FloatArray, ComplexArray]]:
-        """Return per output how its shapes follow."""
+        """Return per output the derivatives of its shapes."""
         # d[Re psi; Im psi] / d(poles, participation) and, these held, its rows by the weighted data
         # (n_in, n_freq, 2 m)
         n_in, n_freq = self.lines.data.shape[1:]
@@ -472,7 +473,7 @@ class PoleFit:
 
 
 def free_inputs(pivots: Any, n_in: int) -> IntArray:
-    """Return the inputs (n_in - 1, m) whose participation is free, those of each mode rising."""
+    """Return the inputs (n_in - 1, m) with free participation, ascending for each mode."""
     others = np.arange(n_in - 1)[:, None]
     return np.asarray(others + (others >= pivots))
 
@@ -502,15 +503,15 @@ def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(Q), np.asarray(R)
 
 
-#: least part of a column that is its own, above which products tell it well, and that for which one
-#: pass is exact to 1e-14; the same of its square, 1e-10 of rounding: a damping of 1e-8 hides that
+#: least independent fraction of a column for which products are accurate, and for which one pass is
+#: exact to 1e-14; the same of its square, 1e-10 with rounding, which a damping of 1e-8 hides
 OWN_PART, FAR_APART, OWN_SQUARE = 1e-4, 0.1, 1e-6
 
 
 def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q and R of columns of length one, whose memory runs along the columns."""
-    # by the triangle of their products, twice where they are not far apart: many times as fast as
-    # `_qr`, and as exact where no column is nearly a combination of the others
+    """Return Q and R of columns of unit length in column-major memory."""
+    # by the triangle of their products, twice where columns are close: many times faster than
+    # `_qr`, and equally accurate where no column is nearly a combination of the others
     rows, whole = columns.T, np.eye(columns.shape[1])
     for _ in range(2):
         try:
@@ -528,5 +529,5 @@ def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _off(Q: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return rows (n_in, count, N) without what the columns of Q (n_in, N, n_terms) explain."""
+    """Return rows (n_in, count, N) without their projection on Q (n_in, N, n_terms)."""
     return np.asarray(rows - (rows @ Q) @ np.swapaxes(Q, -1, -2))

@@ -1,4 +1,4 @@
-"""The answer of an identification: scaled shapes, and the covariance of its poles."""
+"""Result of an identification: scaled shapes and the covariance of poles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def answer(
     reason: str,
     apart: Disagreement | None,
 ) -> IdentifiedModes:
-    """Return the identified modes of a fit, sorted, those that are reported."""
+    """Return the reported modes of a fit, sorted."""
     lines, misfit = fit.lines, fit.misfit
     formal, spread = _covariances(fit, ready)
     covariance, spread = formal * max(1.0, misfit), spread * max(1.0, misfit)
@@ -81,14 +81,14 @@ def answer(
 
 def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, ComplexArray]:
     """Return the covariance of [Re lambda; Im lambda] and that of shapes and participation."""
-    # the latter E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and participation
-    # theta, the error of the shape at output a is `S_a d theta + D_a^T e_a`,
-    # `d theta = N^{-1} sum_b J_b^T e_b`; D_a and J_a are orthogonal, so that the two are
-    # independent unless outputs share errors. Noise that acts on the machine is shared: near a
-    # resonance it moves all outputs along the shape, which is scale
+    # the latter is E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and
+    # participation theta, the error of the shape at output a is `S_a d theta + D_a^T e_a`, `d theta
+    # = N^{-1} sum_b J_b^T e_b`; D_a and J_a are orthogonal, so that the two are independent unless
+    # outputs share errors. Noise forces on the machine are shared: near a resonance they move all
+    # outputs along the shape, which is an error of scale
     N, maps = fit.gradient()[0], fit.maps()
     m, n_out, n_in = fit.poles.size, len(maps), fit.participation.shape[0]
-    # participation of repeated poles is known up to a rotation only: it gets no variance
+    # participation of repeated poles is only known up to a rotation and gets no variance
     inverse = scaled_inverse(N)
     slopes = np.array([slope for slope, _ in maps]).reshape(n_out, 2, m, -1)
     direct = [own for _, own in maps]
@@ -136,11 +136,11 @@ def _scaled_shapes(
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     r"""Return shapes mass-normalised by shared DOFs, or with a largest entry of 1; participation.
 
-    And T (m, n_out + n_in, n_out + n_in) from errors of the raw channels to those scaled. With
-    ``phi = f psi``, ``p = l / f``: ``d phi = f d psi + phi df/f`` and ``d p = d l / f - p df/f``.
-    Of `shared` channels s, ``f^2 ~ psi_s^H l_s / |psi_s|^2`` and l_s is a multiple r of psi_s but
-    for noise, so that ``2 df/f = psi_s^H (d l_s / r - d psi_s) / |psi_s|^2``; else
-    ``f = 1 / psi_max``.
+    Also returns T (m, n_out + n_in, n_out + n_in) from errors of the raw channels to scaled ones.
+    With ``phi = f psi``, ``p = l / f``: ``d phi = f d psi + phi df/f`` and
+    ``d p = d l / f - p df/f``. For `shared` channels s, ``f^2 ~ psi_s^H l_s / |psi_s|^2`` and l_s
+    is a multiple r of psi_s except for noise, so that
+    ``2 df/f = psi_s^H (d l_s / r - d psi_s) / |psi_s|^2``; else ``f = 1 / psi_max``.
     """
     n_out, m = psi.shape
     large, columns = np.argmax(np.abs(psi), axis=0), np.arange(m)
@@ -175,27 +175,28 @@ def _of_modes(left: ComplexArray, right: ComplexArray) -> Any:
     return np.einsum("fak,fbk->kab", *pairs).real
 
 
-#: width 2 zeta f of a resonance in lines below which leakage may keep poles from being stable
+#: width 2 zeta f of a resonance in lines below which leakage may make poles unstable
 FEWEST = 4.0
-#: what leakage adds to the damping, relative, at a width of n lines, as factor and power of n:
-#: without a window, and with Hamming's and Kaiser's (6 to 2.5 %, 1.1 and 0.4 % at 2 to 16 lines)
+#: relative increase of the damping by leakage at a width of n lines, as factor and power of n:
+#: without a window, and with Hamming and Kaiser windows (6 to 2.5 %, 1.1 and 0.4 % at 2 to 16
+#: lines)
 BOXCAR, TAPERED = (1.0 / np.pi, -1.0), (0.15, -1.25)
-#: width in lines where the window is fitted through: below, little but its main lobe is seen
+#: least width in lines if the fit includes the window: below it, only the main lobe is visible
 FEWEST_THROUGH = 0.5
 
 
 def hann_segment(frf: Frf) -> float | None:
-    """Return the length [s] of the Hann-windowed segments of a measurement, None of others."""
+    """Return the length [s] of the Hann-windowed segments of a measurement, else None."""
     known = frf.window == "hann" and frf.resolution is not None
     return 1.0 / float(frf.resolution or 1.0) if known else None
 
 
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
-    """Warn of resonances that windowed segments widen by more than their deviation."""
-    # segments of length T without a taper shift a pole by about -1/T: of its width of n lines,
-    # `1/(pi n)`; tapered ones leave about `0.15 n^-1.25` ([BendatPiersol2010]_, section 11.6;
-    # random excitation). What leaks is not coherent: no more than `1 - gamma^2` at the resonance.
-    # Where the window is fitted through, nothing is left but below half a line
+    """Warn of resonances that windowed segments broaden by more than their deviation."""
+    # segments of length T without a taper shift a pole by about -1/T, a fraction `1/(pi n)` of its
+    # width of n lines; tapered ones by about `0.15 n^-1.25` ([BendatPiersol2010]_, section 11.6;
+    # random excitation). Leakage is not coherent and at most `1 - gamma^2` at the resonance. Where
+    # the fit includes the window, an error remains only below half a line
     if frf.window is None or frf.resolution is None:
         return
     poles = found.poles
@@ -260,7 +261,7 @@ class IdentifiedModes(MeasuredModes):
     poles, modes, covariance, shapes, dofs
         As in `MeasuredModes`; shapes psi_k at the outputs.
     participation : (n_in, m) complex array
-        l_k, of the inputs.
+        Participation vectors l_k of the inputs.
     inputs, outputs : sequences of str
         Names of the channels.
     input_dofs : sequence of n_in str
@@ -268,7 +269,7 @@ class IdentifiedModes(MeasuredModes):
     terms : (n_out, n_in, lower + upper) array
         E(s), coefficients of powers of s scaled by the largest frequency.
     lower : int
-        How many of them are 1/s, 1/s^2, ...
+        Number of the terms 1/s, 1/s^2, ...
     top : float [Hz]
         The largest frequency.
     hold : float [Hz], optional
@@ -276,30 +277,30 @@ class IdentifiedModes(MeasuredModes):
     segment : float [s], optional
         Length of the Hann-windowed segments through which the poles were fitted.
     unreported : complex array
-        Poles just outside the band that help the fit, then their shapes and participation.
+        Poles just outside the band that improve the fit, with their shapes and participation.
     mass_normalised : bool
         Whether shapes satisfy phi^T (2 lambda M + D) phi = 2i Im(lambda), as those of a model
         do: where an input and an output share a DOF. Otherwise their largest entry is 1.
     misfit : float
-        Cost per degree of freedom; 1 when only noise of the stated variance is left.
+        Cost per degree of freedom; 1 when the residual is only noise with the stated variance.
     diagram : StabilisationDiagram, optional
-        The poles were chosen from.
+        Diagram from which the poles were chosen.
     channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
-        E[n n^H] of the error n of each mode's [shape; participation], that of their scale
-        included, from the FRF's variance and the correlation of its outputs' errors (where not
-        known, they are taken for independent).
+        E[n n^H] of the error n of each mode's [shape; participation], including the error of scale,
+        from the variance of the FRF and the correlation of the errors of outputs (assumed
+        independent where it is not known).
     rejected : sequence of (frequency [Hz], damping ratio, reason)
-        Poles, and lines of mains, that are not reported.
+        Poles and mains lines that are not reported.
     first_answer : str
-        Why poles are those of the first answer, empty where they are those of the maximum
-        likelihood fit to its end (`refined`).
+        Reason why the poles are those of the first result; empty for the complete maximum
+        likelihood fit (`refined`).
     inconsistency : float, optional
         Relative deviation of the frequencies between outputs (or inputs), where they disagree:
-        poles are then means over these, and their covariance comes from how they differ.
+        poles are then means over these, and their covariance follows from the differences.
     inconsistent : str
-        Which of them disagree, "outputs", "inputs" or "runs", empty where none do.
+        Kind of the channels that disagree, "outputs", "inputs" or "runs"; empty if they agree.
     undamped : float [rad/s]
-        What was taken out of the damping: that of an exponential window.
+        Damping of an exponential window that was subtracted.
     """
 
     participation: ComplexArray = field(kw_only=True)
@@ -335,15 +336,15 @@ class IdentifiedModes(MeasuredModes):
 
     @property
     def refined(self) -> bool:
-        """Whether poles are those of the maximum likelihood fit to its end."""
+        """Whether poles are those of the complete maximum likelihood fit."""
         return not self.first_answer
 
     def __repr__(self) -> str:
-        notes = ["refined" if self.refined else f"the first answer ({self.first_answer})"]
+        notes = ["refined" if self.refined else f"the first result ({self.first_answer})"]
         if self.inconsistency is not None:
             notes.append(
                 f"{self.inconsistent} disagree by {self.inconsistency:.1e}, "
-                "poles are means of their own"
+                "poles are means of separate fits"
             )
         elif self.misfit > 1.0:
             notes.append(f"deviations enlarged by the misfit {self.misfit:.3g}")
@@ -352,7 +353,7 @@ class IdentifiedModes(MeasuredModes):
 
     @property
     def shape_covariance(self) -> ComplexArray | None:
-        """E[n n^H] (m, n_out, n_out) of the error n of each shape, None where not known."""
+        """E[n n^H] (m, n_out, n_out) of the error n of each shape, None if not known."""
         count, spread = len(self.outputs), self.channel_covariance
         return None if spread is None else spread[:, :count, :count]
 
@@ -362,10 +363,10 @@ class IdentifiedModes(MeasuredModes):
         Parameters
         ----------
         freq : (n_freq,) array [Hz]
-            Positive; outside the identified band the residual terms do not hold.
+            Positive frequencies; outside the identified band the residual terms are not valid.
         as_measured : bool
-            As the lines of the windowed segments show it, where the poles were fitted so: with
-            lower and wider resonances than those of the machine.
+            Whether to include the effect of windowed segments, if the fit did: resonances are then
+            lower and wider than those of the machine.
         """
         freq = checked_freq(freq)
         if freq.size and freq.min() <= 0:

@@ -1,4 +1,4 @@
-"""Averaged spectra of records, and what FRFs follow from them: H1, H2, Hv, joint input-output."""
+"""Averaged spectra of records, and FRFs from them: H1, H2, Hv, joint input-output."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ class H1Estimator(SpectralMethod):
     segment : float, optional
         Length of a segment [s]; its inverse is the resolution. An eighth of the record by default.
     overlap : float
-        Share of a segment that the next one sees again, 0 to below 1.
+        Fraction of a segment that overlaps with the next one, from 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` takes; "boxcar" where all signals are periodic in a segment.
+        Window as for `scipy.signal.get_window`; "boxcar" where all signals are periodic in a
+        segment.
 
     References
     ----------
@@ -72,7 +73,7 @@ class H2Estimator(SpectralMethod):
 class HvEstimator(SpectralMethod):
     """Total least squares of every output and all inputs, each scaled to unit power per line.
 
-    For one input its size is the geometric mean of those of H1 and H2.
+    For one input its magnitude is the geometric mean of those of H1 and H2.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ def averages(data: Records, method: SpectralMethod) -> Averages:
     total = len(starts) * signals.shape[0]
     count = signals.shape[0] * _effective(window, hop, len(starts))
     freq: FloatArray = np.asarray(np.fft.rfftfreq(length, 1.0 / data.rate), dtype=np.float64)
-    # at zero and at half the rate a spectrum is real, and the mean was taken off
+    # at zero and at half the rate a spectrum is real, and the mean was removed
     keep = slice(1, (length + 1) // 2)
     sizes = data.y.shape[1], data.u.shape[1]
     return Averages(freq[keep], S[keep] / total, count, *sizes, data.rate / length)
@@ -174,13 +175,14 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
     )
 
 
-#: averages times power of the inputs that references explain over the rest: below, the errors of
-#: the quotient are a hundred times what its variance says in the mean, above 6 they are as it says
+#: number of averages times the ratio of input power due to references to the rest, below which a
+#: warning is given: below it the errors of the quotient are on average a hundred times its
+#: variance, above 6 they agree
 STRONG = 8.0
 
 
 def weak_references_warned(found: Averages) -> None:
-    """Warn of lines at which references hardly move the inputs: the quotient is not known there."""
+    """Warn of lines at which references hardly affect the inputs, so that the FRF is unknown."""
     back, power = found.block("u", "r"), np.einsum("fuu->fu", found.block("u", "u")).real
     moved = _divide(found.block("r", "r"), back.conj().transpose(0, 2, 1))
     explained = np.einsum("fur,fru->fu", back, moved).real
@@ -189,9 +191,9 @@ def weak_references_warned(found: Averages) -> None:
     if weak.size:
         warn(
             f"at {weak.size} of {found.freq.size} lines, {weak[0]:.4g} .. {weak[-1]:.4g} Hz, the "
-            "references are too weak in the inputs: noise and the controller make most of them, "
-            "and S_yr S_ur^-1 divides by little. The variance is too small there. Leave these "
-            "lines out, band=, or excite more there, measure longer, or take "
+            "references are too weak in the inputs, which consist mostly of noise, and S_yr "
+            "S_ur^-1 divides by a small number. The variance is too small there. Leave these "
+            "lines out, band=, or excite more there, measure longer, or use "
             "identification.Periodic(...)."
         )
 
@@ -246,7 +248,7 @@ def _total(found: Averages, output: int) -> ComplexArray:
     S = found.S[:, places[:, None], places]
     size = np.sqrt(np.maximum(np.einsum("faa->fa", S).real, TINY))
     vectors = np.linalg.eigh(S / (size[:, :, None] * size[:, None, :]))[1][:, :, 0].conj()
-    # of the smallest eigenvalue: v_y y + v_u u = 0
+    # eigenvector of the smallest eigenvalue: v_y y + v_u u = 0
     vectors = vectors / size
     return np.asarray(-vectors[:, 1:] / vectors[:, :1])
 
@@ -305,7 +307,7 @@ class Records:
 
 
 def records(inputs: Any, outputs: Any, reference: Any, rate: Any, quantity: Any) -> Records:
-    """Return records of arrays or mappings by name; the quantity of the outputs is checked too."""
+    """Return records from arrays or mappings by name; the quantity of the outputs is checked."""
     rate = positive(rate, "rate")
     if quantity is not None:
         require_known("quantity", [quantity], ORDERS)
@@ -365,16 +367,17 @@ def signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, 
     return array, signal_names(names, array.shape[1], prefix, side)
 
 
-#: samples of one value, beyond what quantisation makes, that are no measurement
+#: number of equal samples, beyond the effect of quantisation, that counts as a drop-out
 LONGEST = 20
-#: times the logarithm of the number of runs that the longest of quantised noise is at most
+#: factor on the logarithm of the number of runs, an upper limit for the longest run of quantised
+#: noise
 CHANCE = 3.0
 
 
 def dropouts_warned(data: Records) -> None:
-    """Warn of outputs that repeat one value for longer than quantisation would make them."""
-    # a cable, a buffer or an interferometer that lost its fringe: a disturbance at all lines of an
-    # FRF. Values before the first change are the machine at rest
+    """Warn of outputs that repeat one value for longer than quantisation explains."""
+    # a cable, a buffer or an interferometer failed, which disturbs all lines of an FRF. Values
+    # before the first change belong to the machine at rest
     for name, record in zip(data.outputs, np.moveaxis(data.y, 1, 0), strict=True):
         for signal in record:
             at, length = _longest(signal)
@@ -382,14 +385,14 @@ def dropouts_warned(data: Records) -> None:
                 warn(
                     f"{name} keeps the value {signal[at]:.4g} for {length} samples from "
                     f"{at / data.rate:.4g} s on ({length / data.rate:.3g} s): a drop-out? The "
-                    "estimate counts it as measured. Leave that part of the record out, or the "
-                    "period it lies in."
+                    "estimate counts it as measured. Leave out this section of the record, or "
+                    "its period."
                 )
                 break
 
 
 def _longest(signal: FloatArray) -> tuple[int, int]:
-    """Return where the longest run of one value begins and its length, 0 where it is ordinary."""
+    """Return start and length of the longest run of one value, 0 where it is normal."""
     ends = np.flatnonzero(np.diff(signal) != 0) + 1
     if ends.size < 3:
         return 0, 0

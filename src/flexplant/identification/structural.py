@@ -18,21 +18,22 @@ from ..tolerances import divisor
 from ..words import flag, instance
 from .result import IdentifiedModes
 
-#: part of the largest eigenvalue of an inertia or a flexibility below which one is noise, and by
-#: which one may be negative
+#: fraction of the largest eigenvalue of an inertia or a flexibility below which an eigenvalue
+#: counts as noise, also a negative one
 NOISE, NEGATIVE = 1e-3, 0.05
-#: relative imaginary part of a shape, and part of one that a model's modes do not make, to warn of
+#: relative imaginary part of a shape, and relative error of its expansion in modes of a model,
+#: above which a warning is given
 COMPLEX, MISSED = 0.1, 0.1
-#: relative error of its real shapes below which a pole outside the band is a mode
+#: relative error of the real shapes of a pole outside the band below which it counts as a mode
 ALIKE = 0.3
-#: frequencies of residual vectors that are tried, in parts of the band's end
+#: frequencies of residual vectors that are tried, relative to the upper end of the band
 NEAREST, FARTHEST = 1.03, 10.0
 
 
 def structural_modes(
     measured: IdentifiedModes, dofs: DofSet, *, over: Modes | None = None, rigid: bool = True
 ) -> Modes:
-    r"""Return identified modes as those of a structure, for `assemble_plant`.
+    r"""Return identified modes as modes of a structure for `assemble_plant`.
 
     From the fit :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`,
     mass-normalised at a place where the machine was both driven and measured:
@@ -40,41 +41,42 @@ def structural_modes(
     - shapes :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
       :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, their mean at places
       that are both;
-    - what is left, nearest to :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band:
+    - the remainder, approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band:
       rigid-body modes :math:`\Phi_r \Phi_r^T = A` in the span of the rigid-body motions of the
       geometry, and residual vectors :math:`v v^T/\omega_v^2 = G`, completed from the places that
       are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`;
-    - modes that were found just outside the band are residual vectors too, with their own
-      frequency and damping, where they are modes of a structure: real shapes, driven as they move.
+    - modes just outside the band become residual vectors too, with their frequency and damping,
+    where they are modes of a structure: real shapes with equal input and output shapes.
 
     Parameters
     ----------
     measured : IdentifiedModes
-        Of `identify_modes(frf, dofs={channel: label})`.
+        Result of `identify_modes(frf, dofs={channel: label})`.
     dofs : DofSet
-        Where the labels are. POIs elsewhere need shapes between these:
+        DOFs of the labels. POIs at other places need shapes between these:
         ``interpolated(DofSet(...))``.
     over : Modes, optional
-        Of a model of the same structure, not more modes than there are measured places: shapes
-        are expanded over all its DOFs, ``phi = Phi Phi_a^+ psi`` (SEREP), so that POIs may be
-        anywhere on the model.
+        Modes of a model of the same structure, at most as many as measured places. Shapes are
+        expanded over all its DOFs, ``phi = Phi Phi_a^+ psi`` (SEREP), so that POIs may be anywhere
+        on the model.
     rigid : bool
         Whether the term in 1/s^2 is rigid-body motion. False for a held structure.
 
     Returns
     -------
     Modes
-        Rigid-body modes first. `certificate` says how large the imaginary parts left out are
-        ("imaginary") and, with `over`, what part of a measured shape the model's modes do not make
-        ("expansion"); above a tenth both are warned of.
-        ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the poles to the
-        plant, with ``Shapes(shape_deviations(measured, dofs), measured.modes)`` that of shapes too.
+        Modes with rigid-body modes first. `certificate` contains the size of the neglected
+        imaginary parts ("imaginary") and, with `over`, the relative error of the expansion of
+        measured shapes in modes of the model ("expansion"); above 0.1 a warning is given.
+        ``plant.uncertain(numbered(measured, modes))`` passes the covariance of the poles to the
+        plant, with ``Shapes(shape_deviations(measured, dofs), measured.modes)`` also that of
+        shapes.
 
     Raises
     ------
     ModelError, LabelError
-        When the scale of shapes is not known, the term in 1/s^2 is no inertia, `over` has more
-        modes than places, or a channel is not one of `dofs`.
+        When the scale of shapes is not known, the term in 1/s^2 is not an inertia, `over` has more
+        modes than places, or a channel is not in `dofs`.
 
     References
     ----------
@@ -122,12 +124,13 @@ def structural_modes(
         warn(
             f"a measured shape has an imaginary part of {imaginary:.0%}: the modes of this "
             "structure are real, so that it is left out. Measure longer, or look for two modes "
-            "that were taken for one."
+            "that were identified as one."
         )
     if certificate.get("expansion", 0.0) > MISSED:
         warn(
-            f"{certificate['expansion']:.0%} of a measured shape is none of the model's modes: "
-            "the expansion is that far off at least. Give more of its modes, or update it first."
+            f"{certificate['expansion']:.0%} of a measured shape is not in the span of the "
+            "model's modes: the error of the expansion is at least this large. Give more modes "
+            "of the model, or update it first."
         )
     body, phi, vectors = columns
     m = residual.shape[1]
@@ -145,7 +148,7 @@ def structural_modes(
             -near.real / np.abs(near), np.full(m, float(np.median(measured.zeta)))
         ),
         vector_dofs=[
-            *(f"mode beside the band at {abs(pole) / (2 * np.pi):.5g} Hz" for pole in near),
+            *(f"mode outside the band at {abs(pole) / (2 * np.pi):.5g} Hz" for pole in near),
             *(f"residual {i + 1}" for i in range(m)),
         ],
         certificate=certificate,
@@ -170,14 +173,14 @@ def measured_places(
     absent = [label for label in labels if label not in dofs.labels]
     if absent:
         raise LabelError(
-            f"{', '.join(absent[:4])} are channels at no DOF of {dofs!r}. Say where they are: "
+            f"{', '.join(absent[:4])} are channels without a DOF in {dofs!r}. Give their places: "
             "identify_modes(frf, dofs={channel: label})."
         )
     return MeasuredPlaces(measured, labels), dofs, dofs.indices(labels)
 
 
 class Beside(NamedTuple):
-    """Modes just outside the band, as the fit has them and by places."""
+    """Modes just outside the band, from the fit and by places."""
 
     poles: ComplexArray
     residues: ComplexArray
@@ -185,7 +188,7 @@ class Beside(NamedTuple):
 
 
 class MeasuredPlaces:
-    """The channels of an identification by the places they are at."""
+    """The channels of an identification, sorted by their places."""
 
     def __init__(self, measured: IdentifiedModes, labels: tuple[str, ...]) -> None:
         self.measured, self.labels, self.count = measured, labels, len(labels)
@@ -227,8 +230,8 @@ class MeasuredPlaces:
 
     def smooth(self, beside: Beside) -> tuple[FloatArray, FloatArray, float]:
         """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes."""
-        # the residual terms, and what poles outside the band are no modes of a structure, on 200
-        # frequencies of the band, relative to the whole response; w is searched
+        # the residual terms and the poles outside the band that are not modes of a structure, at
+        # 200 frequencies of the band, relative to the whole response; w is searched
         measured, top = self.measured, self.top
         freq = np.geomspace(0.5 * float(measured.freq.min()), measured.top, 200)
         s2 = -((2 * np.pi * freq) ** 2)
@@ -272,7 +275,8 @@ class MeasuredPlaces:
         values, vectors = la.eigh(S)
         if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
             raise ModelError(
-                "the term in 1/s^2 of the measurement is no rigid-body motion of positive mass. "
+                "the term in 1/s^2 of the measurement is not a rigid-body motion with positive "
+                "mass. "
                 "Pass rigid=False for a held structure; begin the band of a free one lower."
             )
         keep = values > NOISE * values[-1]
@@ -314,21 +318,21 @@ def expansion(over: Modes, rows: Any) -> FloatArray:
 def shape_deviations(
     measured: IdentifiedModes, dofs: DofSet, *, over: Modes | None = None, count: int = 2
 ) -> FloatArray:
-    r"""Return the principal standard deviations of shapes that `structural_modes` makes.
+    r"""Return the principal standard deviations of shapes from `structural_modes`.
 
     The error n of a mode's shape and participation gives its place shape (the mean of both where
     a place was driven and measured, expanded over a model's modes where they are given) the error
     :math:`A n`, and its real part, of circular noise, the covariance
-    :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are kept,
-    and made larger so that the sum of all variances is.
+    :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are kept and
+    scaled so that the sum of all variances is preserved.
 
     Parameters
     ----------
     measured, dofs, over
-        As given to `structural_modes`.
+        As for `structural_modes`.
     count : int
-        Directions of each mode; noise that each sensor has for itself needs as many as there are
-        places to be shown in full.
+        Number of directions of each mode; independent sensor noise needs as many as places to be
+        represented exactly.
 
     Returns
     -------
@@ -338,7 +342,7 @@ def shape_deviations(
     Raises
     ------
     ModelError, LabelError
-        As `structural_modes`; or when the covariance of the shapes is not known.
+        As for `structural_modes`; or when the covariance of the shapes is not known.
 
     Examples
     --------

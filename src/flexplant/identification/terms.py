@@ -1,4 +1,4 @@
-"""What a pole and a residual term show at the lines of a measurement, held and windowed."""
+"""Poles and residual terms at the lines of a measurement, with hold and window."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
 
-#: |(s - lambda) T| below which the integral of a window's pole is a sum over Gauss points, because
-#: the closed form cancels there, and their number, which is exact to rounding
+#: |(s - lambda) T| below which the integral for a windowed pole is a sum over Gauss points, because
+#: the closed form loses digits there; and number of points, which is exact to rounding
 CLOSE, GAUSS_POINTS = 8.0, 24
 
 
 def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, ComplexArray]:
-    r"""Return R and dR/dq: a pole's term ``1/q`` is seen as ``R/q``, q = s - lambda.
+    r"""Return R and dR/dq: a window changes the term ``1/q`` to ``R/q``, q = s - lambda.
 
-    Averages of windowed segments estimate, for an input that is white over a few lines, the
-    response whose impulse response is multiplied by the autocorrelation of the window, a lag
-    window:
+    For an input that is white over a few lines, averages of windowed segments estimate a response
+    whose impulse response is multiplied by the autocorrelation of the window (a lag window):
 
     .. math:: R = q \int_0^T \rho(\tau) e^{-q \tau} d\tau, \quad
         \rho(\tau) = \left(1 - \frac{\tau}{T}\right)
@@ -54,13 +53,12 @@ def pole_terms(
 ) -> tuple[ComplexArray, ComplexArray]:
     r"""Return ``1/(s - lambda)`` (n_poles, n_freq) and its derivative with respect to lambda.
 
-    Behind a zero-order hold of period T, a sampled mode answers
+    After a zero-order hold of period T, a sampled mode has the response
 
     .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
 
-    which has the same pole on the axis of s and tends to 1/(s - lambda) with T
-    ([PintelonSchoukens2012]_, section 6.2). `segment`: as lines of Hann-windowed segments [s] show
-    them.
+    which has the same pole in s and tends to 1/(s - lambda) for small T ([PintelonSchoukens2012]_,
+    section 6.2). `segment`: with the effect of Hann-windowed segments [s].
     """
     gap = s[None, :] - poles[:, None]
     value, slope = 1.0 / gap, 1.0 / gap**2

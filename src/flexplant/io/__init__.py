@@ -1,14 +1,14 @@
 """Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
 
 - `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
-- `read_matrices`: matrices without DOFs, which have `frequencies(10)`; `read_modes`: modes of a
-  solved model.
+- `read_matrices`: matrices without DOFs, which still give `frequencies(10)`; `read_modes`: modes of
+a solved model.
 - `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
   `estimate_frf`.
 - `read_mat`, `write_mat`: systems to and from MATLAB.
 
-The first three find the format themselves; the reader of one format says more. Files that cannot
-be read are refused with what to write instead.
+The first three detect the format; readers of a single format have more options. An error for a file
+that cannot be read says what to export instead.
 
 >>> import tempfile, pathlib
 >>> import flexplant as fx
@@ -35,7 +35,7 @@ be read are refused with what to write instead.
 | responses | `read_frf_csv`, ... | .csv, .mat, .npz: frequency responses |
 | values for MATLAB | `read_mat`, `write_mat` | .mat: systems and plants; responses are written |
 
-**A model of your own**, in whatever units it was written, is read, checked, solved and reduced:
+**Your own model**, in any units, is read, checked, solved and reduced:
 
 ```python
 model = fx.read_model(
@@ -74,9 +74,9 @@ print(small.quality(model, band=(100.0, 5000.0), inputs=keep.labels[:2], outputs
   universal file (55 or 2414, nodes 15 or 2411) or Exodus.
 
 Give ``units=("mm", "t", "s")`` where the model is not in SI, ``rigid_below=`` where rigid-body
-modes came out near 0. Modes are for models that only a cluster can solve: the static motion of the
-modes left out is missing then (residual vectors, ``RESVEC``, bring most of it), which the result
-says, and damping must be stated.
+modes came out near 0. Modes serve models that only a cluster can solve. The static motion of the
+truncated modes is then missing (residual vectors, ``RESVEC``, provide most of it), which a note
+states, and damping must be given.
 """
 
 from ..rooms import public_names as _public_names

@@ -31,7 +31,7 @@ from .files import (
 )
 from .triplets import from_triplets
 
-#: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
+#: value that Abaqus writes on the diagonal of a degree of freedom with a boundary condition
 _HELD = 1e35
 _WORD = re.compile(rb"[^\s,]+")
 
@@ -264,7 +264,7 @@ def _input_nodes(path: str | Path) -> dict[int, list[float]]:
     return places
 
 
-#: what to do with an input file that is not flat, or turns its nodes
+#: advice for an input file that is not flat, or rotates its nodes
 _FLAT = "Write the flattened input file (no parts and assemblies)."
 _PLACE = "Remove it, or name rows and places yourself: .with_dofs(DofSet(...))."
 FORMATS.append(Format((".mtx",), read_abaqus, mesh=(".inp",), mesh_option="inp"))

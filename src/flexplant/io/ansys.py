@@ -37,9 +37,9 @@ def read_ansys(
     local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
 
     Refused are lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are not a displacement or
-    rotation, and a file without M. A damping matrix in the file is not read, which `notes` say:
-    give damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about
-    the new x, then about the new y.
+    rotation, and a file without M. A damping matrix in the file is not read, as `notes` state: give
+    damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about the
+    new x, then about the new y.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ ELSEWHERE += [
 
 
 _KINDS = dict(zip(("UX", "UY", "UZ", "ROTX", "ROTY", "ROTZ"), DIRECTIONS, strict=True))
-#: of the header: a modal analysis
+#: value in the header for a modal analysis
 _MODAL = 2
 
 
@@ -185,7 +185,7 @@ def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
     if found["analysis"] != _MODAL or found["cyclic"]:
         what = "a cyclic sector" if found["cyclic"] else "another analysis"
         do = "Write it with ANTYPE,MODAL of the whole model."
-        raise unread(path.name, f"is of {what}: its steps are no modes of a structure", do)
+        raise unread(path.name, f"is of {what}, and its steps are not modes of a structure", do)
     strange = [name for name in found["kinds"] if name not in _KINDS]
     if strange or not found["kinds"]:
         raise no_motion(path.name, strange)

@@ -1,4 +1,4 @@
-"""Coordinate systems of files: where their points are, and along what nodes in them move."""
+"""Coordinate systems of files: positions of points, and directions of motion of nodes."""
 
 from __future__ import annotations
 

@@ -39,22 +39,22 @@ def read_exodus_modes(
     path : str or Path
         A netCDF-3 file; netCDF-4 (HDF5) needs h5py: pip install 'flexplant[hdf5]'.
     times : {"frequency", "omega", "eigenvalue"}
-        What stands in the place of time: Hz (Sierra/SD), rad/s or (rad/s)^2.
+        Quantity stored as time: Hz (Sierra/SD), rad/s or (rad/s)^2.
     zeta : float or (k,) array
-        Damping ratios, which the file does not hold; rigid-body modes have none.
+        Damping ratios, which the file does not contain; those of rigid-body modes are ignored.
     rigid_below : float [Hz], optional
-        Modes below this are rigid-body modes, and set to exactly 0.
+        Frequency below which modes count as rigid-body modes and are set to exactly 0.
     variables : mapping {direction: name}, optional
-        Which nodal variables are the shapes, such as {"z": "DispZ", "rx": "RotX"}; when not given
-        those called DispX ... RotZ, in the usual spellings.
+        Nodal variables of the shapes, such as {"z": "DispZ", "rx": "RotX"}; by default DispX ...
+        RotZ, in the usual spellings.
     M : (n, n) array or sparse matrix [kg], optional
         The mass matrix in the order of the DOFs (node by node), to check the shapes with.
 
     Returns
     -------
     Modes
-        With the shapes as they are. Modes are mass-normalised, which solvers write by default but
-        the file does not say: only `M` makes it sure.
+        Modes with the shapes of the file. They are assumed to be mass-normalised, which is the
+        default of solvers but not stated in the file; `M` checks it.
 
     Raises
     ------
@@ -146,8 +146,8 @@ def _motion_variables(
     doubled = {d: [names[i] for i in places] for d, places in found.items() if len(places) > 1}
     if doubled or not found:
         raise FlexplantError(
-            f"{path!r} has nodal variables {names[:12]}, among which the shapes are not clear. Say "
-            "which they are: variables={'x': 'DispX', ...}."
+            f"{path!r} has nodal variables {names[:12]}, and it is not clear which are the "
+            f"shapes. Name them: variables={'x': 'DispX', ...}."
         )
     return {d: found[d][0] for d in DIRECTIONS if d in found}
 
@@ -198,7 +198,7 @@ class ExodusFile:
     def variables(self) -> list[str]:
         """Return the names of the nodal variables."""
         if "name_nod_var" not in self.held:
-            raise damaged(self.path, "it has no nodal variables, hence no shapes")
+            raise damaged(self.path, "it has no nodal variables and therefore no shapes")
         table = self.array("name_nod_var")
         return [
             b"".join(np.atleast_1d(row).tolist()).split(b"\0")[0].decode("latin-1").strip()

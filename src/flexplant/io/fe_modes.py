@@ -20,12 +20,12 @@ from ..structure.unit_systems import units as unit_system
 from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
-#: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits
+#: distance of generalised masses from 1 that few digits of mass-normalised shapes explain
 _ONE = 1e-5
-#: relative: what shapes in single precision may deviate from orthonormality
+#: largest relative deviation from orthonormality of shapes in single precision
 _SINGLE = 1e-4
 MISSING = (
-    "no residual attachment vectors: what the modes left out move statically is missing "
+    "no residual attachment vectors: the static motion of truncated modes is missing "
     "(write residual vectors as further modes: RESVEC)"
 )
 
@@ -43,7 +43,8 @@ class FileShapes:
     units: Units | None = None
 
 
-#: by suffix, what reads the shapes of a file (its path, that of its nodes); each reader registers
+#: function by suffix that reads the shapes of a file (its path, that of its nodes); each reader
+#: registers
 MODE_READERS: dict[str, Callable[[Path, Path | None], FileShapes]] = {}
 
 
@@ -61,14 +62,16 @@ def scaled_modes(
     shapes = _unit_mass(shapes, path)
     damping = shapes.zeta if zeta is None else zeta
     if damping is None:
-        raise unread(path, "does not say how modes are damped", "Say it: zeta=0.01, or one a mode.")
+        raise unread(
+            path, "does not say how modes are damped", "Give zeta=0.01, or one value per mode."
+        )
     phi, moved = shapes.phi, np.any(shapes.phi != 0, axis=1)
     notes = shapes.notes
     if not moved.all():
         held = int(np.count_nonzero(~moved))
         notes = (
             *notes,
-            f"left out, as no mode moves them: {counted(held, 'DOF')} (held, or not there)",
+            f"left out, since no mode moves them: {counted(held, 'DOF')} (held, or not there)",
         )
     rows = np.flatnonzero(moved)
     directions = tuple(shapes.dofs.directions[i] for i in rows.tolist())
@@ -102,7 +105,7 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
         return replace(shapes, notes=(*shapes.notes, note))
     if np.any(wrong := ~((masses > 0) & np.isfinite(masses))):
         mode = int(np.argmax(wrong)) + 1
-        what = f"gives mode {mode} a generalised mass of {masses[mode - 1]:g}, which none has"
+        what = f"gives mode {mode} an impossible generalised mass of {masses[mode - 1]:g}"
         raise unread(path, what, "Was it written by a modal analysis?")
     off = float(np.max(np.abs(masses - 1)))
     if off < _ONE:
@@ -122,14 +125,15 @@ def frequencies(omega: FloatArray, rigid_below: float | None, path: str) -> Any:
     if elastic.size and (elastic[0] < 0 or (elastic[0] < 1e-3 * elastic[-1] and limit is None)):
         raise ModelError(
             f"{path!r} has modes at {np.array2string(elastic[:6] / 2 / np.pi, precision=3)} Hz: "
-            "some of them seem to be rigid-body modes that came out near zero. Say which: "
-            "rigid_below=... [Hz] sets those below to exactly 0 (a tiny one keeps them all)."
+            "some of them seem to be rigid-body modes with a computed frequency near zero. Give "
+            "rigid_below=... [Hz]: modes below it are set to exactly 0 (a tiny value keeps them "
+            "all)."
         )
     return np.where(rigid, 0.0, omega), int(np.count_nonzero(rigid)), order
 
 
 def check_mass(phi: FloatArray, M: Any, path: str) -> float:
-    """Return how far phi^T M phi is from the identity, which single precision may explain."""
+    """Return the deviation of phi^T M phi from the identity; ModelError above single precision."""
     n = phi.shape[0]
     if M.shape != (n, n):
         raise ShapeError(
@@ -157,16 +161,16 @@ def read_modes(
     units: Sequence[str | float] | None = None,
     matrices: FEMatrices | FEModel | None = None,
 ) -> Modes:
-    r"""Return the modes that a finite-element program computed, whichever wrote the file.
+    r"""Return the modes that a finite-element program computed, from any known file format.
 
-    For models that are too large to be solved here: shapes at all nodes become Modes, and these a
-    plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH); ANSYS .rst;
-    Exodus .exo, .e (frequencies in Hz in the place of time); universal files .uff, .unv of normal
-    modes.
+    It serves models that are too large to be solved here: shapes at all nodes become Modes, which
+    become a plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH);
+    ANSYS .rst; Exodus .exo, .e (frequencies in Hz in the place of time); universal files .uff, .unv
+    of normal modes.
 
     Residual attachment vectors are not in such files, and cannot be made without M and K: the
-    static motion that the modes left out have is missing, which `notes` say. Nastran and ANSYS
-    write residual vectors as further modes of high frequency (RESVEC), which bring most of it back.
+    static motion of truncated modes is missing, as `notes` state. Nastran and ANSYS can write
+    residual vectors as further modes of high frequency (RESVEC), which provide most of it.
 
     Parameters
     ----------
@@ -175,34 +179,34 @@ def read_modes(
         Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
         modes have none.
     nodes : str or Path, optional
-        Where the nodes are, if not in the file: the bulk data of Nastran (.bdf, .dat), a universal
-        file, or a table `node, x, y, z`.
+        File with the nodes, if they are not in the first file: the bulk data of Nastran (.bdf,
+        .dat), a universal file, or a table `node, x, y, z`.
     rigid_below : float [Hz], optional
         Modes below this are rigid-body modes, and set to exactly 0.
     units : (length, mass, time), optional
-        Units of the file: ("mm", "t", "s") for instance; the modes are in SI. None: as a universal
-        file says (dataset 164), or SI.
+        Units of the file: ("mm", "t", "s") for instance; the modes are in SI. None: the units in a
+        universal file (dataset 164), or SI.
     matrices : FEMatrices or FEModel, optional
-        In SI, with the same nodes: the shapes are checked to be mass-normalised with its M.
+        Model in SI with the same nodes; its M checks that the shapes are mass-normalised.
 
     Returns
     -------
     Modes
-        In global directions, with unit generalised masses where the file has them (LAMA, dataset
-        55) and else as they are. `certificate["mass"]` is the largest entry of phi^T M phi - I
-        where `matrices` are given.
+        Modes in global directions, with unit generalised masses where the file contains masses
+        (LAMA, dataset 55) and unchanged otherwise. `certificate["mass"]` is the largest entry of
+        phi^T M phi - I where `matrices` are given.
 
     Raises
     ------
     FileNotFoundError
-        When there is no such file, as with every reader.
+        When the file does not exist, as with every reader.
     FlexplantError
         When the format is not known, holds no modes, or the file is damaged.
     ModelError
-        When damping is not said, modes are near zero and `rigid_below` is not given,
-        several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
+        When damping is not given, modes are near zero and `rigid_below` is not given, the file has
+        several sets of modes, or the shapes are not mass-normalised with `matrices`.
     LabelError
-        When a node has no place or its coordinate system is not there.
+        When a node has no position or its coordinate system is missing.
 
     Examples
     --------
@@ -225,7 +229,7 @@ def read_modes(
     if read is None:
         known = ", ".join(MODE_READERS)
         raise FlexplantError(
-            f"{path.name!r} is no file of modes that is read here; known are {known}. Nastran "
+            f"{path.name!r} is not a known file of modes; known are {known}. Nastran "
             "writes .op2 with DISPLACEMENT=ALL and PARAM,POST,-1, ANSYS .rst; of the others export "
             "a universal file, or matrices, which read_model reads."
         )
@@ -240,7 +244,7 @@ def read_modes(
 
 
 def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float:
-    """Return how far the shapes are from mass-normalised with the M of a model."""
+    """Return the error of the mass normalisation of shapes with the M of a model."""
     if matrices.M is None or matrices.dofs is None:
         raise ModelError(
             "matrices need M, and names of their rows, to check the shapes with. Give them: "
@@ -254,7 +258,7 @@ def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float
             f"the modes of {path!r} move {len(lost)} DOFs that the matrices do not have, the first "
             f"{lost[:4]}. Are both of one model, with the same supports?"
         )
-    # a row that no mode moves was left out
+    # rows that no mode moves were left out
     found = [row.get(label, -1) for label in matrices.dofs.labels]
     phi = np.vstack([np.real(modes.phi), np.zeros(modes.n_modes)])[found]
     return check_mass(phi, matrices.M, path)

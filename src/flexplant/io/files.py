@@ -1,4 +1,4 @@
-"""What is common to files: paths, numbers in the text of Fortran, what is said of damaged ones."""
+"""Common functions for files: paths, numbers in Fortran text, errors for damaged files."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from ..errors import FlexplantError, ModelError, short
 from ..structure import FEMatrices
 from ..words import several
 
-#: characters of a number that a program printed, at least; shorter ones may be typed by hand
+#: least number of characters of a number printed by a program; shorter ones may be typed by hand
 _PRINTED = 12
-#: numbers of fewer digits may be exact; longer ones were rounded to that number of digits
+#: number of digits: shorter numbers may be exact; longer ones were rounded to their number of
+#: digits
 _ROUNDED = 6
 #: digits that a sign and one more digit of the exponent take from a number in a fixed field
 _FIELD = 2
-#: part of the numbers that have all digits: fewer end in several zeros by chance
+#: least fraction of numbers with all digits: fewer end in several zeros by chance
 _ALIKE = 0.6
-#: a number with this number of digits was printed in double precision, however short the others are
+#: number of digits that shows double precision, even if the other numbers are shorter
 _DOUBLE = 15
 #: an exponent without its letter: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
@@ -38,7 +39,7 @@ def decimal(text: str) -> float:
     """Return a decimal number as Fortran or C writes it: 7.5, 7.5e3, 7.5D+03, 7.5+03."""
     match = _DECIMAL.fullmatch(text.strip())
     if match is None:
-        raise ValueError(f"{text.strip()!r:.40} is no decimal number")
+        raise ValueError(f"{text.strip()!r:.40} is not a decimal number")
     return float(f"{match[1]}e{match[2] or match[3] or 0}")
 
 
@@ -47,7 +48,8 @@ def fixed_numbers(text: bytes, width: int) -> FloatArray | None:
     fields = np.frombuffer(text, np.uint8).reshape(-1, width)
     shown = np.zeros((fields.shape[0], width + 1), dtype=bool)
     shown[:, 1:] = fields != ord(" ")
-    # one number in each: a blank within a field next to an empty field would shift all that follow
+    # one number in each field: a blank within a field next to an empty field would shift all
+    # following ones
     if np.any(np.count_nonzero(shown[:, 1:] & ~shown[:, :-1], axis=1) != 1):
         return None
     return spaced_numbers(_separated(fields).tobytes(), len(fields))
@@ -90,7 +92,7 @@ def numbers_of_lines(
     text: bytes, width: int, wrong: Callable[[int, bytes], FlexplantError]
 ) -> FloatArray:
     """Return the finite numbers (m, width) of m lines."""
-    # `wrong` makes the error of the first line, by its place from 0, that does not hold them
+    # `wrong` makes the error for the first line, by its number from 0, without these numbers
     table = rows_of_numbers(text, width)
     if table is None or not np.all(np.isfinite(table)):
         lines = text.split(b"\n")
@@ -116,7 +118,7 @@ _LETTERS = bytes.maketrans(b"DdEQq", b"eeeee")
 
 def _parse_numbers(text: bytes) -> FloatArray | None:
     with warnings.catch_warnings():
-        # what NumPy says when it stops before the end
+        # message of NumPy when it stops before the end
         warnings.simplefilter("error", DeprecationWarning)
         try:
             return np.asarray(np.fromstring(text.decode("latin-1"), sep=" "), dtype=np.float64)
@@ -125,11 +127,11 @@ def _parse_numbers(text: bytes) -> FloatArray | None:
 
 
 def printed_digits(words: Iterable[bytes]) -> int | None:
-    """Return with how many significant digits numbers were printed; None where that does not show.
+    """Return the number of significant digits of printed numbers; None if unknown.
 
-    A program that rounds prints all numbers alike: in a fixed field, up to the places that sign and
-    exponent take, or with as many digits, less the zeros at the end. Numbers of a few digits, such
-    as 5 or 2.5, and some long ones among them, may be exact.
+    A program that rounds prints all numbers in the same way: in a fixed field, apart from the
+    characters of sign and exponent, or with the same number of digits, without zeros at the end.
+    Numbers of a few digits, such as 5 or 2.5, and some long ones among them, may be exact.
     """
     found = []
     for word in words:
@@ -143,12 +145,12 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
     return most if most >= _DOUBLE or (most >= _ROUNDED and alike) else None
 
 
-#: what to do with a file that says a thing twice
+#: advice for a file that contains an item twice
 ONCE = "Export each once (one result set)."
 
 
 def file_path(path: Any, name: str = "path") -> Path:
-    """Return the path of a file; its absence is left to what opens it."""
+    """Return the path of a file; a missing file is reported when it is opened."""
     if not isinstance(path, str | Path):
         raise FlexplantError(
             f"{name} must name a file, got {short(path)}. Pass matrices that are in memory already "
@@ -160,30 +162,30 @@ def file_path(path: Any, name: str = "path") -> Path:
 
 
 def damaged(path: object, what: object, do: str = "Write it again.") -> FlexplantError:
-    """Return the error of a file that is not what its format says; `what` is cut to 200 letters."""
+    """Return the error of a file that violates its format; `what` is cut to 200 letters."""
     return FlexplantError(f"{str(path)!r}, {what!s:.200}: the file is damaged or cut off. {do}")
 
 
 def wrong_line_of(
     path: object, number: int, due: str, line: str | bytes, do: str = "Write it again."
 ) -> FlexplantError:
-    """Return the error of a line, counted from 1, that does not hold what is due there."""
+    """Return the error of a line, counted from 1, with unexpected content."""
     got = line.decode("latin-1") if isinstance(line, bytes) else line
     return FlexplantError(
-        f"{str(path)!r}, line {number}: {due} due, got {got.strip()[:72]!r}. {do}"
+        f"{str(path)!r}, line {number}: {due} expected, got {got.strip()[:72]!r}. {do}"
     )
 
 
 def defined_twice(what: str, first: str, again: str, do: str) -> FlexplantError:
     """Return the error of an identifier with two definitions, both of which are named."""
     return FlexplantError(
-        f"{what} is defined twice, in {first} and in {again}: which of the two the numbers belong "
-        f"to is not known. {do}"
+        f"{what} is defined twice, in {first} and in {again}: it is not clear to which of the "
+        f"two the numbers belong. {do}"
     )
 
 
 def refused(path: object, what: str, do: str) -> FlexplantError:
-    """Return the error of a file that holds another thing than what is read of it."""
+    """Return the error of a file with other content than the reader expects."""
     return FlexplantError(f"{str(path)!r} {what}. {do}")
 
 
@@ -195,9 +197,9 @@ def unread(path: object, what: str, do: str) -> ModelError:
 def no_motion(path: object, kinds: object) -> ModelError:
     """Return the error of a file with DOFs that are not displacements or rotations."""
     what = (
-        f"has DOFs that are no displacement or rotation ({kinds}): temperature, pressure, voltage"
+        f"has DOFs other than displacements and rotations ({kinds}): temperature, pressure, voltage"
     )
-    return unread(path, f"{what}, warping or a multiplier", "Export the structural part alone.")
+    return unread(path, f"{what}, warping or a multiplier", "Export only the structural part.")
 
 
 def three_units(units: Any) -> tuple[Any, ...]:
@@ -213,11 +215,11 @@ def three_units(units: Any) -> tuple[Any, ...]:
 
 def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
     """Refuse a text that ends, without a line end, in a number shorter than all others."""
-    # a number without its last digits still is a number
+    # a number without its last digits is still a number
     last = content[-80:].split()[-1:]
     if content.endswith((b"\n", b"\r")) or not last:
         return
-    # the last itself may be among them
+    # the last number itself may be among them
     others = [len(word) for word in (w.strip().lstrip(b"+-") for w in words) if word not in last[0]]
     if others and len(last[0].lstrip(b"+-")) < min(others) >= _PRINTED:
         raise damaged(path, "the last number is shorter than all others")
@@ -230,12 +232,12 @@ def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
         yield
     except FlexplantError:
         raise
-    except Exception as error:  # its bytes lead anywhere
+    except Exception as error:  # damaged bytes may raise anything
         raise damaged(path, f"{type(error).__name__}: {error}", do) from None
 
 
 def check_count(size: int, held: int, path: object) -> None:
-    """Refuse a number of rows or columns that a damaged count has made."""
+    """Refuse an impossible number of rows or columns from a damaged count."""
     if size > max(2**20, held):
         raise damaged(path, f"a matrix of {size} rows or columns in {held} bytes")
 
@@ -247,16 +249,16 @@ def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
         text = content.decode(encoding)
     except UnicodeDecodeError as error:
         if not is_text(content):
-            what = f"byte {error.start} is no text of UTF-8"
+            what = f"byte {error.start} is not UTF-8 text"
             do = "Is it another format? Save it as plain text, UTF-8."
             raise damaged(path, what, do) from None
         text = content.decode("latin-1")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-#: stands for the matrix that has a usual name, where one is there
+#: stands for the matrix with a usual name, if there is one
 USUAL = "usual"
-#: this many bytes at the beginning of a file must show its format
+#: number of bytes at the beginning of a file that must show its format
 HEAD = 20000
 
 
@@ -318,13 +320,13 @@ class Elsewhere:
     begins: Callable[[bytes], bool] = lambda head: True
 
 
-#: what each reader's module registers: its files, and those of the same program without matrices
+#: formats registered by the readers: their files, and files of the same program without matrices
 FORMATS: list[Format] = []
 ELSEWHERE: list[Elsewhere] = []
 
 
 def add_format(form: Format) -> None:
-    """Make a format of your own known to `read_matrices` and `read_model`.
+    """Register your own format for `read_matrices` and `read_model`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Parsers of other packages, which a damaged file may crash: `in_child` runs them in this file.
+"""Parsers of other packages, run in a child process since a damaged file may crash them.
 
 Nothing of this package is imported here: the process starts in a fraction of a second, and returns
 plain arrays, texts and dicts only.
@@ -15,9 +15,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-#: bytes that any file may need in addition to a multiple of its size
+#: number of bytes that any file may need in addition to a multiple of its size
 _SPARE = 2**26
-#: whether this process is there for the parsers alone, so that its memory and time may be bounded
+#: whether this process only runs parsers, so that its memory and time may be limited
 ALONE = False
 
 
@@ -103,7 +103,7 @@ def _plain_value(value: Any) -> Any:
 
 
 def sound(matrix: Any) -> Any:
-    """Return a sparse matrix whose pointers and indices were checked, anything else as it is."""
+    """Return a sparse matrix with checked pointers and indices, anything else unchanged."""
     # damaged ones make SciPy write outside of its arrays; its own check passes over empty matrices
     import numpy as np
 
@@ -174,14 +174,14 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
     """Return ("value", value) of a function of this module, or the name and the text of its error.
 
     A damaged file may make a parser crash, take all memory or never end: in a separate process,
-    with bounds, that is an error like any other. Where there is no Python to start (a frozen or
-    embedded program), the function is run here.
+    with bounds, this gives a normal error. Where no Python interpreter can be started (a frozen or
+    embedded program), the function runs in this process.
     """
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"no such file: {str(file)!r}")
     key = (os.getpid(), keep)
-    # taken out while it is used: another thread starts its own
+    # removed while it is used: another thread starts its own child
     child = _WAITING.pop(key, None)
     if child is not None and child.poll() is not None:
         _close(child)
@@ -197,7 +197,7 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
     except (OSError, EOFError, pickle.UnpicklingError):
         _close(child)
         return "crash", f"its parser ended with code {child.returncode}"
-    except BaseException:  # interrupted: the answer would be that of the next file
+    except BaseException:  # interrupted: the answer would arrive for the next file
         child.kill()
         _close(child)
         raise
@@ -210,7 +210,7 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
 
 
 def _start_child() -> subprocess.Popen[bytes] | None:
-    """Return a new child; None where there is no Python interpreter to start."""
+    """Return a new child process; None where no Python interpreter can be started."""
     if "python" not in Path(sys.executable or "").name.lower():
         return None
     # -P: the folder of the script, whose modules have names of the standard library, stays out

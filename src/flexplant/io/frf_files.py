@@ -28,11 +28,11 @@ _UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
 def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None = None) -> None:
     """Write frequency response functions as a CSV file.
 
-    A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
-    y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where known), then one line a
-    frequency, with all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and
-    `# overlap: 0.5` follow the first. The correlation between outputs and a window with parameters
-    stay behind: `.save` keeps them.
+    A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N], y1 <- u1 imag
+    [m/N], ...` (and `... coherence`, `... variance` where known), then one line a frequency, with
+    all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and `# overlap: 0.5`
+    follow the first. The correlation between outputs and a window with parameters are not written:
+    `.save` keeps them.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     Raises
     ------
     LabelError
-        When a name holds the arrow ' <- ', or units name no channel.
+        When a name contains the arrow ' <- ', or units name an unknown channel.
     OSError
         When the file cannot be written.
 
@@ -67,7 +67,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     given |= {} if units is None else mapping(units, "units", "Pass {channel: unit}.")
     for name in given:
         if name not in (*frf.inputs, *frf.outputs):
-            raise LabelError(f"units name {name!r}, which is no channel of {frf!r}.")
+            raise LabelError(f"units name {name!r}, which is not a channel of {frf!r}.")
     header, columns = [_FREQ], [frf.freq]
     own = _UNITS.get(frf.quantity or "", "")
     for i, output in enumerate(frf.outputs):
@@ -129,7 +129,9 @@ def read_frf_csv(path: str | Path) -> Frf:
         resolution = float(said["resolution"]) if "resolution" in said else None
         overlap = float(said.get("overlap", 0.0))
     except ValueError as error:
-        raise refused(path, "has a resolution or overlap that is no number", f"{error}.") from None
+        raise refused(
+            path, "has a resolution or overlap that is not a number", f"{error}."
+        ) from None
     first = len(comments) + 1
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     keys = _column_keys(rows[0] if rows else [], str(path))
@@ -208,20 +210,20 @@ def read_frf_npz(
     ----------
     path : str or Path
         A .npz file with frequencies [Hz] and responses; `inputs`, `outputs`, `quantity`,
-        `coherence` and `variance` are taken where they are there. What `Frf.save` wrote is read by
+        `coherence` and `variance` are read if present. What `Frf.save` wrote is read by
         `flexplant.load`.
     freq, data : str
         Names of the arrays (n_freq,) and (n_out, n_in, n_freq); (n_freq,) for a single pair.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the outputs are, where the file does not say.
+        Quantity of the outputs, where the file does not contain it.
     frequency_axis : int, optional
-        Which axis of the responses is frequency, such as 0 for (n_freq, n_out, n_in); when not
-        given, the only one of that length.
+        Axis of frequency of the responses, such as 0 for (n_freq, n_out, n_in); by default the only
+        axis with that length.
 
     Raises
     ------
     FlexplantError
-        When it is not an .npz file, or the arrays are not there.
+        When it is not an .npz file, or arrays are missing.
     ShapeError
         When sizes do not match, or which axis is frequency is not clear.
     ModelError
@@ -311,7 +313,8 @@ def _frf(
     instance(quantity, str | None, "quantity", "Pass 'displacement', say.")
     if quantity is not None and said and said != quantity:
         raise ModelError(
-            f"{str(path)!r} says it holds {said}, not {quantity}. Read it as it is, and convert: "
+            f"{str(path)!r} says it holds {said}, not {quantity}. Read it without quantity=, and "
+            "convert: "
             f".converted({quantity!r})."
         )
     kind = quantity or said or None
@@ -336,7 +339,7 @@ def _ordered(array: Any, n: int, axis: int | None, name: str, path: str | Path) 
     if array.ndim != 3 or chosen is None or not -3 <= chosen < 3 or array.shape[chosen] != n:
         wrong = f"axis {chosen} is not the {n} frequencies. Save (n_out, n_in, {n}), or ({n},)"
     elif axis is None and len(fits) > 1:
-        wrong = f"axes {fits} are as long as freq. Say which it is: frequency_axis=2"
+        wrong = f"axes {fits} are as long as freq. Choose one: frequency_axis=2"
     if wrong or chosen is None:
         raise ShapeError(f"{name!r} of {str(path)!r} has shape {array.shape}: {wrong}.")
     return np.moveaxis(array, chosen, 2)

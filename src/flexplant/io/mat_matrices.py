@@ -17,7 +17,7 @@ from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
 from .foreign_parsers import in_child
 from .triplets import assembled, chosen, extra_module
 
-#: largest number of bytes that a byte of a compressed file holds
+#: largest compression ratio of a compressed file
 _DEFLATED = 1100
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -37,10 +37,10 @@ def read_matlab(
     path : str or Path
         The .mat file; version 7.3 (HDF5) needs h5py: ``pip install 'flexplant[hdf5]'``.
     stiffness, mass, damping : str, optional
-        Names of the variables, fields of structures as "model.K0". Where not given, the usual names
-        are looked for: K, M and C or D. `damping=None`: none.
+        Names of the variables, fields of structures as "model.K0". By default the usual names are
+        searched: K, M and C or D. `damping=None`: no damping.
     dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for: the file does not say.
+        DOFs of the rows, which the file does not contain.
 
     Raises
     ------

@@ -42,9 +42,9 @@ def write_mat(
     path : str or Path
         The file, written atomically; no ending is added.
     value : StateSpace, control.StateSpace, plant, Frf, or mapping of them
-        What to write; several as {"plant": plant, "K": controller, "frf": frf}. A controller or an
-        observer is written as its `.system`, a weighted plant with its weights. Ports and
-        certificates stay behind: `.save` keeps them.
+        Value to write; several values as {"plant": plant, "K": controller, "frf": frf}. A
+        controller or an observer is written as its `.system`, a weighted plant with its weights.
+        Ports and certificates are not written: `.save` keeps them.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def read_mat(path: str | Path, name: str | None = None) -> StateSpace | Standard
     FlexplantError
         When it is not a MATLAB file (version 7.3 is HDF5: save with '-v7').
     ModelError, ShapeError, LabelError
-        When matrices are missing, do not make a system, or there is no such structure.
+        When matrices are missing, do not form a system, or the structure does not exist.
 
     Examples
     --------
@@ -116,8 +116,9 @@ def read_mat(path: str | Path, name: str | None = None) -> StateSpace | Standard
     if missing:
         structures = f" Structures are read by name, {sorted(named)[:8]}." if named else ""
         raise ModelError(
-            f"{str(path)!r} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A system "
-            f"object must be taken apart in MATLAB: [A, B, C, D, dt] = ssdata(P).{structures}"
+            f"{str(path)!r} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A "
+            "system object must be converted in MATLAB: [A, B, C, D, dt] = "
+            f"ssdata(P).{structures}"
         )
     with parsing(str(path)):
         return _system_of(content)

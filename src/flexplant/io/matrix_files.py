@@ -36,7 +36,7 @@ from .files import (
 from .foreign_parsers import sound
 from .triplets import one_matrix_each
 
-#: lines whose digits are counted
+#: number of lines whose digits are counted
 _SAMPLE = 4000
 #: lines of row, column and a number in the plain form of C, which SciPy's fast reader reads whole
 _PLAIN = re.compile(
@@ -54,15 +54,15 @@ def read_matrix_market(
 ) -> FEMatrices:
     """Return the matrices of Matrix Market files.
 
-    A triangle is completed, rows of held DOFs are dropped, printed digits are counted; `notes` say
-    so. Numbering in the file is from 1.
+    A triangle is completed, rows of held DOFs are dropped, printed digits are counted, and `notes`
+    state it. Numbering in the file is from 1.
 
     Parameters
     ----------
     stiffness, mass, damping : str or Path
         Files (.mtx, also .mtx.gz) of K, M and D.
     dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for: the files do not say.
+        DOFs of the rows, which the files do not contain.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FlexplantError(f"{str(path)!r} cannot be unpacked ({error}): cut short?") from None
     head = _header(content, path)
-    # without what follows the last number: SciPy's fast reader reads beyond a blank at the end
+    # without the text after the last number: SciPy's fast reader reads beyond a blank at the end
     body = content[head.start :].rstrip() + b"\n"
     if b"%" in body:
         body = b"\n".join(b"" if line[:1] == b"%" else line for line in body.split(b"\n"))
@@ -133,7 +133,7 @@ def _entry_table(body: bytes, head: _Header, path: Path) -> FloatArray:
 
 
 class _Header(NamedTuple):
-    """What the first lines say, and where the entries begin."""
+    """Content of the first lines, and start of the entries."""
 
     listed: bool  # coordinate form; else all entries column by column
     whole: bool  # integers
@@ -149,7 +149,7 @@ def _header(content: bytes, path: Path) -> _Header:
     words = content[:start].decode("latin-1").lower().split()
     if len(words) < 5 or words[0] != "%%matrixmarket":
         raise FlexplantError(
-            f"{str(path)!r} is no Matrix Market file: it begins with {content[:40]!r}. Abaqus "
+            f"{str(path)!r} is not a Matrix Market file: it begins with {content[:40]!r}. Abaqus "
             "writes .mtx files of another kind: read_abaqus."
         )
     form, kind, symmetry = words[2:5]
@@ -183,9 +183,9 @@ def _header(content: bytes, path: Path) -> _Header:
 
 
 def _plain_entries(body: bytes, head: _Header) -> Any | None:
-    """Return the matrix of the entries by SciPy's reader; None where it may not read what is there.
+    """Return the matrix of the entries by SciPy's reader; None where the reader does not apply.
 
-    It drops what it cannot parse (`7.5D+03` becomes 7.5): it gets plain lines only.
+    SciPy drops what it cannot parse (`7.5D+03` becomes 7.5), so that it gets plain lines only.
     """
     if head.whole or body.count(b"\n") < head.entries or not _PLAIN.fullmatch(body):
         return None
@@ -242,7 +242,7 @@ FORMATS.append(
 )
 
 
-#: characters of a line at most; lines of cards have 80
+#: largest number of characters of a line; lines of cards have 80
 _LINE = 4096
 _FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
 
@@ -299,7 +299,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         if min(*counts, n_rows, n_columns, n_entries) < 0:
             raise ValueError("a count below 0")
     except (IndexError, ValueError, UnicodeDecodeError) as error:
-        what = f"is no Harwell-Boeing file: its header cannot be read ({error})"
+        what = f"is not a Harwell-Boeing file: its header cannot be read ({error})"
         raise refused(path, what, "Write it again, or give its format another suffix.") from None
     check_count(max(n_rows, n_columns), sum(map(len, lines)), path)
     if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
@@ -352,7 +352,7 @@ def _number_block(
     text = b"".join(line[:full].ljust(full) for line in lines)
     numbers = fixed_numbers(text[: size * width], width) if len(text) >= size * width else None
     if numbers is None:
-        # not in the fields that the header names, as some programs write; blanks still separate
+        # some programs do not keep to the fields of the header; blanks still separate numbers
         numbers = spaced_numbers(b" ".join(lines), size)
     if numbers is None:
         where = ""

@@ -1,4 +1,4 @@
-"""Matrices and models of the files of all finite-element programs."""
+"""Matrices and models from the files of all known finite-element programs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_matrices(
     scalar_direction: str | None = None,
     rotations: Mapping[int, Any] | None = None,
 ) -> FEMatrices:
-    """Return the matrices of a file, whichever program wrote it, for `check`.
+    """Return the matrices of a file in any known format, for example for `check`.
 
     By suffix and content: Matrix Market or Abaqus .mtx; Harwell-Boeing .rsa, .rua; MATLAB .mat;
     NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch.
@@ -54,7 +54,7 @@ def read_matrices(
     Parameters
     ----------
     path : str or Path
-        The file; where each matrix has its own, that of K.
+        The file; the file of K where each matrix has a separate file.
     stiffness, mass, damping, dofs, nodes, scalar_direction, rotations : optional
         As for `read_model`.
 
@@ -126,34 +126,34 @@ def read_model(
     scalar_direction: str | None = None,
     rotations: Mapping[int, Any] | None = None,
 ) -> FEModel:
-    """Return the model of a file, whichever program wrote it.
+    """Return the model of a file in any known format.
 
-    As `read_matrices(...).converted(*units).model(massless=...)`: what is wrong with a file is
-    refused with a reason, and `check(read_matrices(...))` reports all of it.
+    As `read_matrices(...).converted(*units).model(massless=...)`: an error gives the first reason
+    why a model is refused, and `check(read_matrices(...))` reports all problems.
 
     Parameters
     ----------
     path : str or Path
-        The file; where each matrix has its own, that of K.
+        The file; the file of K where each matrix has a separate file.
     stiffness : str, optional
         Name of the variable, in files that hold several (.mat, .op4, .pch).
     mass, damping : str or Path, optional
-        Their files, or names of variables, likewise; where several matrices are in one file those
-        of the usual names are taken when not given. `damping=None`: none.
+        Files of M and D, or names of variables; in a file of several matrices those with usual
+        names by default. `damping=None`: no damping.
     dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for, where the file does not say. Its coordinates are in the unit of
-        length of the file, too.
+        DOFs of the rows, where the file does not contain them. Their coordinates use the unit of
+        length of the file too.
     nodes : str or Path, optional
         Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
         .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
     units : (length, mass, time)
         Units of the file: ("mm", "t", "s") for instance; the model is in SI.
     massless : "refuse" or "condense"
-        What to do with DOFs and motions without mass; condensing them is exact.
+        Treatment of DOFs and motions without mass; condensing them is exact.
     free : bool
-        Free the rigid-body motions that only lost digits of a text hold.
+        Whether to free the rigid-body motions that are held only by lost digits of a text.
     name : str, optional
-        For display; the name of the file when not given.
+        Name for display; by default that of the file.
     scalar_direction, rotations : optional
         Options of one format: the direction in which scalar points move (`read_dmig`), and local
         coordinate systems (`read_ansys`).
@@ -165,13 +165,13 @@ def read_model(
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
-        When the reader of this format has no such option, and what it raises itself; when the
-        matrices make no model.
+        When the reader of this format does not have an option, for its errors, and when the
+        matrices do not form a model.
 
     Warns
     -----
     FlexplantWarning
-        When the digits of a text file endanger the soft modes.
+        When the digits of a text file are too few for the soft modes.
 
     Examples
     --------
@@ -205,7 +205,7 @@ def read_model(
 
 
 def _check_options(options: Iterable[str], form: Format, name: str) -> None:
-    """Raise ModelError for an option that the reader does not take, naming those it does."""
+    """Raise ModelError for an unknown option of the reader, with the known ones."""
     wrong = sorted(set(options) - set(form.options))
     if wrong:
         why = "its files hold one matrix of a kind, without names; " * (

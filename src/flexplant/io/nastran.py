@@ -1,4 +1,4 @@
-"""Nastran: where nodes are and in which directions they move; modes of OUTPUT2 files."""
+"""Nastran: positions and directions of nodes; modes of OUTPUT2 files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _INCLUDE = re.compile(r"\s*INCLUDE\s+(?:'([^']*)'|\"([^\"]*)\"|([^\s$]+))", re.I
 _END = re.compile(r"\s*ENDDATA\b", re.IGNORECASE)
 #: files within files, at most
 _DEEP = 20
-#: what to do with two cards of one number
+#: advice for two cards with the same number
 _DEFINED_ONCE = "Remove the card that is not of this run."
 
 
@@ -118,8 +118,9 @@ def _bulk_lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int
         if file is None or len(above) == _DEEP:
             why = "includes itself" if file else "is not there"
             raise FlexplantError(
-                f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}: its nodes would "
-                "be missing. Put it beside, or give the file that holds the GRID cards."
+                f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}: its nodes "
+                "would be missing. Put it in the same folder, or give the file with the GRID "
+                "cards."
             )
         found += _bulk_lines(file, (*above, path))
         if found and _END.match(found[-1][2]):
@@ -185,10 +186,10 @@ class _Systems:
         if name not in self.given:
             raise LabelError(
                 f"{self.path!r} has no coordinate system {name} as CORD2R, CORD2C or CORD2S: nodes "
-                "refer to it. Add its card (CORD1R and the like: written out as CORD2R)."
+                "refer to it. Add its card (convert CORD1R and the like to CORD2R)."
             )
         if name in above:
-            raise ModelError(f"{self.path!r}: coordinate system {name} is defined by itself.")
+            raise ModelError(f"{self.path!r}: coordinate system {name} refers to itself.")
         kind, fields = self.given[name]
         try:
             numbers = [nastran_float(item) for item in fields[2:11]]
@@ -213,7 +214,7 @@ _LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
 def named_matrices(
     found: Mapping[str, Any], given: Mapping[str, str | None], endings: Sequence[str], path: str
 ) -> list[str | None]:
-    """Return the names of stiffness, mass and damping; of the latter two None where not there."""
+    """Return the names of stiffness, mass and damping; None for missing mass or damping."""
     names: list[str | None] = []
     for what, said in given.items():
         if what == "damping" and said is None:
@@ -228,13 +229,13 @@ def named_matrices(
             there = [one for one in found if one in there or re.sub(r"_\d+$", "", one) in there]
         if len(there) > 1:
             raise ModelError(
-                f"{path!r} holds {there}, any of which may be the {what}. Say which: "
+                f"{path!r} holds {there}, any of which may be the {what}. Name one: "
                 f"{what}={there[0]!r}."
             )
         if not there and what == "stiffness":
             raise ModelError(
-                f"{path!r} holds {sorted(found)}, none of which has a usual name of a stiffness "
-                f"matrix ({', '.join(usual)}). Say which it is: stiffness='...'."
+                f"{path!r} holds {sorted(found)}, but no usual name of a stiffness matrix "
+                f"({', '.join(usual)}). Name it: stiffness='...'."
             )
         names.append(there[0] if there else None)
     return names
@@ -258,7 +259,7 @@ def shapes_at(
     notes: tuple[str, ...] = ()
     if not grid.all():
         scalar = counted(int(np.count_nonzero(~grid)), "scalar point")
-        notes = (f"without a place, left out: {scalar}",)
+        notes = (f"without a position, left out: {scalar}",)
     ids, values = ids[grid], values[grid]
     xyz, axes = _node_places(ids, nodes, path)
     local = np.intersect1d(ids, list(axes)) if not turned else ids[:0]
@@ -349,7 +350,8 @@ def _word_layout(content: bytes, path: str) -> tuple[str, int]:
         if size in (4, 8):
             return order, size
     raise FlexplantError(
-        f"{path!r} is no OUTPUT2 file: it begins with {content[:8].hex(' ')}, not with a record of "
+        f"{path!r} is not an OUTPUT2 file: it begins with {content[:8].hex(' ')}, not with a "
+        "record of "
         "one word. Was it changed in transfer? Copy it in binary mode."
     )
 

@@ -75,7 +75,7 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
         name = _header_name(content[start + 4 * size : stop].decode("latin-1"))
         if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
             got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
-            raise damaged(path, f"byte {start}: no header of a matrix: {got}")
+            raise damaged(path, f"byte {start}: not a header of a matrix: {got}")
         check_count(max(columns, abs(rows)), words.size, path)
         at = stop + marker
         places: list[tuple[int, int]] = []
@@ -139,7 +139,7 @@ def _matrix(
             words.path, f"byte {place[bad]}", name, int(row[bad] - 1 + length[bad]), shape
         )
     target: Any = np.complex128 if kind > 2 else np.float64
-    if dense:  # each string where it is in the file, without a copy
+    if dense:  # each string at its place in the file, without a copy
         each = zip(length.tolist(), place.tolist(), strict=True)
         numbers = [np.frombuffer(words.content, value, n, at) for n, at in each]
     else:
@@ -175,7 +175,7 @@ def _placed(
 
 
 def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
-    """Return where each string's values begin, how many there are, their row and their column."""
+    """Return start, number, row and column of the values of each string."""
     # the strings of a column are a chain; those of all columns are followed at once
     size, integer = words.integer, np.dtype(f"{words.order}i{words.integer}")
     head = 2 * size if big else size
@@ -313,7 +313,7 @@ class _Reader:
         while True:
             column, row, count = self.integers(self.line(), key)
             if column > columns:
-                # one number without a meaning, whatever its count says
+                # one number without a meaning, for any count
                 if len(self.line()) < self.width:
                     raise self.wrong("the last number is cut off")
                 break
@@ -372,7 +372,8 @@ class _Reader:
         numbers: Any = fixed_numbers(b"".join(self.chunks), self.width)
         if numbers is None:
             raise FlexplantError(
-                f"{self.path!r}, before line {self.at + 1}: matrix {name} holds what is no number. "
+                f"{self.path!r}, before line {self.at + 1}: matrix {name} contains an entry that "
+                "is not a number. "
                 "The file is damaged, or a number too large for its field (***): write it in "
                 "binary form."
             )
@@ -386,7 +387,7 @@ class _Reader:
         return _placed((column, row, count), parts, shape, numbers.dtype, sparse=sparse)
 
 
-#: entries that are kept dense however few of them the file holds
+#: number of entries up to which a matrix is always stored as dense
 _SMALL = 2**20
 #: largest ratio of the entries of a dense matrix to the numbers in the file
 _TIMES = 16
@@ -430,7 +431,7 @@ def read_op4(
     FlexplantError
         When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
     ModelError
-        When which matrix is meant is not clear, or M or D is complex.
+        When the choice of a matrix is not clear, or M or D is complex.
 
     Notes
     -----
@@ -472,7 +473,7 @@ def read_op4_matrices(
     path : str or Path
         An .op4 file, binary (32 or 64 bit integers, either byte order) or text.
     names : sequence of str, optional
-        Those to return; all when not given.
+        Names of the returned matrices; all by default.
 
     Returns
     -------
@@ -502,7 +503,7 @@ def read_op4_matrices(
 
 
 def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
-    """Return whether a matrix is the null of 1 x 1 that stands for none."""
+    """Return whether a matrix is the 1 x 1 zero that stands for a missing one."""
     return matrix is None or (n > 1 and matrix.shape == (1, 1) and not matrix.count_nonzero())
 
 

@@ -1,4 +1,4 @@
-"""What Nastran punches: matrices as DMIG cards, with nodes and components; eigenvectors."""
+"""Nastran punch files: matrices as DMIG cards, with nodes and components; eigenvectors."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def read_dmig(
         move in local directions (field CD) are turned into the basic system.
     stiffness, mass, damping : str, optional
         Names of the matrices; when not given, the one of the usual names (KAAX, KAA, KGG, K2GG;
-        MAAX, ...; BAAX, ...) that is there. `damping=None`: none. Structural damping (K4AAX) is no
-        viscous damping and is not read.
+        MAAX, ...; BAAX, ...) that is there. `damping=None`: none. Structural damping (K4AAX) is not
+        viscous and is not read.
     scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
-        What scalar points (component 0) move in; without it they are refused.
+        Direction of scalar points (component 0); without it they are refused.
 
     Returns
     -------
@@ -73,9 +73,9 @@ def read_dmig(
     FlexplantError
         When a card cannot be read; the line is named.
     LabelError
-        When there is no matrix of such a name, or a node has no coordinates in `bdf`.
+        When a named matrix does not exist, or a node has no coordinates in `bdf`.
     ModelError
-        When a matrix is complex, not square, gives an entry twice, or scalar points are there.
+        When a matrix is complex, not square, gives an entry twice, or the file has scalar points.
 
     Notes
     -----
@@ -132,7 +132,7 @@ def read_dmig(
         notes=notes,
     )
     local = {} if nodes is None else {n: axes.T for n, axes in nodes.axes.items() if n in ids}
-    # axes that are those of the file, to the rounding of a rotation matrix
+    # axes equal to those of the file within the rounding of a rotation matrix
     turned = {n: C for n, C in local.items() if np.abs(C - np.eye(3)).max() > 1e-14}
     if not turned:
         return found
@@ -337,9 +337,9 @@ def _matrix_dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path:
     ids, components = order >> 4, order & 15
     if np.any(components == 0) and scalar is None:
         raise ModelError(
-            f"{path!r} has scalar points {ids[components == 0][:6].tolist()}: they have no place "
-            "and no direction. Say what they move in, scalar_direction='z' (generalised "
-            "coordinates of a reduced model are no DOFs at a node: punch the g-set instead)."
+            f"{path!r} has scalar points {ids[components == 0][:6].tolist()}: they have no "
+            "position and no direction. Give their direction, scalar_direction='z' (generalised "
+            "coordinates of a reduced model do not belong to a node: punch the g-set instead)."
         )
     if scalar is not None:
         require_known("direction", [scalar], DIRECTIONS)

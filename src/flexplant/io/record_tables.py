@@ -21,9 +21,11 @@ _RATE = re.compile(
     r"(?:sampl\w*[\s_-]*(?:rate|freq\w*)|\bfs\b)[^0-9\n]*?([0-9][0-9.,eE+]*)\s*(k?)(?:hz)?",
     re.IGNORECASE,
 )
-#: part of a step by which times may be off a grid beyond the rounding of their printed digits
+#: fraction of a step by which times may deviate from a grid, in addition to the rounding of printed
+#: digits
 _OFF = 1e-3
-#: steps this many times the usual one have lost samples: rounding to two digits makes 1.5 of it
+#: ratio of a step to the usual one above which samples are missing: rounding to two digits gives
+#: 1.5
 _GAP = 1.75
 
 
@@ -57,7 +59,7 @@ def read_table_records(path: Path) -> RecordedChannels:
 
 
 def _first_numbers(lines: list[str], path: Path) -> tuple[int, str]:
-    """Return the first of two lines of as many numbers, and what separates these."""
+    """Return the first of two lines with equal numbers of values, and their separator."""
     for mark in (";", "\t", ",", ""):
         widths = [_numbers_in(line, mark) for line in lines[:_HEAD]]
         for place, width in enumerate(widths[:-1]):
@@ -70,7 +72,7 @@ def _first_numbers(lines: list[str], path: Path) -> tuple[int, str]:
     )
 
 
-#: lines in which the numbers begin
+#: number of lines within which the numbers must begin
 _HEAD = 500
 
 
@@ -154,7 +156,7 @@ def read_lvm(path: Path) -> RecordedChannels:
     lines = text_of(path).splitlines()
     ends = [place for place, line in enumerate(lines) if line.strip().startswith(_END)]
     if not lines or not lines[0].startswith("LabVIEW Measurement") or len(ends) < 2:
-        what = "is no LabVIEW measurement file with the headers of the file and of its channels"
+        what = "is not a LabVIEW measurement file with the headers of the file and of its channels"
         raise refused(path, what, "Write it with headers, or export a table.")
     comma = any(line.startswith("Separator") and "Comma" in line for line in lines[: ends[0]])
     mark = "," if comma else "\t"
@@ -199,12 +201,12 @@ def _segments(
             raise unread(path, what, "Write the samples over time.")
         rows = lines[end + 2 : after] if 0 < samples <= len(lines) else []
         if len(rows) < samples or not rows:
-            raise damaged(path, f"line {end + 2}: {samples} samples are announced, fewer follow")
+            raise damaged(path, f"line {end + 2}: {samples} samples are expected, fewer follow")
         picked = slice(1, None, 2 if columns == "Multi" else 1)
         names = [name.strip() for name in lines[end + 1].split(mark)[picked][:count]]
         labels = [*said.get("Y_Unit_Label", []), *[""] * len(names)][: len(names)]
         if len(names) != count or not count:
-            raise damaged(path, f"line {end + 2}: {count} names of channels are due")
+            raise damaged(path, f"line {end + 2}: {count} names of channels are expected")
         data = np.empty((count, samples))
         for k, row in enumerate(rows[:samples]):
             cells = row.split(mark)[picked][:count]

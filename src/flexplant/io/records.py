@@ -1,4 +1,4 @@
-"""Time records of measuring systems: what was sampled, how fast, in which units."""
+"""Time records of measuring systems, with names, sampling rate and units."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .record_tables import read_lvm, read_table_records
 from .uff_times import UNIVERSAL, read_uff_records
 from .unit_labels import unit_of
 
-#: by suffix, what reads the channels of a file
+#: function by suffix that reads the channels of a file
 RECORD_READERS: dict[str, Callable[[Path], RecordedChannels]] = {
     **dict.fromkeys(UNIVERSAL, read_uff_records),
     ".lvm": read_lvm,
@@ -41,9 +41,10 @@ def read_records(path: str | Path, *, rate: float | None = None) -> Response:
     -------
     Response
         ``found["acc"]`` is the record of a channel, (n_time,), or (n_runs, n_time) where each
-        channel was recorded several times; `found.rate` [Hz]; `found.units`. A unit that is known
-        is converted (g to m/s^2); of others the numbers remain, and `units` lacks the channel.
-        Channels of universal files are named by node and direction, "41:z", forces "u 41:z".
+        channel was recorded several times; `found.rate` [Hz]; `found.units`. Known units are
+        converted (g to m/s^2). Numbers in unknown units are unchanged, and the channel is missing
+        in `units`. Channels of universal files are named by node and direction, "41:z", forces "u
+        41:z".
 
     Raises
     ------
@@ -56,7 +57,7 @@ def read_records(path: str | Path, *, rate: float | None = None) -> Response:
 
     See Also
     --------
-    flexplant.estimate_frf, flexplant.identification.impact_frf : what is made of records.
+    flexplant.estimate_frf, flexplant.identification.impact_frf : frequency responses from records.
     flexplant.io.read_spectra : power spectral densities of universal files.
 
     Examples
@@ -75,13 +76,13 @@ def read_records(path: str | Path, *, rate: float | None = None) -> Response:
     if read is None:
         known = ", ".join(RECORD_READERS)
         raise FlexplantError(
-            f"{path.name!r} is of no format of time records that is read here; known are {known}. "
+            f"{path.name!r} is not in a known format of time records; known are {known}. "
             "Export it as one of these, or pass arrays with their rate to estimate_frf."
         )
     found = read(path)
     if (rate is None) == (found.rate is None):
         if rate is None:
-            what, do = "holds neither times nor a sampling rate", "Say it: rate=... [Hz]."
+            what, do = "holds neither times nor a sampling rate", "Give rate=... [Hz]."
         else:
             what, do = f"holds its sampling rate, {found.rate:.6g} Hz", "Leave rate= out."
         raise unread(path, what, do)

@@ -17,7 +17,7 @@ from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure.unit_systems import units
 from .files import decimal, file_path, refused, text_of
 
-#: what other programs call the six directions
+#: names of the six directions in other programs
 _DIRECTION = {
     name: direction
     for direction, names in {
@@ -48,12 +48,12 @@ def read_dofs(
     directions: Sequence[str] | None = None,
     length: str | float = "m",
 ) -> DofSet:
-    """Return the DofSet of a text table: what the rows of the matrices stand for.
+    """Return the DofSet of a text table: the DOFs of the rows of the matrices.
 
     Three forms: one line a DOF with columns `node, direction, x, y, z`; one line a DOF with `node,
     direction`, and the coordinates in a second table of `nodes`; or a table of nodes (`node, x, y,
-    z`) all of which have the same `directions`. A column `row` (from 1) gives the order, else that
-    of the lines holds.
+    z`) all of which have the same `directions`. A column `row` (from 1) gives the order; otherwise
+    the order of the lines is used.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def read_dofs(
     Raises
     ------
     FlexplantError
-        When a line has another number of columns, or holds no number where one is needed.
+        When a line has another number of columns, or a number is missing.
     LabelError
         When a column is missing, a direction is unknown, or a node has no coordinates.
 
@@ -214,7 +214,8 @@ def _direction(name: str, path: str | Path) -> str:
     direction = _DIRECTION.get(str(name).strip().lower())
     if direction is None:
         raise LabelError(
-            f"{str(path)!r}: {name!r} is no direction of motion. Use {', '.join(DIRECTIONS)}, UX "
+            f"{str(path)!r}: {name!r} is not a direction of motion. Use {', '.join(DIRECTIONS)}, "
+            "UX "
             "to ROTZ, T1 to R3 or 1 to 6, and leave temperature, pressure and the like out."
         )
     return direction

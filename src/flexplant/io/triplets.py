@@ -1,4 +1,4 @@
-"""From the matrices of a file to FEMatrices: triangles completed, held rows dropped, digits."""
+"""FEMatrices from the matrices of a file: complete triangles, drop held rows, count digits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .files import USUAL, damaged, file_path, parsing
 from .foreign_parsers import sound
 from .tables import read_dofs
 
-#: the names under which K, M and D are looked for, in any case
+#: names of K, M and D that are searched, in upper or lower case
 USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "K": ("k", "k0", "kaa", "kgg", "kaax", "kmat", "stiffness", "stiff", "kff", "kred"),
     "M": ("m", "m0", "maa", "mgg", "maax", "mmat", "mass", "mff", "mred"),
@@ -84,16 +84,17 @@ def from_triplets(
     twice = np.count_nonzero(np.unique(i * n + j, return_counts=True)[1] > 1)
     if twice:
         raise damaged(path, f"entries stored twice: {twice} (several steps?)")
-    # unsorted labels put entries of a half on both sides: no entry then has its mirror image
+    # with unsorted labels the entries of one half may lie on both sides, but none has its mirror
+    # image
     return completed(sp.coo_array((values, (i, j)), shape=(n, n)), "a matrix")[0]
 
 
 def chosen(
     variables: Mapping[str, Any], wanted: Mapping[str, str | None], source: str
 ) -> dict[str, Any]:
-    """Return which variables of a file are K, M and D, where there; those named must be."""
-    # "usual" stands for one that has a usual name, as does None, but for D: None leaves it out
-    # the shortest path first: K before model.K
+    """Return the variables of a file that are K, M and D; named ones must exist."""
+    # "usual" stands for a variable with a usual name, and so does None, except that None leaves D
+    # out. The shortest path comes first: K before model.K
     there = sorted(variables, key=lambda text: (text.count("."), text))
     found: dict[str, Any] = {}
     for part, name in wanted.items():
@@ -113,14 +114,14 @@ def chosen(
         if own != name and len(alike) > 1:
             kind = {"K": "stiffness", "M": "mass", "D": "damping"}[part]
             raise ModelError(
-                f"{source!r} holds {alike}, any of which may be the {kind}. Say which: "
+                f"{source!r} holds {alike}, any of which may be the {kind}. Name one: "
                 f"{kind}={own!r}."
             )
         if own is not None:
             found[part] = variables[own]
     if "K" not in found:
         raise ModelError(
-            f"{source!r} holds {list(variables)[:10]}, none of which looks like a stiffness "
+            f"{source!r} holds {list(variables)[:10]}, but nothing that looks like a stiffness "
             "matrix. Say which it is: stiffness='...', mass='...'."
         )
     return found

@@ -43,7 +43,7 @@ class AnalysisData(NamedTuple):
     eigenvalue: complex
     nodes: IntArray
     motions: FloatArray | ComplexArray
-    #: zero where nothing was measured, as test software writes them
+    #: zero where nothing was measured, as test software does
     measured: bool = False
 
     @property

@@ -30,7 +30,7 @@ def _opened(path: str | Path) -> Any:
         start = file.read(200)
     pyuff = extra_module("pyuff", "uff", "reading universal files")
     if start.split()[:1] != [b"-1"]:
-        what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
+        what = f"is not a universal file: it begins with {start[:20]!r}, not with -1"
         raise refused(path, what, "Export it as one, .uff or .unv.")
     _begins(file_path(path))
     with (
@@ -123,7 +123,7 @@ def whole_entry(part: dict[str, Any], name: str) -> int:
         return int(part.get(name) or 0)
     except (TypeError, ValueError):
         raise FlexplantError(
-            f"dataset {part.get('type')}: {name} is {short(part.get(name))}, no whole number. The "
+            f"dataset {part.get('type')}: {name} is {short(part.get(name))}, not an integer. The "
             "file is damaged: export it again."
         ) from None
 
@@ -183,7 +183,7 @@ def check_complete(
     there = set(pairs)
     missing = [f"{a} <- {b}" for a in outputs for b in inputs if (a, b) not in there]
     if missing:
-        few = f"lacks {len(missing)} of {len(outputs) * len(inputs)} {what}: "
+        few = f"does not contain {len(missing)} of {len(outputs) * len(inputs)} {what}: "
         do = f"Export every output for every input{remedy}."
         raise refused(path, few + ", ".join(missing[:8]), do)
 
@@ -254,8 +254,7 @@ def record_scale(
     if length is None or force is None:
         raise ModelError(
             f"{path!r}: the units of a response are {above or '?'!r} per {below or '?'!r}, which "
-            "are not known here. Say what brings the numbers to SI: scale=9.80665 where they are "
-            "g/N, scale=1 where they are SI."
+            "are unknown. Give the factor to SI: scale=9.80665 for g/N, scale=1 for SI."
         )
     if factors is None:
         return length / force
@@ -266,8 +265,8 @@ def record_scale(
     if abs(named_length / to_length - 1) > 1e-3 or abs(named_force / to_force - 1) > 1e-3:
         raise ModelError(
             f"{path!r}: the axes say {above!r} per {below!r}, dataset 164 (units) factors "
-            f"{factors['length']:g} and {factors['force']:g} for length and force: they contradict "
-            "each other. Say what brings the numbers to SI: scale=..."
+            f"{factors['length']:g} and {factors['force']:g} for length and force: they "
+            "contradict each other. Give the factor to SI: scale=..."
         )
     return to_length / to_force
 

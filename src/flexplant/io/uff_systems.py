@@ -1,4 +1,4 @@
-"""Nodes of universal files: where they are, and in which local directions they move."""
+"""Nodes of universal files: positions and local directions of motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class UffNodes:
     given_in: IntArray
     moves_in: IntArray
     places: FloatArray
-    systems: dict[int, System | str]  # a text says why a system is not read
+    systems: dict[int, System | str]  # a text gives the reason why a system is not read
 
     def xyz(self) -> FloatArray:
         """Return the places (n, 3) of the nodes in the global system, in units of the file."""
@@ -91,7 +91,7 @@ def _is_global(system: System) -> bool:
 
 
 def uff_nodes(path: str | Path) -> UffNodes:
-    """Return the nodes of a universal file, of which there may be none."""
+    """Return the nodes of a universal file, which may have no nodes."""
     sets = datasets(path, (15, 2411, 18, 2420))
     systems = _systems(sets, str(path))
     if 0 in systems and not (isinstance(systems[0], System) and _is_global(systems[0])):
@@ -172,7 +172,7 @@ def _of_18(part: dict[str, Any], path: str) -> dict[int, System | str]:
             return found.get(number, BASIC if number in (0, 1) else f"refers to system {number}")
         row = given[number]
         if number in above:
-            return "is defined by itself"
+            return "refers to itself"
         # a system that is its own reference is given in the global one
         base = BASIC if bases[row] == number else system(bases[row], (*above, number))
         if isinstance(base, str):
@@ -195,8 +195,8 @@ def turning(
 ) -> tuple[list[str], FloatArray]:
     """Return labels in global directions, and the matrix (n, n) that turns motions into them.
 
-    Forces turn as motions do. Of a node that moves in local directions all must be there that a
-    global one is made of.
+    Forces rotate like motions. A node with local directions must have all local directions that a
+    global one combines.
     """
     names, matrix = list(labels), np.eye(len(labels))
     groups: dict[tuple[int, int], list[int]] = {}

@@ -30,7 +30,7 @@ def read_uff_records(path: Path) -> RecordedChannels:
         by_name.setdefault(name, []).append((sign, part))
     counts = {name: len(found) for name, found in by_name.items()}
     if len(set(counts.values())) > 1:
-        what = f"holds {counts} records of its channels, which are no runs"
+        what = f"holds {counts} records of its channels, which do not form runs"
         raise refused(path, what[:200], "Export each channel once, or in every run.")
     step, start, size = _even(parts, path)
     names = sorted(by_name, key=channel_order)
@@ -63,7 +63,7 @@ def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, S
     path : str or Path
         A .uff, .unv or .uf file. Needs pyuff: pip install 'flexplant[uff]'.
     scale : float, optional
-        Factor that brings the numbers to SI, where the file's units are not clear.
+        Factor to SI, where the units of the file are not clear.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, S
         label = unit_text(part, "ordinate_axis_units_lab")
         factor = density_of(label) if scale is None else scale
         if factor is None:
-            what = f"holds the density of {name} in {label or 'no unit'}, which is not known here"
+            what = f"holds the density of {name} in {label or 'no unit'}, which is unknown"
             raise unread(path, what, "Say what brings the numbers to SI: scale=...")
         freq = np.asarray(part["x"], dtype=np.float64)
         found[name] = Spectrum(freq, factor * np.real(np.asarray(part["data"], dtype=complex)))

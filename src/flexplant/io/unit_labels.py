@@ -1,4 +1,4 @@
-"""Labels of units as measuring systems write them, and what one of each is in SI."""
+"""Labels of units from measuring systems, and their size in SI."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 
 from ..structure.unit_systems import GRAVITY, LENGTHS, POUND
 
-#: prefixes of SI: with capitals, since mN is a millinewton and MN a meganewton
+#: prefixes of SI are case-sensitive: mN is a millinewton and MN a meganewton
 PREFIXES = {"": 1.0, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
 
 
@@ -66,7 +66,7 @@ def seconds_of(text: str) -> float | None:
 
 
 def density_of(text: str) -> float | None:
-    """Return what brings a power spectral density to SI: (m/s^2)^2/Hz, g^2/Hz."""
+    """Return the factor of a power spectral density to SI: (m/s^2)^2/Hz, g^2/Hz."""
     label = plain_label(text)
     match = re.fullmatch(r"(.*?)(?:\^|\*\*)?2?/Hz", label)
     squared = re.fullmatch(r"\(?(.*?)\)?(?:\^|\*\*)2/Hz", label)

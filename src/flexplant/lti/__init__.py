@@ -1,15 +1,14 @@
-"""Linear time-invariant systems: the control side's one type and its methods.
+"""Linear time-invariant systems: one type for all of control, and its methods.
 
-A `StateSpace` has named inputs and outputs and keeps the block structure of modes, which makes
-its frequency responses, norms and sampling exact and fast. Everything a controller, a plant or a
-weight is made of is one.
+A `StateSpace` has named inputs and outputs and keeps the block structure of modes, which makes its
+frequency responses, norms and sampling exact and fast. Controllers, plants and weights consist of
+such systems.
 
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
 - `frequency_response`: an `Frf`, of systems, of structures between their ports, measured or not.
 - `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
-- `step`, `impulse`, `lsim`, `step_info`: what a system answers over time, in numbers;
-  `fx.plot.step` draws it.
-- `h2_norm`, `hinf_norm`, `peak_gain`: norms, the last two with the frequency, found with proof.
+- `step`, `impulse`, `lsim`, `step_info`: time responses in numbers; `fx.plot.step` draws them.
+- `h2_norm`, `hinf_norm`, `peak_gain`: norms, with a proof for the last two.
 - `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,
   `modal_form`: fewer or clearer states.
 
@@ -26,8 +25,8 @@ weight is made of is one.
 >>> print(fx.lti.feedback(g, 0.5 * fx.lti.low_pass_filter(2.0)))
 <StateSpace: 3 states, continuous, in -> out>
 
-**From MATLAB and python-control.** Their systems are taken wherever a system is; `to_control()`
-goes back. Their names (``fx.c2d``) raise an error that says ours.
+**From MATLAB and python-control.** Their systems are accepted wherever a system is expected;
+`to_control()` converts back. Their names (``fx.c2d``) raise an error with the name used here.
 
 | there | here |
 |---|---|

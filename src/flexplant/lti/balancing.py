@@ -1,4 +1,4 @@
-"""Balanced reduction: fewer states, with the error bounded beforehand and measured afterwards."""
+"""Balanced reduction: fewer states, with an error bound and the actual error."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .modal_map import obstacle
 from .norms import axis_peak, h2_norm, peak_gain
 from .statespace import StateSpace, System, as_statespace
 
-#: Hankel singular values below this of the largest are rounding
+#: Hankel singular values below this fraction of the largest one count as zero
 RANK = 1e-14
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BalancedReduction(Value):
-    """A reduced system and what the reduction costs.
+    """A reduced system and its error.
 
     Parameters
     ----------
     system : StateSpace
-        The reduced system: balanced states, then the rigid-body and unstable ones as they were.
+        The reduced system: balanced states, then the unchanged rigid-body and unstable ones.
     hankel : (n_stable,) array [output unit / input unit]
         Hankel singular values of the stable part (of the weighted one), the largest first.
     bound : float [output unit / input unit]
@@ -37,9 +37,9 @@ class BalancedReduction(Value):
     error : float [output unit / input unit]
         H-infinity norm of the error that was made, computed from the error system (weighted).
     error_freq : float [Hz]
-        Where the error is largest.
+        Frequency of the largest error.
     n_kept : int
-        Rigid-body and unstable states, which are kept exactly.
+        Number of rigid-body and unstable states, which are kept exactly.
 
     Examples
     --------
@@ -88,20 +88,22 @@ def balanced(
     sys : StateSpace or control.StateSpace
         Continuous or sampled.
     order : int, optional
-        States of the result, those kept exactly included. Give this or `tol`.
+        Number of states of the result, including those kept exactly. Give this or `tol`.
     tol : float, optional
-        The smallest order whose bound is at most this times the largest Hankel singular value.
+        Relative error: the result has the smallest order whose bound is at most this times the
+        largest Hankel singular value.
     match_dc : bool
-        Residualise: the gain at 0 Hz is kept instead of that at infinite frequency. The discarded
-        states are taken at rest (singular perturbation) rather than left out; same bound.
+        Whether to residualise: the gain at 0 Hz is kept instead of that at infinite frequency. The
+        discarded states are set to equilibrium (singular perturbation) instead of zero; the bound
+        is the same.
     input_weight, output_weight : StateSpace, optional
-        Stable filters before the inputs and behind the outputs, matched in order.
+        Stable filters before the inputs and after the outputs, matched in order.
 
     Raises
     ------
     ModelError
-        When not exactly one of order and tol is given, order is outside what is possible, or a
-        weight does not fit or is not stable.
+        When not exactly one of order and tol is given, order is out of range, or a weight does not
+        match or is not stable.
     SolverError
         When a two-sided weight leaves the reduced system unstable.
 
@@ -202,8 +204,8 @@ def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace:
 def hankel_values(sys: System) -> FloatArray:
     """Return the Hankel singular values, the largest first.
 
-    The square roots of the eigenvalues of P Q, from factors of the two Gramians, which are never
-    formed: values far below the largest keep their digits.
+    They are the square roots of the eigenvalues of P Q, computed from factors of the two Gramians,
+    so that values far below the largest stay accurate.
 
     Parameters
     ----------
@@ -270,7 +272,7 @@ def hankel_norm(sys: System) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NormReport(Value):
-    """All norms of a system, where its peak lies, and why a norm is infinite.
+    """All norms of a system, the frequency of its peak, and reasons for infinite norms.
 
     Parameters
     ----------

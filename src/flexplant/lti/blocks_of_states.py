@@ -1,4 +1,4 @@
-"""Matrices and names of systems that are joined, and the blocks on the diagonal of their A.
+"""Matrices and names of connected systems, and the blocks on the diagonal of their A.
 
 Systems are anything with A, B, C, D, dt, inputs, outputs, states and blocks: the operators of
 `StateSpace` are built upon these functions.
@@ -145,7 +145,7 @@ def joined_blocks(parts: Sequence[Any]) -> list[int]:
 
 
 def short_list(names: Sequence[str]) -> str:
-    """Return names, of many the first and the last."""
+    """Return the names, abbreviated when there are many."""
     return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"
 
 
@@ -170,7 +170,7 @@ def equal_matrices(one: Any, other: Any) -> bool:
 
 
 def is_block_diagonal(g: Any) -> bool:
-    """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
+    """Return whether A is known to consist of 1 x 1 and 2 x 2 diagonal blocks only."""
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         return False
     owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
@@ -180,7 +180,7 @@ def is_block_diagonal(g: Any) -> bool:
 def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, IntArray]:
     """Return 1 x 1 and 2 x 2 diagonal blocks as (b, 2, 2), and the states of each (b, 2; -1: none).
 
-    A block of one state has its pole twice: nothing drives the second.
+    A block of one state gets its pole twice; nothing drives the second.
     """
     sizes = np.asarray(blocks)
     starts = np.cumsum(sizes) - sizes
@@ -192,8 +192,8 @@ def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, I
 
 
 def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int, Sequence[int]]:
-    """Return the first state, that after the last and the blocks of the longest uncoupled run."""
-    # blocks of one or two states that do not see each other: modes among filters and delay lines
+    """Return the first state, the end and the blocks of the longest uncoupled run."""
+    # blocks of one or two states that do not act on each other: modes among filters and delay lines
     if not blocks:
         return 0, 0, ()
     sizes = np.asarray(blocks, dtype=np.int64)
@@ -233,7 +233,7 @@ def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     return sizes
 
 
-#: what selects channels: a name or number, several, or a slice
+#: selection of channels: a name or number, several, or a slice
 Channels: TypeAlias = str | int | slice | Sequence[str | int]
 
 
@@ -251,7 +251,7 @@ def chosen_names(known: Sequence[str], key: Channels, side: str) -> list[str]:
             )
         if isinstance(item, int | np.integer) and not -len(known) <= item < len(known):
             raise LabelError(
-                f"there is no {side} number {item}: the system has {len(known)} "
+                f"{side} number {item} does not exist: the system has {len(known)} "
                 f"({short_list(known)}), counted from 0."
             )
     return [item if isinstance(item, str) else known[item] for item in listed]

@@ -65,13 +65,13 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
 
 
 def _has_pole_at(place: float, A: FloatArray) -> bool:
-    """Return whether an eigenvalue lies there; a condition number would see the states' units."""
+    """Return whether an eigenvalue lies there; a condition number would depend on units."""
     distance = np.abs(np.linalg.eigvals(A) - place)
     return bool(np.min(distance, initial=np.inf) <= ROUNDING * abs(place))
 
 
 def image_freq(omega: Any, dt: float) -> Any:
-    """Return the frequencies [Hz] that those of the bilinear image [rad/s] stand for."""
+    """Return the frequencies [Hz] that belong to those of the bilinear image [rad/s]."""
     return np.arctan(0.5 * dt * omega) / (np.pi * dt) if dt else omega / (2.0 * np.pi)
 
 
@@ -86,16 +86,17 @@ def bilinear(sys: System, rate: float) -> StateSpace:
     return g.replace(A=A, B=B, C=C, D=D, dt=0.0, blocks=None)
 
 
-#: samples in a piece, whose arrays stay in the cache; a whole number of blocks of any size
+#: number of samples in a piece, whose arrays fit the cache; a multiple of any block size
 PIECE = 4096
 #: sizes of a block [samples]
 _SIZES = (1, 2, 4, 8, 16, 32, 64, 128)
-#: in operations of a product of two matrices: one of a product with a single vector, and a call
+#: cost of an operation with a single vector, and of a call, relative to an operation in a matrix
+#: product
 ONE_VECTOR, CALL = 3.0, 3e4
 
 
 def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
-    """Return the size of a block that costs least, and the operations that a sample then takes."""
+    """Return the cheapest size of a block, and its number of operations per sample."""
 
     # n states, p outputs, m inputs; the preparation is shared by a number of samples
     def cost(size: int) -> float:
@@ -157,7 +158,7 @@ class Recursion(NamedTuple):
         see, enter = np.empty((b, p, n)), np.empty((b, n, m))
         see[0], enter[b - 1] = self.H, self.G
         power, done = self.F, 1
-        while done < b:  # twice as many each time, by one product each
+        while done < b:  # twice the number in each step, by one product each
             more = min(done, b - done)
             see[done : done + more] = see[:more] @ power
             enter[b - done - more : b - done] = power @ enter[b - more :]
@@ -188,7 +189,7 @@ class Blocks(NamedTuple):
 
     def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state."""
-        # N is a whole number of blocks. All is a product of two matrices but `step x`
+        # N is a whole number of blocks. everything except `step x` is a product of two matrices
         count = v.shape[0] // self.size
         inputs = np.ascontiguousarray(v).reshape(count, -1)
         states = np.empty((count + 1, x.size))

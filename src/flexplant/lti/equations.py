@@ -1,4 +1,4 @@
-"""Matrix equations (Stein, Lyapunov, Sylvester, Riccati), and units in which rounding is small."""
+"""Matrix equations (Stein, Lyapunov, Sylvester, Riccati), and scaling that limits rounding."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..tolerances import SPLIT, TINY, divisor
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even."""
     # A is bordered by the sizes of B's rows and C's columns and balanced with them: balancing A
-    # alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
-    # got units of 1e26 and 1e-34), which costs B and C all their digits
+    # alone shrinks the entries above its diagonal blocks without limit (a Schur form of 84 states
+    # got units of 1e26 and 1e-34), so that B and C lose all digits
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     # borders as large as the balanced A, whatever the units of A, inputs, outputs
     size = float(np.linalg.norm(balanced_matrix(A))) or 1.0
@@ -68,7 +68,7 @@ def _gebal(A: FloatArray | ComplexArray) -> tuple[FloatArray | ComplexArray, Flo
 
 def axis_frequencies(hamiltonian: FloatArray | ComplexArray) -> FloatArray:
     """Return the imaginary parts of the eigenvalues that lie, or nearly lie, on the axis."""
-    # those that only seem to do no harm: what they stand for is computed there
+    # false candidates do no harm, since the gain is computed there
     balanced = _gebal(hamiltonian)[0]
     values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
     return values.imag[np.abs(values.real) <= _NEARLY * np.linalg.norm(balanced)]
@@ -77,7 +77,7 @@ def axis_frequencies(hamiltonian: FloatArray | ComplexArray) -> FloatArray:
 def mean_speed(poles: ComplexArray) -> float:
     """Return the geometric mean [rad/s] of the sizes of poles, those near zero left out; 1 if none.
 
-    Free masses come out at rounding, which says nothing about the others.
+    Poles of free masses are computed with rounding size and carry no information.
     """
     sizes = np.abs(poles)
     moving = sizes[sizes > SPLIT * sizes.max(initial=0.0)]
@@ -85,23 +85,23 @@ def mean_speed(poles: ComplexArray) -> float:
 
 
 def reciprocal(size: FloatArray) -> FloatArray:
-    """Return ``1 / size``, and 1 for what is of no size."""
+    """Return ``1 / size``, and 1 where the size is zero."""
     return np.asarray(1.0 / divisor(size))
 
 
 _Schur = tuple[ComplexArray, ComplexArray]
-#: doublings: 2^60 terms of a series; a slower decay is not distinguished from none
+#: number of doublings, 2^60 terms of a series; a slower decay counts as no decay
 DOUBLINGS = 60
-#: a term of this size, relative to its sum, is below rounding (2e-16), and so is all that follows
+#: relative size of a term below rounding (2e-16), which ends the sum
 _LAST = 1e-17
 #: a doubled Riccati equation has converged: the next term would be the square of this
 _CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
-#: relative: eigenvalues of a Hamiltonian count as on the imaginary axis, or may do; Q - S R^-1 S'
-#: is rounding
+#: relative tolerances: eigenvalues of a Hamiltonian that lie, or may lie, on the imaginary axis; Q
+#: - S R^-1 S' that counts as zero
 _AXIS, _NEARLY, _CANCELLED = 1e-10, 1e-9, 1e-12
 #: largest residual of an equation with indefinite R: near the least gamma X grows without bound
 _OFF = 1e-6
-#: residuals that are examined: Newton's correction between them squares the error
+#: number of examined residuals, with a Newton correction between them, which squares the error
 _CORRECTIONS = 4
 
 
@@ -150,7 +150,7 @@ def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     if (largest := float(np.max(form[0].diagonal().real))) >= 0:
         raise SolverError(
             f"A is not strictly stable (largest real part {largest:.2e} rad/s): "
-            "A X + X A' + Q = 0 has no solution of meaning. Take rigid-body modes out."
+            "A X + X A' + Q = 0 has no meaningful solution. Take rigid-body modes out."
         )
     X = symmetrised(_by_schur((form, None), Q))
     return X + symmetrised(_by_schur((form, None), A @ X + X @ A.T + Q))
@@ -182,8 +182,8 @@ def doubled_riccati(
     A: FloatArray, G: FloatArray, H: FloatArray, *, quick: bool = False
 ) -> tuple[FloatArray, int]:
     """Return X of ``X = A' X (I + G X)^-1 A + H`` and the number of doublings [Chu2004]_."""
-    # quick: converged once no variance grows by 1e-8, which a closed loop that is barely stable may
-    # seem to reach: check the residual
+    # fast test: converged when no variance grows by 1e-8; a barely stable closed loop may pass it,
+    # so that the residual must be checked
     n = A.shape[0]
     for k in range(1, DOUBLINGS + 1):
         inner = G @ H
@@ -228,7 +228,7 @@ def stabilising(
     for _ in range(_CORRECTIONS):
         moved, bent = drift.T @ X, X @ spread @ X
         residual = moved + moved.T - bent + rest
-        # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
+        # relative to Q: where it cancels with S R^-1 S' the solution is zero except for rounding
         if relative(residual, *(float(np.linalg.norm(term)) for term in (moved, bent, Q))) <= _OFF:
             return X, np.asarray(-(BR @ X + SR))
         closed = (drift - spread @ X).T
@@ -244,7 +244,7 @@ def stable_subspace(
     # units of the states, and one of the adjoint states: still Hamiltonian
     parts = (A * d / d[:, None], G / d / d[:, None], Q * d * d[:, None], whole * d * d[:, None])
     inner, reach, cost, own = (float(np.linalg.norm(part)) for part in parts)
-    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of A over G
+    if cost <= _CANCELLED * own:  # only rounding: X has the size of A over G
         cost = inner**2 / reach if reach else 0.0
     unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
     scale = np.concatenate([d, unit / d])
@@ -259,15 +259,15 @@ def stable_subspace(
     return symmetrised(np.linalg.solve(top.T, bottom.T).T)
 
 
-#: relative to the mean speed of the closed loop: shifts of the Cayley transform, tried in turn
-#: until its condition leaves half of the digits to Newton's steps
+#: shifts of the Cayley transform relative to the mean speed of the closed loop, tried in turn until
+#: its condition leaves half of the digits for Newton's steps
 SHIFTS, WELL = (1.0, 1.7, 0.6, 3.1, 0.33), 1e8
 
 
 def cayley(A: FloatArray, G: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:
     """Return A, G, Q of the discrete equation with the solution of a continuous one [Chu2005]_."""
     moduli, unit = np.abs(la.eigvals(np.block([[A, -G], [-Q, -A.T]]))), np.eye(len(A))
-    # a rigid-body mode does not say how fast the closed loop is
+    # a rigid-body mode has no information on the speed of the closed loop
     typical = np.exp(np.mean(np.log(np.maximum(moduli, SPLIT * np.max(moduli, initial=TINY)))))
     found: dict[float, tuple[FloatArray, ...]] = {}
     for shift in (np.array(SHIFTS) * typical).tolist():
@@ -300,7 +300,7 @@ def accumulated(A: FloatArray, Q: FloatArray) -> FloatArray:
     for _ in range(8):
         X = X + A @ X @ A.T
         A = A @ A
-        # unstable: its size so far is scale enough, and later terms would hide the others
+        # unstable: its present size is a sufficient scale, and later terms would hide the others
         if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
             break
     return np.abs(X.diagonal())

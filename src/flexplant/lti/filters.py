@@ -75,9 +75,9 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     matched at one frequency. Notches keep their frequency and depth exactly, which Tustin only
     does at one.
 
-    Systems of one input and one output alone, as in MATLAB's c2d: zeros of several channels belong
-    to all of them together. A filter with a section for each channel is sampled section by section:
-    ``append(*(matched(f, rate) for f in sections))``.
+    Only for systems of one input and one output, as in MATLAB's c2d, since zeros of several
+    channels belong to all of them. A filter with a section for each channel is sampled section by
+    section: ``append(*(matched(f, rate) for f in sections))``.
 
     Parameters
     ----------
@@ -85,7 +85,8 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
         Continuous, one input, one output: a filter or a controller; for a plant use `discretized`.
     rate : float [Hz]
     at : float [Hz]
-        Where the gain is matched; not 0 for a filter that integrates or differentiates.
+        Frequency at which the gain is matched; not 0 for a filter that integrates or
+        differentiates.
 
     Returns
     -------
@@ -116,7 +117,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
         raise ModelError(
             f"matched needs one input and one output, got {len(g.inputs)} and {len(g.outputs)}: "
             "zeros of several channels cannot be mapped one by one. Use tustin, or sample each "
-            "channel by itself: append(matched(g['y1', 'u1'], rate), ...)."
+            "channel separately: append(matched(g['y1', 'u1'], rate), ...)."
         )
     at = between(at, "at", 0.0, 0.5 * rate, "It is in Hz, below half the rate.", ends="[")
     if not g.n_states:
@@ -308,7 +309,7 @@ def inverse_sensitivity(
     Parameters
     ----------
     bandwidth : float [Hz]
-        Where the bound on |S| crosses 1.
+        Frequency at which the bound on |S| crosses 1.
     peak : float
         Bound on |S| at high frequencies.
     floor : float
@@ -342,8 +343,8 @@ def inverse_sensitivity(
     floor, peak = positive(floor, "floor"), positive(peak, "peak")
     if not floor < 1.0 < peak:
         raise ModelError(
-            f"need 0 < floor < 1 < peak, got floor {floor:g} and peak {peak:g}. They are the sizes "
-            "of S at low and at high frequency: 1e-3 and 2, say."
+            f"need 0 < floor < 1 < peak, got floor {floor:g} and peak {peak:g}. They are the "
+            "sizes of S at low and at high frequency, for example 1e-3 and 2."
         )
     high, low = peak ** (-1.0 / slope), floor ** (1.0 / slope)
     # |W| = 1 at the bandwidth w_b: (w_b high)^2 + w^2 = w_b^2 + (w low)^2
@@ -361,7 +362,7 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     ----------
     delay : float [s]
     order : int
-        Number of states, 1 to 12; the phase is right up to about ``order / (6 delay)`` Hz.
+        Number of states, 1 to 12; the phase is accurate up to about ``order / (6 delay)`` Hz.
 
     Returns
     -------

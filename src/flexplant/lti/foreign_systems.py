@@ -23,7 +23,8 @@ def zpk_fields(
     if z.size > p.size:
         raise ModelError(
             f"the transfer function has {z.size} zeros and {p.size} poles: it differentiates its "
-            "input, which no state space does. Add poles beyond the band, such as a low-pass."
+            "input, which a state-space system cannot do. Add poles above the band, such as a "
+            "low-pass."
         )
     left = root_pairs(z)
     chain = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
@@ -33,7 +34,8 @@ def zpk_fields(
         nearest = _near_zeros(pair, left)
         left = [part for part in left if part is not nearest]
         a, b, c, d = _section(pair, nearest)
-        # sections of moderate gain: what they lack of the poles' size goes to the factor
+        # sections of moderate gain: the remaining factor of the poles' size goes to the common
+        # factor
         size = float(np.abs(pair).max()) or 1.0
         lacking = size ** (pair.size - nearest.size)
         c, d, factor = c * lacking, d * lacking, factor / lacking
@@ -52,7 +54,9 @@ def tf_fields(
         for part, name in ((numerator, "the numerator"), (denominator, "the denominator"))
     )
     if not den.size:
-        raise ModelError("the denominator is zero: a transfer function needs one that is not.")
+        raise ModelError(
+            "the denominator is zero: a transfer function needs a denominator that is not zero."
+        )
     if not num.size:
         return zpk_fields([], [], 0.0)
     return zpk_fields(np.roots(num), np.roots(den), num[0] / den[0], dt)

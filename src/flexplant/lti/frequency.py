@@ -1,4 +1,4 @@
-"""Frequency responses: exact, by the blocks of A where it has them."""
+"""Frequency responses: exact, from the blocks of A where it has blocks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .measured_lines import checked_correlation, checked_overlap, checked_window
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
-#: multiplications below which a response takes no time
+#: number of multiplications below which a response needs no progress bar
 _LONG = 1e9
 _NUMBERS = (int, float, complex, np.number)
 
@@ -111,7 +111,7 @@ def _line_range(frf: Any) -> str:
 
 #: time derivatives of each quantity
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-#: of a motion, by the order of its time derivative
+#: units of a motion by the order of its time derivative
 _PER_TIME = ("", "/s", "/s^2")
 
 
@@ -145,16 +145,16 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         `scipy.signal.get_window` takes; needs `resolution`. Such lines leak, and their errors are
         correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
     overlap : float
-        Share of a segment that the next one sees again, 0 to below 0.95.
+        Fraction of a segment that overlaps with the next one, from 0 to below 0.95.
     units : mapping {channel: unit}, optional
         SI units of the inputs and outputs that have a known one.
 
     Notes
     -----
-    It calculates with numbers, responses on the same lines and systems. Errors of two responses are
-    taken to be independent, so that variances add; those of a product follow to first order,
-    ``|G2|^2 var G1 + |G1|^2 var G2``. A system adds none. What belongs to one measurement
-    (coherence, correlation of outputs, segments) is left out of sums and products.
+    Responses can be combined with numbers, responses on the same lines and systems. Errors of two
+    responses are assumed independent, so that variances add; the variance of a product is
+    ``|G2|^2 var G1 + |G1|^2 var G2`` to first order. A system adds no variance. Data of a single
+    measurement (coherence, correlation of outputs, segments) are left out of sums and products.
 
     Raises
     ------
@@ -188,7 +188,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     freedom: float | None = field(default=None, metadata=checked(positive))
     units: Mapping[str, str] = field(default_factory=dict)
 
-    if TYPE_CHECKING:  # what comes in is anything array-like
+    if TYPE_CHECKING:  # the input is any array-like object
 
         def __init__(
             self,
@@ -223,8 +223,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             self._set(correlation=checked_correlation(self.correlation, shape))
         if self.window is not None and self.resolution is None:
             raise ModelError(
-                f"window={self.window!r} says little without the length of its segments: give "
-                "resolution= too, the inverse of that length [Hz]."
+                f"window={self.window!r} needs the length of its segments: give resolution= too, "
+                "the inverse of that length [Hz]."
             )
         inputs = signal_names(self.inputs, shape[1], "u", "inputs")
         outputs = signal_names(self.outputs, shape[0], "y", "outputs")
@@ -352,12 +352,12 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Parameters
         ----------
         quantity : {"displacement", "velocity", "acceleration"}
-            What the outputs shall be.
+            New quantity of the outputs.
 
         Raises
         ------
         ModelError
-            When the own quantity is not known, or zero frequency would be integrated.
+            When the present quantity is not known, or zero frequency would be integrated.
         """
         require_known("quantity", [quantity], ORDERS)
         if self.quantity not in ORDERS:
@@ -380,7 +380,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     def unit(self, output: str, input: str) -> str | None:
         """Return the unit of a response, such as "rad/N", "1" of a ratio; None when not known.
 
-        By the units of the channels, else, of a measurement, by its quantity for one N.
+        It follows from the units of the channels, or from the quantity of a measurement per N.
         """
         self._place((output, input))
         known = self.channel_units
@@ -393,7 +393,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 
     @property
     def channel_units(self) -> dict[str, str]:
-        """Units of the channels: as given, else, of a measurement, by its quantity for one N."""
+        """Units of the channels: as given, or from the quantity of a measurement per N."""
         per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}.get(
             self.quantity or ""
         )
@@ -490,7 +490,7 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
 
 def _of_system(g: StateSpace, freq: FloatArray) -> Frf:
     """Return the response of a system at frequencies that are known to suit it."""
-    # the checks of Frf hold already: its copy and its look at every entry cost twice the response
+    # the checks of Frf hold already; its copy and checks would take twice the time of the response
     data = responses(g, freq)
     for array in (freq, data):
         array.flags.writeable = False

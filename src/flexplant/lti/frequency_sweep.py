@@ -13,23 +13,24 @@ from ..tolerances import ROUNDING, SPLIT, TINY
 from .response_solvers import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
-#: [rad] most turn of a phase between neighbours; a dip between them turns it by more
+#: [rad] largest change of a phase between neighbours; a dip between them changes it by more
 TURN = 0.6
-#: a channel this far below the others of its row and column at a frequency is taken for zero
+#: ratio to the other channels of its row and column below which a channel counts as zero
 FLOOR = 1e-6
-#: a pole with less damping than this has no finite response at its frequency: it is not computed
+#: damping ratio below which the response at the frequency of a pole is not computed
 UNDAMPED = 1e-12
-#: relative width of the narrowest interval that is halved
+#: relative width of the narrowest interval to halve
 NARROWEST = 1e-8
-#: local maxima that are climbed at most, and the part of the highest that each has at least
+#: largest number of local maxima that are refined, and their least fraction of the highest one
 _PEAKS, _HIGH = 6, 0.5
-#: a bracket, inner points of its halves and of all of it; a maximum that gains less is found
+#: number of inner points of the halves of a bracket and of all of it; relative gain below which a
+#: maximum is found
 _ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
 _SIXTEENTHS = np.arange(1, 16) / 16.0
-#: relative accuracy of the frequencies of crossings: margins there are right to nine digits
+#: relative accuracy of the frequencies of crossings, for margins with nine digits
 _ACCURATE = 1e-12
-#: around a resonance, in units of its half-power half-width: for a curve that is drawn through
-#: the points, and for a search that seeks the top between them
+#: grid around a resonance in units of its half-power half-width: for a drawn curve, and for a
+#: search that finds the maximum between points
 DRAWN = (0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0)
 SOUGHT = (0.0, 0.7, 2.0, 6.0)
 
@@ -40,14 +41,14 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     From a decade below the slowest pole to a decade above the fastest (or half the sampling rate),
     with points through every resonance; then intervals are halved, the worst first, until in the
     middle of each the logarithm of every channel's magnitude lies within `tolerance` of the line
-    between its ends, and no phase turns by more than 0.6 rad: a line drawn through the points is
-    the response. At an undamped resonance, which has no response, the grid leaves a gap.
+    between its ends, and no phase changes by more than 0.6 rad, so that a line through the points
+    shows the response. The grid has a gap at an undamped resonance, which has no finite response.
 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
     points : int
-        Most points. 64 channels of 24 lightly damped modes need some 3500.
+        Largest number of points. 64 channels of 24 lightly damped modes need about 3500.
     tolerance : float
         Step of the natural logarithm of a magnitude: 0.05 is 0.4 dB.
 
@@ -88,7 +89,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
         if low < f < high and z < 0.3:
             # narrower ones are lines at any scale of a plot
             near = f * (1 + max(z, 1e-6) * around)
-            if z <= UNDAMPED:  # infinite there: a gap is left around it
+            if z <= UNDAMPED:  # infinite there: the grid has a gap
                 near, undamped = np.delete(near, around.size // 2), [*undamped, f]
             freq.append(near)
     grid = np.unique(np.concatenate(freq))
@@ -101,7 +102,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
 def _halve_intervals(
     g: StateSpace, grid: FloatArray, points: int, tolerance: float, gaps: FloatArray
 ) -> FloatArray:
-    """Halve intervals until the middle of each is as its ends say, those over gaps left alone."""
+    """Halve intervals, except gaps, until the middle of each agrees with its ends."""
     find = responder(g)
     values = _log_channels(find(grid))
     left = np.arange(grid.size - 1)  # intervals [left, right] that are not settled, by their ends
@@ -135,7 +136,7 @@ def _log_channels(data: ComplexArray) -> ComplexArray:
 
 
 def _line_error(left: ComplexArray, middle: ComplexArray, right: ComplexArray) -> FloatArray:
-    """Return how wrong a line from left to right is in the middle, the worst channel of each."""
+    """Return the error of a line from left to right in the middle, for the worst channel."""
     bent = np.abs(middle.real - 0.5 * (left.real + right.real))
     turned = np.maximum(_phase_step(left, middle), _phase_step(middle, right))
     bent = np.where(turned > TURN, np.maximum(bent, turned), bent)
@@ -157,7 +158,7 @@ def resonance_grid(
         s = np.asarray(np.log(s[np.abs(s) > ROUNDING]) / dt, dtype=np.complex128)
     nyquist = 0.5 / dt if dt else np.inf
     size = np.abs(s) / (2 * np.pi)
-    # rigid-body poles and rounding of them at 0 or 1 say nothing about the frequencies of interest
+    # rigid-body poles at 0 or 1, and their rounding, do not indicate the frequencies of interest
     size_seen = size[size > SPLIT * np.max(size, initial=0.0)]
     if not size_seen.size:
         size_seen = np.array([0.01 * nyquist if dt else 1.0])
@@ -207,8 +208,8 @@ def highest(
     values: FloatArray | None = None,
 ) -> tuple[float, float]:
     """Return the largest value of a function of frequency, and its frequency [Hz]."""
-    # `values` on the grid where these are known
-    # brackets around the highest maxima are divided, until a parabola gains nothing
+    # `values` on the grid where these are known brackets around the highest maxima are divided
+    # until a parabola gives no improvement
     values = find(grid) if values is None else values
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
     freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each
@@ -222,7 +223,7 @@ def highest(
         freq, size = (np.take_along_axis(both, order, axis=1) for both in (freq, size))
         around = np.clip(np.argmax(size, axis=1)[:, None] + _ASIDE, 0, freq.shape[1] - 1)
         freq, size = (np.take_along_axis(both, around, axis=1) for both in (freq, size))
-        # a top seen at half its height is seen at 1 - 0.5 / 8^n of it by now
+        # a maximum first seen at half its height is now known to 1 - 0.5 / 8^n of it
         left_in = size[:, 1] >= (1.0 - (1.0 - _HIGH) / 8.0**n) * size[:, 1].max()
         freq, size = freq[left_in], size[left_in]
         if not np.any(_vertex(freq, size)[1] > _GAIN * size[:, 1]):
@@ -234,7 +235,8 @@ def highest(
 def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return where the vertex of a parabola lies, and how far above its middle point; (k, 3)."""
     width = x[:, 2] - x[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):  # at an end of the grid there is no side
+    # an end of the grid has only one neighbour
+    with np.errstate(divide="ignore", invalid="ignore"):
         slopes = np.diff(y, axis=1) / np.diff(x, axis=1)
         slope = (slopes[:, 0] * (x[:, 2] - x[:, 1]) + slopes[:, 1] * (x[:, 1] - x[:, 0])) / width
         way = 0.5 * slope * width / (slopes[:, 0] - slopes[:, 1])
@@ -258,7 +260,7 @@ def crossings(
     find: Callable[[FloatArray], FloatArray], freq: FloatArray, values: FloatArray
 ) -> FloatArray:
     """Return the zeros of a function of frequency between the points where its sign changes."""
-    # all at once: a response at many frequencies costs little more than at one
+    # all together: a response at many frequencies costs little more than at one
     from scipy.optimize.elementwise import find_root
 
     first = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
@@ -288,7 +290,7 @@ def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
     if dt and grid.size and grid.max() > 0.5 / dt * (1 + ROUNDING):
         raise ModelError(
             f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / dt:g} Hz), "
-            "where a sampled system has no response of its own. Stay below."
+            "where the response of a sampled system only repeats. Stay below."
         )
     if np.any(np.diff(grid) <= 0):
         raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")

@@ -30,7 +30,7 @@ def append(*systems: System) -> StateSpace:
     Parameters
     ----------
     *systems : StateSpace
-        Any number.
+        Systems, in any number.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def append(*systems: System) -> StateSpace:
 
 
 def side_by_side(systems: Iterable[System], names: Iterable[str], mark: str = "|") -> StateSpace:
-    """Return systems of one input and one output each as one, channel by channel of some names."""
+    """Return single-channel systems as one system with the given channel names."""
     return append(
         *(
             g.replace(inputs=[n], outputs=[n], states=[f"{n}{mark}{state}" for state in g.states])
@@ -74,7 +74,7 @@ def among(
     outputs: Sequence[str],
     through: Mapping[tuple[str, str], float] | None = None,
 ) -> StateSpace:
-    """Return a system with its channels among others, and gains added, as {(output, input): k}."""
+    """Return a system with more channels and with added gains {(output, input): k}."""
     column, row = ({name: i for i, name in enumerate(names)} for names in (inputs, outputs))
     driven, seen = [column[name] for name in g.inputs], [row[name] for name in g.outputs]
     B, C = np.zeros((g.n_states, len(column))), np.zeros((len(row), g.n_states))
@@ -91,7 +91,7 @@ def series(first: System, second: System) -> StateSpace:
     Parameters
     ----------
     first, second : StateSpace
-        As many outputs of the first as inputs of the second; their names need not agree.
+        Systems; the first has as many outputs as the second has inputs, with any names.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
     forward, back : StateSpace
         G and H, connected in order of their channels.
     sign : {-1, +1}
-        Negative feedback unless given.
+        Sign of the feedback; negative by default.
 
     Raises
     ------
@@ -319,7 +319,7 @@ def connect(
     for name in sorted({n for n in known if known.count(n) > 1} - may_add):
         raise LabelError(
             f"{name!r} is driven {known.count(name)} times: two blocks (or a block and an outer "
-            "input) produce it. Rename one, or add them in a block of their own."
+            "input) produce it. Rename one, or add them in a separate block."
         )
     require_known("signal to connect", [*needed, *outputs], known)
     route, enter, leave, through = (

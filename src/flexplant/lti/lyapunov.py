@@ -1,4 +1,4 @@
-"""Stein and Lyapunov equations, and the Gramians that follow from them, also by their factors."""
+"""Stein and Lyapunov equations, and the Gramians that follow, also in factored form."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
 
     By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. With
-    ``T = |A| |X| |A'| + |Q|``, the terms before they cancel, entry (i, j) of the residual is at
-    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``. The first is the larger where Q is not definite
-    and has a diagonal entry that is small compared with its row; the second bounds it otherwise.
+    the terms before cancellation ``T = |A| |X| |A'| + |Q|``, entry (i, j) of the residual is at
+    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``.
 
     Parameters
     ----------
@@ -53,7 +52,8 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     Raises
     ------
     SolverError
-        When A is not strictly stable, so that the series does not end, or the residual is bad.
+        When A is not strictly stable, so that the series does not end, or the residual is too
+        large.
 
     References
     ----------
@@ -110,7 +110,7 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     A, Q = _square_pair(A, Q)
     if not A.size:
         return Q
-    # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 with Q
+    # balance A without Q: a chain of lags is solved to 1e-16 in these units, and to 1e-11 with Q
     d = even_scale(A)
     As, Qs = A * d / d[:, None], Q / d / d[:, None]
     X = lyapunov(As, Qs)
@@ -187,7 +187,7 @@ def observability_gramian(sys: System) -> FloatArray:
 def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
     if g.n_states and not g.is_stable:
         raise SolverError(
-            f"{g!r} is not strictly stable, so its Gramian is infinite. Take rigid-body and "
+            f"{g!r} is not strictly stable, so that its Gramian is infinite. Take rigid-body and "
             "unstable modes out, or close a loop first."
         )
     if is_block_diagonal(g):
@@ -207,7 +207,8 @@ def _modal_gramian(
     real, b = slots >= 0, len(slots)
     drive = (B[slots] * real[:, :, None]).reshape(2 * b, -1)
     gap = 0.25 * (pairs[:, 0, 0] - pairs[:, 1, 1]) ** 2
-    # nearly double poles have poor eigenvectors, real ones of unlike size would lose digits
+    # nearly double poles have ill-conditioned eigenvectors, and real poles of different size would
+    # lose digits
     if np.all(gap + pairs[:, 0, 1] * pairs[:, 1, 0] < -_SWINGING * gap):
         own = ModalMap.of_pairs(pairs)
         modal = own.gramian(own.driven(drive), sampled=discrete)
@@ -303,7 +304,7 @@ def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
     return compressed(np.hstack([L.real, L.imag]))
 
 
-#: relative, of a standard deviation: the terms that follow add the square of this to a variance
+#: relative term of a standard deviation that ends the sum: later terms add its square to a variance
 _LAST_ROOT = 1e-9
 
 

@@ -1,4 +1,4 @@
-"""A measured response on its lines and between them: correlated errors, modes that lie between."""
+"""A measured response at its lines and between them: correlated errors, modes between lines."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, between, com
 from ..errors import ModelError, ShapeError
 from ..tolerances import ROUNDING, SAME, TINY
 
-#: samples of a window that stand for all lengths
+#: number of samples of a window that represents all lengths
 SAMPLES = 256
-#: correlations below this are left out, and so are lines farther apart than this many
+#: correlation below which it is neglected, and largest distance of correlated lines
 LEAST, FARTHEST = 1e-3, 40
 
 
@@ -39,7 +39,7 @@ def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
 
 def checked_window(window: Any, name: str = "window") -> str | tuple[Any, ...]:
     """Return a window that `scipy.signal.get_window` takes."""
-    from scipy.signal import get_window  # costs a third of a second that few need
+    from scipy.signal import get_window  # slow import that few users need
 
     window = tuple(window) if isinstance(window, list) else window
     try:
@@ -51,7 +51,9 @@ def checked_window(window: Any, name: str = "window") -> str | tuple[Any, ...]:
 
 def checked_overlap(overlap: Any, name: str = "overlap") -> float:
     """Return an overlap below 0.95."""
-    return between(overlap, name, 0.0, 0.95, "More brings nothing new: try 0.5.", ends="[")
+    return between(
+        overlap, name, 0.0, 0.95, "A larger overlap adds no information: try 0.5.", ends="["
+    )
 
 
 def line_correlation(
@@ -100,14 +102,14 @@ def _window_overlap(distance: FloatArray, window: Any, overlap: float) -> FloatA
     return np.asarray(power / own)
 
 
-#: change of a response between two lines, relative to its size, below which it is a straight line
+#: relative change of a response between two lines below which it is a straight line
 _STRAIGHT = 1e-9
-#: third difference, relative to the terms of its sum, that is rounding, and how far away the pole
-#: of such lines is put
+#: relative third difference that counts as rounding, and distance assigned to the pole of such
+#: lines
 _ROUNDING, _FAR = 1e-14, 1e6
-#: neighbouring lines through which a mode on a straight line is fitted
+#: number of neighbouring lines for a fit of a mode plus a straight line
 LINES = 4
-#: where an interval is filled: by its length, and about a resonance by its half-width
+#: points that fill an interval: relative to its length, and around a resonance to its half-width
 _SHARES = (0.25, 0.5, 0.75)
 AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
 
@@ -115,7 +117,7 @@ AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
 def between_lines(
     lines: FloatArray, data: ComplexArray, freq: FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return responses between lines, and what two estimates of them differ by."""
+    """Return responses between lines, and the difference of two estimates."""
     # the circle through three neighbours is exact for one mode on a constant; each frequency lies
     # in two
     last = lines.size - 3
@@ -191,24 +193,24 @@ def _circle_values(
     return np.asarray(data[..., first] + a * h / below)
 
 
-#: damping ratio below which a mode is not considered: no structure has less
+#: smallest damping ratio that a structure may have
 _LEAST = 1e-5
-#: how far outside its interval, relative to its length, a fit may find a mode of it
+#: distance outside of an interval, relative to its length, at which a fitted mode still belongs to
+#: it
 _ASIDE = 0.25
-#: error of fits, relative to the difference of two of them; the part of an interval up to
-#: which that is a mode found; and the part of its shift within which they have to agree on that
+#: factor from the difference of two fits to their error; fraction of an interval below which a mode
+#: counts as found; and fraction of its shift to which the fits must agree
 _SAFETY, _FOUND, _ALIKE = 2.0, 0.3, 0.5
-#: half-power width, relative to the distance of two lines, of a mode that the lines show: some of
-#: them lie on its circle, so that the steps from line to line follow it
+#: half-power width relative to the distance of lines above which lines resolve a mode
 _SHOWN = 4.0
 #: phase step of det(I - L) between two lines above which its path is not known
 _STEP = 0.6 * np.pi
-#: lines that the three fits of an interval use
+#: number of lines of the three fits of an interval
 FEWEST = LINES + 2
 
 
 class HiddenModes(NamedTuple):
-    """What is known of a loop in each interval between two lines of its plant."""
+    """Information on a loop in each interval between two lines of its plant."""
 
     step: FloatArray
     unknown: npt.NDArray[np.bool_]
@@ -218,14 +220,14 @@ class HiddenModes(NamedTuple):
 
 
 def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
-    """Return how P (ny, nu, n) falls at the lowest lines: 2 for a free body, 0 for a held one."""
+    """Return the slope of P (ny, nu, n) at low lines: 2 for a free body, 0 for a held one."""
     low = _lowest(freq)
     size = np.maximum(np.linalg.norm(plant[:, :, low], axis=(0, 1)), TINY)
     return -float(np.polyfit(np.log(freq[low]), np.log(size), 1)[0])
 
 
 def free_motions(freq: FloatArray, plant: ComplexArray) -> int:
-    """Return how many directions of P (ny, nu, n), the largest, fall with slope 2 at low lines."""
+    """Return the number of directions of P (ny, nu, n) with slope 2 at the lowest lines."""
     low = _lowest(freq)
     sizes = np.linalg.svd(np.moveaxis(plant[:, :, low], -1, 0), compute_uv=False)
     slopes = -np.polyfit(np.log(freq[low]), np.log(np.maximum(sizes, TINY)), 1)[0]
@@ -234,17 +236,17 @@ def free_motions(freq: FloatArray, plant: ComplexArray) -> int:
 
 
 def _lowest(freq: FloatArray) -> BoolArray:
-    """Return which lines show how a plant goes on to lower frequencies."""
+    """Return the lines that show how a plant continues to lower frequencies."""
     return np.asarray(freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)]))
 
 
 def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray) -> HiddenModes:
     """Return what lies between lines."""
-    # with S K that of one end, `det(I - L)` changes over an interval as `1 - g`,
-    # `g = tr(S K P) = a + b f + rho / (f - p)`: a mode p of the plant is `p + d` in the loop, d rho
-    # over what 1 - g is beside it. Three fits through four lines each, by S K of both ends, find p
-    # and d. Where they agree a mode is there, unstable in the loop when its half-width Im p is
-    # below -Im d; where they do not, d bounds what may be there unseen
+    # with S K that of one end, `det(I - L)` changes over an interval as `1 - g`, `g = tr(S K P) = a
+    # + b f + rho / (f - p)`: a mode p of the plant becomes `p + d` in the loop, where d is rho over
+    # the rest of 1 - g. Three fits through four lines each, with S K of both ends, find p and d.
+    # Where they agree there is a mode, which is unstable in the loop when its half-width Im p is
+    # below -Im d; where they do not agree, d bounds a hidden mode
     slope = 2 if low_slope(freq, plant) > 1.0 else 0  # f^slope P is level at the lowest lines
     plant, controller = (np.moveaxis(part, -1, 0) for part in (plant, controller))
     n, L = freq.size, controller @ plant
@@ -268,7 +270,7 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
             beside = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
             poles.append(p)
             moves.append(moved * rho / beside)
-            # what another mode in the middle would have for rho, of which one fit shows more
+            # rho of another mode in the middle, if one fit shows more
             others += [
                 np.abs(p - q) * tail / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside))
                 for q, _, tail in fits
@@ -279,7 +281,7 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
 def _hidden_modes(
     freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, other: FloatArray
 ) -> HiddenModes:
-    """Return what fits (k, n - 1) say: poles p from the middle of each interval, moved by d."""
+    """Return results of fits (k, n - 1): poles p from the middle of each interval, and shifts d."""
     wide, middle = np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
     step, least = np.angle(F[1:] / F[:-1]), _LEAST * middle
     acts = (np.abs(p.real) <= (0.5 + _ASIDE) * wide) & (np.abs(d) > least)

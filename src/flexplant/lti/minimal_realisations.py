@@ -1,4 +1,4 @@
-"""Minimal realisations: without the states that no input moves or no output sees."""
+"""Minimal realisations: systems without uncontrollable or unobservable states."""
 
 from __future__ import annotations
 
@@ -19,50 +19,49 @@ from .modal_map import DOUBLE, eigenvalues_with_error
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
-#: shares and Hankel singular values below this of what they are computed from are rounding
+#: relative size of contributions and Hankel singular values below which they count as zero
 NOISE = 1e-13
-#: poles this close together, relative to their size, are judged together: copies of one mode lose
-#: a state, whose share is the square of their distance relative to their damping
+#: relative distance of poles below which they are judged together: of two copies of one mode a
+#: state is redundant, with a contribution of the square of their distance relative to their damping
 SAME = 1e-6
-#: conditions of a pole above which they say nothing more: two poles in one that rounding leaves,
-#: then any number
+#: largest meaningful condition numbers of a pole: for a double pole, then for any multiplicity
 DEFECTIVE = (DOUBLE, 1e12)
-#: condition of the bases of the modes above which the modes are not judged one by one
+#: condition number of the bases of modes above which modes are not judged separately
 LARGEST = 1e6
-#: fraction of a frequency by which a point lies next to the imaginary axis: wide enough for no
-#: resonance and no zero to be met
+#: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
+#: resonances and zeros
 BESIDE = 0.1
-#: the same, so near that all but undamped poles have their whole peak
+#: the same, so close that every damped pole shows its full peak
 NEAR = 1e-9
-#: distance from the frequency of a mode, relative, at which the result is compared: undamped modes
-#: are infinite at their own
+#: relative distance from the frequency of a mode at which the result is compared, since undamped
+#: modes are infinite at their frequency
 OFF = 0.01
-#: largest accepted change of a response, relative: beyond rounding in bases of condition LARGEST
+#: largest accepted relative change of a response: above rounding in bases of condition LARGEST
 AGREEMENT = 1e-6
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
-    """Return the system without states that are not both reached and seen.
+    """Return the system without uncontrollable or unobservable states.
 
-    Each mode is judged at its own frequency: it is left out where its peak is below `tol` of what
-    the whole system does around there, however much larger responses elsewhere are. Modes of equal
-    poles are judged together: of their balanced states those with Hankel singular values below
-    `tol` of their largest are left out. Channels are scaled to one size, so that metres beside
-    newtons do not decide what is small. The responses at the frequencies of all modes that are kept
-    are compared with those of `sys`, which is returned as it is when they do not agree.
+    Each mode is judged at its own frequency: it is removed if its peak is below `tol` times the
+    response of the whole system there, independent of larger responses at other frequencies. Modes
+    with equal poles are judged together: their balanced states with Hankel singular values below
+    `tol` times the largest one are removed. Channels are scaled to equal size, so that units do not
+    decide. The responses at the frequencies of all kept modes are compared with those of `sys`,
+    which is returned unchanged if they do not agree.
 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled.
     tol : float
-        Relative; below it rounding decides.
+        Relative tolerance; it should be above rounding.
 
     Returns
     -------
     StateSpace
-        The same channels; `sys` itself when nothing is to be left out, or nothing can be without
-        changing its responses. Blocks are found again when it had any.
+        System with the same channels; `sys` itself if no state can be removed. Blocks are found
+        again if it had blocks.
 
     Raises
     ------
@@ -135,7 +134,7 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
         label = _labels(poles, np.maximum(same, error), conjugate)
         bases = _bases(A, poles, vectors, error, label)
         V = np.hstack(bases)
-        units = np.linalg.norm(V, axis=1)  # those in which what a cascade amplifies is of one size
+        units = np.linalg.norm(V, axis=1)  # units in which the signals of a cascade have equal size
         V = V / units[:, None]
         whole = V.shape == A.shape and bool(np.all(np.isfinite(V)))
         apart = whole and float(np.linalg.cond(V)) <= LARGEST
@@ -160,7 +159,7 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
 
 
 def _labels(poles: ComplexArray, radius: FloatArray, together: Any) -> Any:
-    """Return the number of the group of each pole: discs that touch, and those that must be."""
+    """Return the number of the group of each pole: overlapping discs, and required pairs."""
     reach = radius[:, None] + radius
     gap = np.minimum(abs(poles[:, None] - poles), abs(poles[:, None] - poles.conj()))
     return csgraph.connected_components((gap <= reach) | together, directed=False)[1]
@@ -201,14 +200,14 @@ def _omega(poles: ComplexArray, dt: float) -> FloatArray:
 
 
 def _frequencies(groups: list[_Group]) -> FloatArray:
-    """Return all frequencies [rad/s] of groups; a rigid body acts where the slowest mode does."""
+    """Return all frequencies [rad/s] of groups; a rigid body gets that of the slowest mode."""
     omega = np.unique(np.concatenate([np.zeros(0), *(group.omega for group in groups)]))
     moving = omega[omega > 0]
     return moving if moving.size else np.ones(1)
 
 
 def _visible(groups: list[_Group], tol: float) -> list[_Group]:
-    """Return the groups whose share of the response around their own frequency exceeds rounding."""
+    """Return the groups whose contribution around their frequency exceeds rounding."""
     slowest = _frequencies(groups)[0]
     omega = [np.maximum(np.unique(group.omega), slowest) for group in groups]
     whole = sum(_gains(group.part, np.concatenate(omega), BESIDE) for group in groups)
@@ -224,7 +223,7 @@ def _visible(groups: list[_Group], tol: float) -> list[_Group]:
 
 
 def _gains(g: StateSpace, omega: FloatArray, beside: float) -> ComplexArray:
-    """Return the gains (n, p, m) at points ``(beside + j) omega``, right of the stability limit."""
+    """Return the gains (n, p, m) at points ``(beside + j) omega`` in the unstable half plane."""
     s = (beside + 1j) * omega
     s = np.exp(s * g.dt) if g.dt else s
     shifted = s[:, None, None] * np.eye(g.n_states) - g.A
@@ -232,7 +231,7 @@ def _gains(g: StateSpace, omega: FloatArray, beside: float) -> ComplexArray:
 
 
 def _equalisers(gains: FloatArray) -> FloatArray:
-    """Return what makes the largest gain of each input, then of each output, 1 (n, p, m)."""
+    """Return factors (n, p, m) that scale the largest gain of each input, then output, to 1."""
     columns = reciprocal(np.max(gains, axis=1, keepdims=True, initial=0.0))
     rows = reciprocal(np.max(gains * columns, axis=2, keepdims=True, initial=0.0))
     return np.asarray(rows * columns)
@@ -250,9 +249,10 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
     """Return a system without the balanced states of Hankel singular values below `tol`."""
     n = g.n_states
     if n == 1 or (n == 2 and np.any(np.linalg.eigvals(g.A).imag)):
-        return g  # one mode: all of it or nothing
+        return g  # a single mode is kept or removed
     judged = _stabilised(g)
-    # one size for all channels: what reaches the states from each input, what each output sees
+    # equal size of all channels: effect of each input on the states, and of the states on each
+    # output
     seen = observability_factor(judged)
     drive = reciprocal(np.linalg.norm(seen.T @ g.B, axis=0))
     judged = judged.replace(B=judged.B * drive)
@@ -274,8 +274,8 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
 
 def _stabilised(g: StateSpace) -> StateSpace:
     """Return the system with its poles moved together until it is stable: the same subspaces."""
-    # by the speed of the system: much farther out all poles look alike, and chains of integrators
-    # lose what zeros near them distinguish
+    # by the speed of the system: with a much larger shift all poles look equal, and zeros near
+    # chains of integrators are lost
     poles = g.poles()
     eye = np.eye(g.n_states)
     if g.dt:

@@ -18,7 +18,7 @@ from .statespace import StateSpace, System, as_statespace
 #: speed of a rigid-body pair, relative to A, below which it counts as zero
 RIGID = 1e-6
 #: relative distance of two poles, and sine of the angle between their eigenvectors, below which
-#: they share a block: apart, what each does would be a thousand times what both do together
+#: they share a block: separately, each contribution would be a thousand times their sum
 _PARALLEL = 1e-3
 #: largest accepted distance of the transformed A from the blocks, relative to A
 RESIDUAL = 1e-9
@@ -26,7 +26,7 @@ RESIDUAL = 1e-9
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalForm(Value):
-    """A system in modal blocks, or as it came when its eigenvectors do not allow them.
+    """A system in modal blocks, or unchanged when its eigenvectors do not allow blocks.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class ModalForm(Value):
     transformation : (n, n) array
         ``x = T x_modal``; the identity when `reason` is not empty.
     condition : float
-        Condition of the eigenvectors, states balanced: what rounding is multiplied with.
+        Condition number of the eigenvectors for balanced states, by which rounding grows.
     residual : float
-        Norm of what the blocks leave out of ``T^-1 A T``, relative to A, states balanced.
+        Norm of the part of ``T^-1 A T`` outside of the blocks, relative to A, for balanced states.
     reason : str
-        Why the dense form was kept; empty when the blocks were found.
+        Reason why the dense form was kept; empty if blocks were found.
 
     Examples
     --------
@@ -70,9 +70,10 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Any; a system that has 2 x 2 and 1 x 1 blocks on its diagonal alone comes back as it is.
+        Any system; one with only 2 x 2 and 1 x 1 diagonal blocks is returned unchanged.
     largest_condition : float
-        Condition of the eigenvectors; above it the system is kept as given, and `reason` says so.
+        Largest condition number of the eigenvectors; above it the system is returned unchanged with
+        a `reason`.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
 def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[int]]:
     """Return real eigenvectors (n, n), the block-diagonal A and its blocks, slow poles first."""
     eye = np.eye(A.shape[0])
-    # a slow mode is not a rigid-body one, however fast the others: rounding says which may be
+    # a slow mode is not a rigid-body mode, even beside fast modes: rounding decides which may be
     values, vectors, error = eigenvalues_with_error(A)
     near = np.abs(values - centre) <= error
     columns, parts = [np.zeros((A.shape[0], 0))], []
@@ -227,7 +228,7 @@ class StableSplit(Value):
     rest : StateSpace
         Rigid-body, marginal and unstable modes, strictly proper.
     separation : float
-        Norm of the decoupling transformation: how much rounding grows; 0 when A had blocks.
+        Norm of the decoupling transformation, by which rounding grows; 0 if A had blocks.
     """
 
     stable: StateSpace
@@ -247,9 +248,9 @@ def split_stable(sys: System) -> StableSplit:
 
     Where A is block diagonal and no block has poles of both kinds, its blocks are sorted, exactly.
     Otherwise by ordered Schur form ``[[A1, A12], [0, A2]]`` and the Sylvester equation
-    ``A1 X - X A2 + A12 = 0`` that removes A12; a pole nearer to the edge of stability than its
-    rounding (of A, times the condition of the eigenvalue) is not called stable, nor is any that
-    lies nearer than such a pole.
+    ``A1 X - X A2 + A12 = 0`` that removes A12; a pole closer to the stability limit than its
+    rounding (of A, times the condition number of the eigenvalue) does not count as stable, and
+    neither does any pole that is closer than such a pole.
 
     Parameters
     ----------
@@ -291,7 +292,7 @@ def split_stable(sys: System) -> StableSplit:
 
     try:
         T, Z, k = la.schur(A, sort=inside)
-    except la.LinAlgError as error:  # poles at the edge, which rounding moves across it
+    except la.LinAlgError as error:  # poles at the limit, which rounding moves across it
         raise _inseparable(g) from error
     if k == g.n_states:
         return StableSplit(g, part_of(g, np.zeros(k, dtype=bool)).replace(D=0 * g.D), 0.0)
@@ -310,7 +311,7 @@ def split_stable(sys: System) -> StableSplit:
 def _inseparable(g: StateSpace) -> SolverError:
     return SolverError(
         f"{g!r} cannot be split: its stable part and the rest share a pole to working precision. "
-        "Add damping, or reduce it in coordinates where the modes are apart."
+        "Add damping, or reduce it in coordinates in which the modes are separated."
     )
 
 

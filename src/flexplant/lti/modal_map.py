@@ -1,4 +1,4 @@
-"""The modes of a system as a map: its poles, what drives them and how they are seen."""
+"""The modal map of a system: poles, input and output vectors."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class ModalMap(NamedTuple):
 
     @classmethod
     def of_pairs(cls, pairs: FloatArray) -> ModalMap:
-        """Return that of separate blocks (b, 2, 2); T^-1 is not finite where one lacks a mode.
+        """Return the map of separate blocks (b, 2, 2); T^-1 is not finite for defective blocks.
 
         The poles are m +- r, m half the trace and ``r^2 I = (A - m I)^2`` (Cayley-Hamilton): their
-        damping is as exact as the block.
+        damping is as accurate as the block.
         """
         (a, e), (c, g) = pairs.transpose(1, 2, 0)
         mean, half = 0.5 * (a + g), 0.5 * (a - g)
@@ -85,7 +85,7 @@ def _times(factor: ComplexArray, columns: FloatArray | ComplexArray) -> ComplexA
 
 
 class Diagonal(NamedTuple):
-    """``C (s I - A)^-1 B = left (s I - diag(poles))^-1 right``; without where V is poor."""
+    """``C (s I - A)^-1 B = left (s I - diag(poles))^-1 right``; None for ill-conditioned V."""
 
     poles: ComplexArray
     left: ComplexArray | None = None
@@ -93,7 +93,7 @@ class Diagonal(NamedTuple):
 
 
 def diagonal_form(A: FloatArray, B: FloatArray, C: FloatArray) -> Diagonal:
-    """Return a system in the eigenvectors of A, its poles alone where these are ill-conditioned."""
+    """Return a system in the eigenvectors of A; only its poles where these are ill-conditioned."""
     if len(A) == 1:
         return Diagonal(*(part.astype(np.complex128) for part in (A[0], C, B)))
     d = state_scale(A, B, C)
@@ -123,15 +123,15 @@ def block_form(g: StateSpace) -> Diagonal | None:
     return Diagonal(own.poles, own.seen(C.reshape(-1, n)), own.driven(B.reshape(n, -1)))
 
 
-#: poles this close to the axis, relative to the size of A, are examined with their condition
+#: distance from the axis relative to the size of A below which the condition of a pole is examined
 NEAR = 1e-6
 
 
-#: roundings of A that a pole is allowed to have suffered
+#: number of roundings of A that a pole may contain
 ROUNDINGS = 4.0
 
 
-#: largest condition of a pole: two in one are moved by the root of rounding
+#: largest condition number of a pole: a double pole moves by the root of rounding
 DOUBLE = 1.0 / float(np.sqrt(np.finfo(float).eps))
 
 
@@ -145,11 +145,11 @@ class Obstacle(NamedTuple):
 def obstacle(
     g: StateSpace, *, axis_only: bool = False, known: ComplexArray | None = None
 ) -> Obstacle | None:
-    """Return the worst pole on or beyond the edge of stability (or on it alone), or None."""
-    # computed poles are moved by rounding: those of a rigid body in dense A come out at some 1e-4
-    # rad/s, on either side. A pole nearer to the edge than its own uncertainty (rounding of A times
-    # the condition of the eigenvalue) counts as lying on it. Eigenvalues that are known are not
-    # computed again
+    """Return the worst pole on or beyond the stability limit (or only on it), or None."""
+    # rounding moves computed poles: those of a rigid body in dense A have about 1e-4 rad/s with
+    # either sign. A pole closer to the limit than its uncertainty (rounding of A times the
+    # condition number of the eigenvalue) counts as lying on it. Known eigenvalues are not computed
+    # again
     if not g.n_states:
         return None
     poles, error = uncertain_poles(g, known)
@@ -177,7 +177,7 @@ def obstacle(
 def uncertain_poles(
     g: StateSpace, known: ComplexArray | None = None
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return the poles and how far rounding may have moved each."""
+    """Return the poles and the uncertainty of each by rounding."""
     poles = g.poles() if known is None else known
     if g.blocks is not None and max(g.blocks) <= 2:
         return poles, np.zeros(poles.size)  # closed form: as exact as A
@@ -197,8 +197,9 @@ def uncertain_poles(
 def eigenvalues_with_error(
     A: FloatArray, largest: float = DOUBLE
 ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return eigenvalues, eigenvectors and how far rounding may have moved each eigenvalue."""
-    # in LAPACK's own units of A, in which blocks of unlike speed do not spoil each other
+    """Return eigenvalues, eigenvectors and the uncertainty of each eigenvalue by rounding."""
+    # in the units of LAPACK's balancing, in which blocks of different speed do not affect each
+    # other
     found: Any = la.eig(A, left=True, right=True)
     values, left, right = found
     d = even_scale(A)[:, None]

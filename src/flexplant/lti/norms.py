@@ -1,4 +1,4 @@
-"""H-infinity and L-infinity norms: peaks of the gain, and the proof that nothing is above."""
+"""H-infinity and L-infinity norms: peaks of the gain with a proof of the maximum."""
 
 from __future__ import annotations
 
@@ -32,9 +32,10 @@ AGREEMENT = 1e-9
 def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     """Return the H-infinity norm: the largest gain over all frequencies and input directions.
 
-    Relative accuracy 1e-8, or ``eps |A| / |Re p|`` where that is larger, p the pole of the peak:
-    rounding moves the poles of a dense A by eps |A|. It counts at damping ratios below 1e-8, and
-    not in modal blocks, as `modal_form` and assembled plants have them. See `peak_gain`.
+    The relative accuracy is 1e-8, or ``eps |A| / |Re p|`` where that is larger, with the pole p of
+    the peak: rounding moves the poles of a dense A by eps |A|. This matters for damping ratios
+    below 1e-8, but not in modal blocks, which `modal_form` and assembled plants have. See
+    `peak_gain`.
 
     Parameters
     ----------
@@ -68,32 +69,32 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
 def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, float]:
     """Return the largest gain over all frequencies, and the frequency of the peak.
 
-    Newton's steps lead from the resonances to a peak. That no frequency exceeds it by 1e-9 is
-    proved on intervals: by the series of ``D + sum R_i / (s - p_i)``, whose rest is bounded by the
-    distances to the poles. Where the eigenvectors of A are poor or the gain is flat, a
-    level set does it: the Hamiltonian matrix of that level has no eigenvalue on the imaginary axis.
-    Sampled systems go through the bilinear map, which keeps gains.
+    Newton's steps lead from the resonances to a peak. A proof on intervals shows that no frequency
+    exceeds it by 1e-9: it uses the series of ``D + sum R_i / (s - p_i)``, whose remainder is
+    bounded by the distances to the poles. Where the eigenvectors of A are ill-conditioned or the
+    gain is flat, a level set takes its place: the Hamiltonian matrix of that level has no
+    eigenvalue on the imaginary axis. Sampled systems go through the bilinear map, which keeps
+    gains.
 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled, any numbers of channels.
     progress : bool, optional
-        True shows a bar of the search and its levels at once, False never; None after two seconds
-        on a terminal.
+        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
 
     Returns
     -------
     gain : float
         Largest singular value; infinite when the system is not strictly stable.
     freq : float [Hz]
-        Where it is found; of the least stable pole when the gain is infinite; infinite when the
-        peak is the feedthrough.
+        Frequency of the peak; that of the least stable pole when the gain is infinite; infinite
+        when the peak is the feedthrough.
 
     Raises
     ------
     SolverError
-        When the level set does not settle (not seen so far).
+        When the level set does not converge.
 
     References
     ----------
@@ -130,7 +131,7 @@ def linf_norm(sys: System) -> float:
     Raises
     ------
     SolverError
-        When the level set does not settle.
+        When the level set does not converge.
 
     Examples
     --------
@@ -158,7 +159,7 @@ def _peak_gain(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[f
 
 
 def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None:
-    """Return the peak that residues prove, None where they do not or are not those of g."""
+    """Return the peak proved from residues, None where there is no proof."""
     if model is None or not model.poles.size:
         return None
     found = proved_peak(model, TOLERANCE)
@@ -179,8 +180,8 @@ def _gain_at(g: StateSpace, freq: float) -> float:
     return float(np.linalg.norm((g.C * d) @ np.linalg.solve(shifted, g.B / d[:, None]) + g.D, 2))
 
 
-#: relative tolerance of the squares of the H2 norm by both Gramians: five digits, as many as the
-#: certificate of `design_h2` holds; or, where that is larger, rounding of their terms
+#: relative tolerance of the squared H2 norms from both Gramians: five digits, as in the certificate
+#: of `design_h2`; or, if larger, the rounding of their terms
 _SAME_NORM, ROUNDING = 1e-5, 1e-13
 
 
@@ -229,7 +230,7 @@ def h2_norm(sys: System) -> float:
     if is_block_diagonal(g):
         square, terms = _trace(g.C, controllability_gramian(g))
         other, their = _trace(g.B.T, observability_gramian(g))
-    else:  # by factors: slow poles next to fast ones cost the Gramians themselves half their digits
+    else:  # by factors: with slow poles next to fast ones the Gramians lose half of their digits
         square, terms = _trace_of_factor(g.C, controllability_factor(g))
         other, their = _trace_of_factor(g.B.T, observability_factor(g))
     direct = float(np.sum(g.D**2)) if g.dt else 0.0
@@ -255,17 +256,17 @@ def _trace_of_factor(C: FloatArray, L: FloatArray) -> tuple[float, float]:
     return float(np.sum((C @ L) ** 2)), float(np.sum(deviation**2))
 
 
-LEVELS = 30  # each squares the error: what needs more is rounding
-#: how far above the largest gain of the feedthrough a level set is not lost in rounding
+LEVELS = 30  # each step squares the error, so that more steps mean rounding
+#: relative distance of a level above the gain of the feedthrough at which rounding does not matter
 CLEAR = 1e-7
-#: of the sweep before the level sets, which are the judge
+#: tolerance of the sweep before the level sets, which decide
 _POINTS, _ROUNDS = 200, 6
 
 
 def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[float, float]:
     """Return the largest gain and its frequency [Hz] of a system without poles on the axis."""
-    # from the middles of the crossings of its level, until none is left at (1 + tolerance) times
-    # it
+    # from the midpoints between crossings of its level, until no crossing remains at (1 +
+    # tolerance) times it
     top = 0.5 / g.dt if g.dt else np.inf
     respond = responder(g)
 
@@ -290,7 +291,7 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
         best = int(np.argmax(sizes))
         gain, freq = float(sizes[best]), float(middles[best])
     raise SolverError(
-        f"the level set of the H-infinity norm of {g!r} did not settle in {LEVELS} levels (last "
+        f"the level set of the H-infinity norm of {g!r} did not converge in {LEVELS} levels (last "
         f"gain {gain:.9g} at {freq:.6g} Hz). Report this system."
     )
 
@@ -298,7 +299,7 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
 def _swept_peak(
     g: StateSpace, find: Callable[[FloatArray], FloatArray], top: float
 ) -> tuple[float, float]:
-    """Return the largest gain that a sweep finds, that of the feedthrough too, and where [Hz]."""
+    """Return the largest gain of a sweep, including the feedthrough, and its frequency [Hz]."""
     grid = np.append(0.0, resonance_grid(g.poles(), g.dt, points=_POINTS, around=SOUGHT))
     through = np.linalg.norm(g.evaluated(-1.0) if g.dt else g.D, 2)
     return max((float(through), top), highest(find, grid, _ROUNDS))

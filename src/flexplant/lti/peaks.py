@@ -1,4 +1,4 @@
-"""The largest gain over all frequencies, proved by intervals: no eigenvalue problem."""
+"""The largest gain over all frequencies, proved on intervals without an eigenvalue problem."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from ..tolerances import divisor
 from .modal_map import block_form, diagonal_form
 from .statespace import StateSpace
 
-#: peaks that are climbed: how many, and their least part of the largest gain seen
+#: largest number of refined peaks, and their least fraction of the largest gain
 PEAKS, PART = 5, 0.7
-#: steps of Newton, and how far from it [distance to the nearest pole] a peak may be left
+#: number of Newton steps, and largest remaining distance from a peak [distance to the nearest pole]
 STEPS, SETTLED = 12, 1e-5
-#: an interval is examined by its series once its radius is such a part of the distance to the
-#: poles
+#: radius of an interval, relative to the distance to the poles, below which its series is used
 NEAR = 0.6
-#: where it is cut when that does not suffice, from -1 to 1: finer towards its ends
+#: points from -1 to 1 at which an interval is divided otherwise: finer towards its ends
 CUTS = np.array([-1.0, -0.9, -0.4, 0.4, 0.9, 1.0])
 MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
-#: relative: levels so close to the gain of the feedthrough are not examined
+#: relative distance from the gain of the feedthrough below which levels are not examined
 CLEAR = 1e-6
-#: entries of the largest arrays: intervals at a time, times poles or channels
+#: number of entries of the largest arrays: intervals times poles or channels
 CHUNK = 1_000_000
-#: relative: eigenvalues so close to the largest are taken together with it
+#: relative distance from the largest eigenvalue below which eigenvalues are treated together with
+#: it
 TOGETHER = 1e-6
 #: radii tried around a peak, in distances to the nearest pole
 ZONES = np.array([0.4, 0.3, 0.2, 0.1, 0.03, 0.01])
@@ -114,7 +114,7 @@ def newton_maxima(model: Residues, start: FloatArray, tolerance: float) -> Peaks
             break
         keep = height >= PART * height.max()
         omega = np.abs(omega + move)[keep]
-    else:  # the last step has moved or left out points: what belongs to those that stay
+    else:  # the last step has moved or removed points: compute again for the remaining ones
         one, near = _expansion(model, omega), model.nearest(omega)
         height = one.values[:, 0]
     return Peaks(omega, np.sqrt(height), _zone_radii(model, omega, near, one, tolerance))
@@ -150,7 +150,7 @@ def _zone_radii(
 
 def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     """Return frequencies at which the gain is above a level, empty when proven not to exist."""
-    # None: undecided, at as much work as an eigenvalue problem
+    # None: undecided after as much work as an eigenvalue problem
     through = float(np.linalg.norm(model.through, 2))
     if not level > through * (1.0 + CLEAR):
         return None
@@ -179,8 +179,7 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
 
 def _intervals_left(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, FloatArray]:
     """Return centres and radii of intervals outside the peaks' zones, from zero to an end."""
-    # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|) is less than what the level leaves
-    # room for
+    # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|) is below the distance to the level
     speed = float(np.abs(model.poles).max())
     end = 1.001 * speed + 2.0 * float(model.sizes.sum()) / room
     beyond = 1.001 * speed * 4.0 ** np.arange(1 + int(np.log2(end / speed)) // 2)
@@ -217,9 +216,9 @@ def _largest(X: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
 
 
-#: a distance that counts as none: its cube divides without overflow
+#: smallest distance, whose inverse cube does not overflow
 NONE = 1e-100
-#: entries of all residues from which on they are not formed
+#: largest number of entries of all residues that are formed
 LARGEST = 5_000_000
 
 
@@ -270,8 +269,8 @@ class Residues(NamedTuple):
     def rest(self, omega: FloatArray, radius: FloatArray, order: int) -> FloatArray:
         """Return a bound on ``|sum_(k > order) T_k d^k| / radius^(order + 1)`` for |d| <= radius.
 
-        Of each pole at the distance a: a geometric series, ``1 / (a^(order+1) (a - radius))``;
-        next to infinite where a pole is closer than the radius.
+        Each pole at the distance a contributes a geometric series,
+        ``1 / (a^(order+1) (a - radius))``; nearly infinite where a pole is closer than the radius.
         """
         total = np.zeros(omega.size)
         for apart in self.apart(omega):
@@ -292,8 +291,8 @@ class Residues(NamedTuple):
 def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``."""
     # block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
-    # are poor or too many, or a pole lies at z = -1. Beside them the eigenvalues of A where they
-    # were computed
+    # are ill-conditioned or too many, or a pole lies at z = -1. Also returns the eigenvalues of A
+    # where they were computed
     if g.n_states * g.D.size > LARGEST:
         return None, None
     closed = block_form(g)

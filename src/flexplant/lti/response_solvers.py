@@ -19,7 +19,7 @@ from .statespace import StateSpace
 
 #: number of complex numbers in less than 128 kB
 SMALL = 7000
-#: where a system keeps what was prepared: it is often swept again and again
+#: attribute with the prepared function of a system, which is often swept several times
 _KEPT = "_responder"
 
 #: the responses (p, m, n_freq) at frequencies [Hz]
@@ -84,7 +84,8 @@ def points(g: StateSpace | Part, freq: FloatArray) -> ComplexArray:
 
 
 def _finite(out: ComplexArray, freq: FloatArray) -> ComplexArray:
-    # the sum is infinite or NaN when an entry is; it may also overflow, which the entries decide
+    # the sum is infinite or NaN when an entry is; it may also overflow, so that the entries are
+    # checked
     with np.errstate(invalid="ignore", over="ignore"):
         suspect = not np.isfinite(out.sum())
     if suspect and (bad := ~np.isfinite(out).all(axis=(0, 1))).any():
@@ -106,7 +107,7 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
 
 
 def _solver(g: Part) -> tuple[Solver, int, int]:
-    """Return what solves, how many frequencies at a time, times states, and least parts of a grid.
+    """Return a solver, its number of frequencies together times states, and least parts of a grid.
 
     The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
     """
@@ -148,7 +149,7 @@ def _modal(g: Part) -> Solver:
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
         y = s.imag
-        # on the imaginary axis a mode's x is one number: what stays (b, 1) costs nothing
+        # on the imaginary axis x of a mode is one number; arrays (b, 1) cost nothing
         x = s.real - mean[:, None] if g.dt else -mean[:, None]
         functions = np.empty((residues.shape[1], s.size, 2))
         real_part = (swing[:, None] - y) * (swing[:, None] + y)
@@ -174,7 +175,7 @@ def _modal(g: Part) -> Solver:
 
 
 def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
-    """Return which columns are not zero; all of them as a slice, which copies nothing."""
+    """Return the columns that are not zero; a slice without a copy if these are all."""
     some = np.any(residues, axis=0)
     return slice(None) if some.all() else some
 
@@ -218,7 +219,7 @@ def _among_others(g: Part, first: int, end: int, blocks: Sequence[int]) -> Solve
 
 #: entries of the largest intermediate array of a back substitution (complex): it stays in cache
 CHUNK = 400_000
-#: functions of frequency at a time, and least parts of a grid, where poles are known
+#: number of frequencies together, and least parts of a grid, where poles are known
 MODAL_CHUNK, PARTS = 19_200, 7
 #: rows of a back substitution that are solved together
 ROWS = 32

@@ -42,7 +42,7 @@ from .lyapunov import stein_root, triangular
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RiccatiSolution(Value):
-    """The stabilising solution of a Riccati equation, with what was checked about it.
+    """The stabilising solution of a Riccati equation, with its checks.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def filter_dare(
     Parameters
     ----------
     A : (n, n) array
-        May have eigenvalues on and outside the unit circle.
+        State matrix; eigenvalues on and outside the unit circle are allowed.
     C : (p, n) array
         Outputs.
     Q : (n, n) array
@@ -112,10 +112,10 @@ def filter_dare(
     Raises
     ------
     ShapeError, ModelError
-        For bad sizes, entries that are not finite, a singular R.
+        For wrong sizes, entries that are not finite, or a singular R.
     SolverError
         When no strictly stabilising solution exists (a mode on the unit circle that Q does not
-        excite, an unstable one that C does not see) or the residual stays bad.
+        excite, an unstable one that C does not see) or the residual stays too large.
 
     References
     ----------
@@ -137,8 +137,8 @@ def filter_care(
     """Return the stabilising solution of the continuous filter Riccati equation.
 
     ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by the stable subspace of the Hamiltonian
-    in scaled states; where that has eigenvalues on the axis but for rounding (poles 1e-12 of the
-    fastest), by a Cayley transform to the doubling of `filter_dare`. Newton steps follow.
+    in scaled states; where that has eigenvalues on the axis within rounding (poles of 1e-12 times
+    the fastest), by a Cayley transform to the doubling of `filter_dare`. Newton steps follow.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def control_dare(
     Parameters
     ----------
     A : (n, n) array
-        May have eigenvalues that are not stable.
+        State matrix; unstable eigenvalues are allowed.
     B : (n, m) array
         Inputs.
     Q : (n, n) array
@@ -279,13 +279,13 @@ def _riccati_problem(
 
 #: largest accepted relative residual, and last Newton correction, in states of unit variance
 RESIDUAL, CORRECTION = 1e-9, 1e-7
-#: relative: a correction that the next one would square to below rounding ends Newton's steps;
-#: they double the digits, so that ten are more than a solution from the doubling can need
+#: relative correction at which Newton's steps end, since the next one would be below rounding;
+#: largest number of steps, which double the digits each time
 SETTLED, NEWTON_STEPS = 1e-11, 10
 
 
-#: relative: a closed loop that decays in over a hundred steps (or periods) is examined for modes
-#: that only rounding stabilises; a pole, or a singular value, that is undamped but for rounding
+#: relative decay per step (or period) below which a closed loop is examined for modes that only
+#: rounding stabilises; relative size of a pole or singular value that counts as undamped
 SLOW, EDGE = 0.01, 1e-9
 
 
@@ -296,18 +296,18 @@ class RiccatiProblem(NamedTuple):
     C: FloatArray
     Q: FloatArray
     J: FloatArray  # (p,) of +1 and -1
-    gain: FloatArray  # (n, p), what the cross term adds to the gain
+    gain: FloatArray  # (n, p), contribution of the cross term to the gain
     whitening: FloatArray  # (p, p), whitened y = whitening y
     discrete: bool
 
     @property
     def G(self) -> FloatArray:
-        """Return ``C' J C``, the information that one measurement brings."""
+        """Return ``C' J C``, the information of one measurement."""
         return np.asarray((self.C.T * self.J) @ self.C)
 
     @property
     def whole(self) -> FloatArray:
-        """Return Q with what the cross term took from it."""
+        """Return Q without the part of the cross term."""
         return np.asarray(self.Q + (self.gain * self.J) @ self.gain.T)
 
     def scaled(self, d: FloatArray) -> RiccatiProblem:
@@ -321,7 +321,7 @@ class RiccatiProblem(NamedTuple):
 
 
 def _growth(p: RiccatiProblem, poles: ComplexArray) -> FloatArray:
-    """Return by how much poles lie beyond the limit of stability."""
+    """Return the distance of poles beyond the stability limit."""
     return np.asarray(np.abs(poles) - 1.0 if p.discrete else poles.real)
 
 
@@ -396,8 +396,8 @@ def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
-    # the subspace solves unstable modes that no noise moves; the doubling poles 1e-12 of the
-    # fastest, which the Schur form of all states puts on the axis
+    # the subspace method solves unstable modes without noise; doubling solves poles of 1e-12 times
+    # the fastest, which the Schur form of all states puts on the axis
     refusals: list[Exception] = []
     for way in (_by_doubling,) if problem.discrete else (_by_subspace, _by_doubling):
         try:
@@ -412,9 +412,9 @@ def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
 def _solution(
     problem: RiccatiProblem, P: FloatArray, d: FloatArray, doublings: int
 ) -> RiccatiSolution:
-    """Return the solution that Newton's steps find from a start, checked."""
+    """Return the checked solution of Newton's steps from a start."""
     first = problem.scaled(d)
-    # to unit variances: there residual and correction are relative
+    # scaled to unit variances, so that residual and correction are relative
     unit = scale_of(np.abs(P.diagonal()))
     d, P = d * unit, P / unit / unit[:, None]
     scaled = problem.scaled(d)
@@ -427,7 +427,7 @@ def _solution(
             f"{'' if stable else 'not '}strictly stable. The problem is too badly "
             "conditioned for double precision."
         )
-    # noise that misses a rigid-body mode but for rounding gives a slow, meaningless loop
+    # noise that excites a rigid-body mode only by rounding gives a slow, meaningless loop
     size = 1.0 if first.discrete else float(np.max(np.abs(poles)))
     if np.max(_growth(first, poles)) > -SLOW * size and (reason := _defect(first)):
         raise SolverError(reason)
@@ -442,7 +442,7 @@ def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, f
         K = _riccati_gain(p, P)
         change = correction(p.A - K @ p.C, _residual(p, P, K)[0])
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
-        # far from the solution the second step may be the larger one: the first one is arbitrary
+        # far from the solution the second step may be larger, since the first one is arbitrary
         if size < last or last > CORRECTION:
             P = symmetrised(P + change)
         if size < SETTLED or (size >= 0.5 * last and last < CORRECTION):
@@ -499,21 +499,20 @@ def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
     if np.any(spread == 0):
         return int(np.count_nonzero(spread == 0))
     values = la.eigvalsh(form / spread / spread[:, None])
-    # as a covariance: 3e-7 of an amplitude; below that it is rounding
+    # as a covariance: 3e-7 of an amplitude; smaller values are rounding
     return int(np.count_nonzero(np.abs(values) < RANK))
 
 
-#: relative, of a standard deviation: Newton's next step would square it; and where the gain's own
-#: rounding lets no step go below, the most that is accepted: of 12 such filters at 3e-4, of states
-#: that the POIs hardly show, 8 were within 1e-6 of the optimum
+#: relative change of a standard deviation at which Newton's steps end; and largest accepted change
+#: where rounding of the gain prevents smaller ones: of 12 such filters at 3e-4, 8 were within 1e-6
+#: of the optimum
 _SETTLED_ROOT, _STALLED = 1e-9, 3e-4
-#: steps in a row that do not halve the least change: some come before the quadratic ones
+#: number of consecutive steps that need not halve the least change, before quadratic convergence
 _STALLS = 6
-#: Newton's steps: from a start with 1e8 times the noise it took 20, the last four of them
-#: quadratic
+#: largest number of Newton steps: from a start with 1e8 times the noise 20 were needed
 STEPS = 60
-#: powers of ten by which sensors have more noise, relative to their motion in a sample and to
-#: their own noise: from rounding to a million times as much
+#: range of added sensor noise in decades, relative to the motion in a sample and to their own
+#: noise: from rounding to a factor of a million
 DECADES = (-16, 7)
 
 
@@ -548,8 +547,8 @@ def _measured(
 
 def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiRoot:
     """Return the stationary filter, by Newton's steps from that of noisier sensors."""
-    # in square roots `P = L L'`, twice the digits of P: little noise next to much motion leaves P
-    # with directions that are 1e-16 of others, below its rounding, and yet the gain hangs on them
+    # in square roots `P = L L'`, twice the digits of P: with little noise and large motion P has
+    # directions of 1e-16 relative to others, below its rounding, and the gain depends on them
     start = _noisier(A, C, G, H)
     d = scale_of(np.abs(start.P.diagonal()))
     found = _newton_in_roots(A * d / d[:, None], C * d, G / d[:, None], H, start.gain / d[:, None])
@@ -557,7 +556,7 @@ def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> 
 
 
 def _noisier(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiSolution:
-    """Return the filter for the least noise that sensors have in addition, in decades, with one."""
+    """Return the filter for the least added sensor noise, in decades, for which one is found."""
     why: Exception | None = None
     R, moved = H @ H.T, C @ G
     reach = np.diag(R) + np.sum(moved**2, axis=1)
@@ -572,7 +571,7 @@ def _noisier(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> Ricc
 def _newton_in_roots(
     A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray, K: FloatArray
 ) -> RiccatiRoot:
-    """Improve a stable gain: the error that it has, then the gain best for it [Hewer1971]_."""
+    """Improve a stable gain: compute its error, then the best gain for this error [Hewer1971]_."""
     last, least, stalls = np.zeros(A.shape[0]), np.inf, 0
     for taken in range(1, STEPS + 1):
         closed = A - K @ C
@@ -587,6 +586,6 @@ def _newton_in_roots(
             return RiccatiRoot(L, K, X, change, taken)
         last, least = size, min(least, change)
     raise SolverError(
-        f"the filter is not settled in {STEPS} steps of Newton in square roots: a standard "
+        f"the filter did not converge in {STEPS} steps of Newton in square roots: a standard "
         f"deviation still changes by {change:.1e} of it."
     )

@@ -1,4 +1,4 @@
-"""Zero-order hold: exact, with delays of channels and noise, at a rate that is judged."""
+"""Exact zero-order hold with delays of channels and noise, and a check of the rate."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def discretized(
     """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
 
     ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; exact, also for
-    delays that are no multiple of h. Where A is block diagonal each block is done in closed form.
+    delays that are not a multiple of h. Where A is block diagonal each block has a closed form.
 
     Parameters
     ----------
@@ -34,10 +34,10 @@ def discretized(
         A continuous system.
     rate : float [Hz]
     delay : float [samples]
-        From the sampling of an input to its arrival; its integer part adds that many states per
-        delayed input, a fraction one more.
+        Delay of the inputs; its integer part adds this number of states per delayed input, and a
+        fraction adds one more.
     delayed : iterable of str, optional
-        The inputs that are delayed; all when not given.
+        Delayed inputs; all by default.
 
     Returns
     -------
@@ -53,8 +53,8 @@ def discretized(
     Warns
     -----
     FlexplantWarning
-        When all modes lie above half the rate, or a delay is shorter than 0.01 samples: the unit
-        is probably another one.
+        When all modes lie above half the rate, or a delay is shorter than 0.01 samples: it is
+        probably given in the wrong unit.
 
     References
     ----------
@@ -97,14 +97,14 @@ HeldFlow: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
 
 
 class Late(NamedTuple):
-    """A delay per channel: whole samples, and a fraction of one in seconds."""
+    """Delay of each channel: integer number of samples, and a fraction of a sample in seconds."""
 
     whole: IntArray
     fraction: FloatArray
 
     @classmethod
     def of(cls, names: Sequence[str], delays: Mapping[str, float], h: float) -> Late:
-        """Split delays [s] at a sampling time; what is whole to rounding is whole."""
+        """Split delays [s] at a sampling time; values within rounding of integers are integers."""
         samples = np.array([delays.get(name, 0.0) for name in names]) / h
         near = np.round(samples)
         samples = np.where(np.abs(samples - near) < SAME * np.maximum(near, 1.0), near, samples)
@@ -113,7 +113,7 @@ class Late(NamedTuple):
 
     @property
     def length(self) -> IntArray:
-        """Samples of an input that must be remembered."""
+        """Number of past samples of an input that are states."""
         return self.whole + (self.fraction > 0)
 
 
@@ -130,8 +130,8 @@ def sample_and_hold(
     """
     # x(k h + t) = E(t) x[k] + N(t) u[k - m] + O(t) u[k - m - 1]: an input that is (m h + f) late is
     # the new sample for the last t - f and the old one before that. A late output is the motion at
-    # its own instant between samples, a state of its own; its noise is the part of the same noise
-    # that has acted until then
+    # an instant between samples and a separate state; its noise is the part of the same noise that
+    # has acted until then
     h = 1.0 / rate
     inputs = Late.of(g.inputs, late_inputs, h)
     outputs = Late.of(g.outputs, late_outputs or {}, h)
@@ -140,7 +140,7 @@ def sample_and_hold(
     layout = _Layout(g, inputs, outputs)
     n, first = g.n_states, layout.first
     states = slice(first, first + n)
-    alone = not n or uncoupled_pairs(g.A) is not None  # in closed form in any units
+    alone = not n or uncoupled_pairs(g.A) is not None  # closed form, independent of units
     units = np.ones(n) if alone else state_scale(g.A, g.B, g.C)
     held = _held_flow(g, units)
     A = np.zeros((layout.size, layout.size))
@@ -179,7 +179,7 @@ def sample_and_hold(
 
 
 class _Layout:
-    """Where the states are: late outputs, then those of the system, then late inputs."""
+    """Order of the states: late outputs, then the system, then late inputs."""
 
     def __init__(self, g: StateSpace, inputs: Late, outputs: Late) -> None:
         self.inputs, self.outputs = inputs, outputs
@@ -250,8 +250,9 @@ def _acting_sample(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, F
 def reaches_at_once(noise: str, output: str) -> AssumptionError:
     """Return the error of white noise of which a sensor takes single samples."""
     return AssumptionError(
-        f"white noise of {noise!r} reaches {output!r} at once (an acceleration, say), so that a "
-        "sample of it would have infinite variance. Measure displacement or velocity, give the "
+        f"white noise of {noise!r} reaches {output!r} without delay (for example an "
+        "acceleration), so that a sample of it would have infinite variance. Measure "
+        "displacement or velocity, give the "
         "sensor dynamics that roll off, or shape the noise or hold it over each sample (held=True)."
     )
 
@@ -295,12 +296,12 @@ def _sampled_noise(
 
 
 class Flow:
-    """``e^(A t)``, exactly 0 where a state does not act on another, in states of the given units.
+    """``e^(A t)`` in given units of the states, exactly 0 where a state does not act on another.
 
-    Modes that do not see each other, among others that see them (head: sensors) and drive them
-    (tail: amplifiers, inputs): e^(A t) is a sum over modes of exponentials of the size of head,
-    mode and tail, O(n) for n modes instead of O(n^3), and the modes' own blocks in closed form,
-    rigid-body ones exact. Where there are no such modes it is the exponential of the whole.
+    Uncoupled modes lie between states that see them (head: sensors) and drive them (tail:
+    amplifiers, inputs). Then e^(A t) is a sum over modes of small exponentials of head, mode and
+    tail, O(n) for n modes instead of O(n^3), and the blocks of modes have a closed form, which is
+    exact for rigid-body modes. Without such modes it is the exponential of the whole matrix.
     """
 
     def __init__(self, A: FloatArray, blocks: Sequence[int] | None, units: FloatArray) -> None:
@@ -308,7 +309,7 @@ class Flow:
         self.A = A = A * units / units[:, None]
         self.rate = float(np.linalg.norm(A, 1)) if n else 0.0
         h, end, own = uncoupled_run(A, blocks or ())
-        #: the tail stands still and no state but modes sees it: inputs that are held
+        #: the tail is constant and only modes see it: held inputs
         self.still = not h and not A[end:].any()
         self.modal = end > h and (self.still or 2 * (end - h) >= n)
         if not self.modal:
@@ -318,7 +319,8 @@ class Flow:
             self.rate = float(np.abs(block_eigenvalues(A, own)).max())
         pairs, slots = diagonal_blocks(A[h:end, h:end], own)
         self.pairs, self.h, self.t = pairs, h, n - end
-        #: the two states of each mode; what one of one state lacks is behind all others
+        #: the two states of each mode; the missing state of a mode with one state comes after all
+        #: others
         self.at_modes = at = np.where(slots < 0, n, slots + h)
         wide = np.pad(A, ((0, 1), (0, 1)))
         self.entering = wide[at][:, :, end:n]
@@ -367,7 +369,7 @@ def _held_flow(g: StateSpace, units: FloatArray) -> HeldFlow:
     n, m = g.B.shape
     grown = np.pad(g.A, (0, m))
     grown[:n, n:] = g.B
-    # inputs no larger than the rates: large units would make expm square too often
+    # inputs not larger than the rates: large units would cause too many squarings in expm
     rate = float(np.abs(g.A * units / units[:, None]).max(initial=TINY))
     drive = float(np.abs(g.B / units[:, None]).max(initial=rate))
     both = np.append(units, np.full(m, np.exp2(np.floor(np.log2(rate / drive)))))
@@ -381,7 +383,7 @@ def _held_flow(g: StateSpace, units: FloatArray) -> HeldFlow:
 
 
 def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
+    """Return which states (n, n) act on which: entries of the exponential that may be non-zero."""
     reached = direct | np.eye(direct.shape[0], dtype=bool)
     while True:
         wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
@@ -391,7 +393,7 @@ def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
-    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
+    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A has other entries."""
     b, odd = divmod(len(A), 2)
     if odd:
         return None
@@ -401,11 +403,11 @@ def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
 
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
-    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
-    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
-    # pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
-    # by `I(2 t) = I(t) + e^(A t) I(t)`: no division by small frequencies. There both states of a
-    # pair have units in which they are of one size, so that s is small
+    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so `e^(A h) = e^(m h)
+    # (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating pair, linear in h
+    # for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled by `I(2 t) = I(t) +
+    # e^(A t) I(t)`: no division by small frequencies. Both states of a pair are scaled to equal
+    # size, so that s is small
     given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
     pairs[:, 0, 1] /= units
     pairs[:, 1, 0] *= units
@@ -435,9 +437,9 @@ def _even_units(pairs: FloatArray) -> FloatArray:
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
-    # an overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
-    # its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
-    # the determinant over the larger, which keeps the digits that m +- r would cancel
+    # an overdamped pair has poles m +- r, whose exponentials are formed separately: cosh(r h)
+    # overflows long before the product with the decay e^(m h). The smaller of the two poles is the
+    # determinant over the larger, which keeps the digits that m +- r would cancel
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs - mean[:, None, None] * np.eye(2)
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
@@ -465,13 +467,15 @@ def accumulated_noise(
     at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
 ) -> FloatArray:
     """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
-    # Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
-    # rounding give less than n columns, as for a large structure with few forces. Else over a piece
-    # so short that ten nodes are exact, then `G(2 t) = [G(t), e^(A t) G(t)]`: log2(time rate)
-    # steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
-    # any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models
+    # Gauss-Legendre quadrature. It covers the whole interval where the number of nodes for rounding
+    # accuracy gives less than n columns, as for a large structure with few forces. Otherwise it
+    # covers an interval so short that ten nodes are exact, followed by `G(2 t) = [G(t), e^(A t)
+    # G(t)]`: log2(time rate) steps, for modes of any speed. These are sums of squares, so that G G'
+    # is positive semidefinite in any units, unlike the block exponential of [VanLoan1978]_ on large
+    # models
     n, m = force.shape
-    # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
+    # the error is a Bessel function of order 2 count and argument |A| time, which is negligible
+    # beyond
     size = min(rate * time, 2.0 * n)
     count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
     if count * m >= n:
@@ -488,21 +492,21 @@ def accumulated_noise(
     return G
 
 
-#: delay in samples below which it is probably given in seconds: it changes no result
+#: delay in samples below which it has no effect and is probably given in seconds
 _NO_DELAY = 0.01
-#: longest delay in samples, of a loop or a port: each sample is a state of each channel
+#: longest delay in samples of a loop or a port: each sample is a state of each channel
 _LONGEST = 1000.0
-#: damping ratio up to which a pole is a mode, not a filter
+#: largest damping ratio of a mode; poles with more damping are filters
 _LIGHT = 0.3
 
 
 def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
-    """Check a sampling rate [Hz] and a delay [samples]; warn where the unit is probably another."""
+    """Check a sampling rate [Hz] and a delay [samples]; warn of a probably wrong unit."""
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
     if 0 < delay < _NO_DELAY:
         warn(
-            f"delay={delay:g} is in samples, {delay / rate:.3g} s, and changes next to nothing. "
-            f"If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
+            f"delay={delay:g} is in samples, {delay / rate:.3g} s, and has almost no effect. If "
+            f"{delay:g} s is meant, pass delay={delay * rate:.4g} at {rate:g} Hz."
         )
     _check_length("delay", delay, rate)
     if modes.size and modes.min() > 0.5 * rate:
@@ -511,8 +515,8 @@ def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
         other = other or f"{rate:g} s as a sampling period is rate={1 / rate:g}"
         warn(
             f"all {modes.size} elastic modes, {lowest:.4g} Hz and above, lie above half the "
-            f"sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The rate "
-            f"is in Hz and the model in SI units; {other}."
+            f"sampling rate ({0.5 * rate:g} Hz): in its samples they appear as slow modes. The "
+            f"rate is in Hz and the model in SI units; {other}."
         )
 
 

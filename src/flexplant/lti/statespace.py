@@ -1,4 +1,4 @@
-"""The one LTI type: labelled, frozen, and aware of the blocks that a structure gives its A."""
+"""The LTI type: labelled, immutable, and with the block structure of A from modes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scipy import signal
 
 
-#: what functions of systems accept: ours, or one of python-control or SciPy
+#: types that functions of systems accept: StateSpace, or systems of python-control or SciPy
 System: TypeAlias = "StateSpace | control.StateSpace | control.TransferFunction | signal.lti"
 
 
@@ -184,7 +184,7 @@ class StateSpace(Value):
             inputs=[self.inputs[i] for i in cols],
             outputs=[self.outputs[i] for i in rows],
         )
-        if "_poles" in self.__dict__:  # they stay
+        if "_poles" in self.__dict__:  # the poles do not change
             chosen.__dict__["_poles"] = self._poles
         return chosen
 
@@ -208,7 +208,7 @@ class StateSpace(Value):
 
     def __add__(self, other: Any) -> StateSpace:
         """Return `parallel(self, other)`: same channels, outputs added; a number adds to D."""
-        if isinstance(other, Mapping):  # an Frf, which is computed line by line
+        if isinstance(other, Mapping):  # an Frf, which combines line by line
             return NotImplemented
         if isinstance(other, int | float | np.number | np.ndarray):
             return self.replace(D=self.D + self._direct(other))
@@ -249,7 +249,7 @@ class StateSpace(Value):
         D = self.D
         if D.shape[0] != D.shape[1] or np.linalg.matrix_rank(D) < D.shape[0]:
             raise ModelError(
-                "the inverse of this system differentiates: its D is not invertible, as of all "
+                "the inverse of this system differentiates: its D is not invertible, as for all "
                 "plants. For 1 / (1 + L) write the brackets; for S and T see lti.feedback."
             )
         inverse = np.linalg.inv(D)
@@ -341,9 +341,9 @@ class StateSpace(Value):
         return float(gain[0, 0]) if gain.shape == (1, 1) else gain
 
     def zeros(self) -> ComplexArray:
-        """Return the finite invariant zeros [rad/s, or z]: where inputs leave no trace in outputs.
+        """Return the finite invariant zeros [rad/s, or z], where inputs have no effect on outputs.
 
-        The poles of states that inputs do not reach or outputs do not see are among them.
+        They include the poles of uncontrollable and unobservable states.
         """
         return invariant_zeros(self)
 
@@ -356,7 +356,7 @@ class StateSpace(Value):
         except np.linalg.LinAlgError as error:
             raise ModelError(
                 f"the gain at {s:g} is infinite: a pole lies there, at zero frequency that of a "
-                "free mass or an integrator. Evaluate beside it."
+                "free mass or an integrator. Evaluate at another frequency."
             ) from error
         return np.asarray(gain, dtype=np.complex128)
 
@@ -379,16 +379,16 @@ class StateSpace(Value):
 
     @classmethod
     def from_control(cls, sys: Any) -> StateSpace:
-        """Return a system of python-control or SciPy as ours, names kept.
+        """Return a system of python-control or SciPy as a StateSpace with the same names.
 
-        A transfer function becomes sections in series, each channel of a matrix with its own
-        states: `minimal` removes what they share.
+        A transfer function becomes sections in series, each channel of a matrix with separate
+        states: `minimal` removes common states.
         """
         return cls(**foreign_fields(sys))
 
 
 def as_statespace(sys: System | FloatArray) -> StateSpace:
-    """Return `sys` as our StateSpace.
+    """Return `sys` as a StateSpace.
 
     Parameters
     ----------
@@ -425,8 +425,8 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     if isinstance(inner, StateSpace):
         if all(hasattr(sys, side) for side in "wuzy"):
             raise ModelError(
-                "this is a StandardPlant, whose [w; u] -> [z; y] are four systems: say which is "
-                "meant, plant.Gzw (or Gzu, Gyw, Gyu), or plant.system for all of it."
+                "this is a StandardPlant, whose [w; u] -> [z; y] are four systems: choose "
+                "plant.Gzw (or Gzu, Gyw, Gyu), or plant.system for all of it."
             )
         return inner
     return StateSpace.from_control(sys)

@@ -11,7 +11,8 @@ from ..arrays import ComplexArray, FloatArray
 from ..tolerances import SPLIT, divisor
 from .equations import mean_speed, reciprocal, state_scale
 
-#: a zero closer to the limit than this, relative to its size, is tested as if it were on it
+#: distance of a zero from the stability limit, relative to its size, below which it is tested on
+#: the limit
 _ON_AXIS = 1e-6
 
 #: smallest singular value of the scaled system matrix, at which its rank is lost
@@ -23,9 +24,9 @@ _ROUNDING = 1e-11
 
 def invariant_zeros(g: Any) -> ComplexArray:
     """Return the finite invariant zeros, where ``[A - s I, B; C, D]`` loses its normal rank."""
-    # the system is compressed until D has full row and column rank: outputs that do not feel an
-    # input directly are states, and states of the rest. What is left is a regular pencil, whose
-    # eigenvalues are the zeros; those at infinity have left with the compressed states.
+    # the system is compressed until D has full row and column rank: outputs without feedthrough are
+    # states, which act as inputs of the rest. A regular pencil remains, whose eigenvalues are the
+    # finite zeros; zeros at infinity were removed with the compressed states.
     # [EmamiNaeiniVanDooren1982]_
     A, B, C, D = _scaled_matrices(g)
     d = state_scale(A, B, C) if A.size else np.ones(0)
@@ -86,15 +87,16 @@ def axis_zeros(g: Any) -> ComplexArray:
     E = np.zeros((n + m, n + m))
     E[:n, :n] = np.eye(n)
     alpha, beta = la.eig(pencil, E, right=False, homogeneous_eigvals=True)
-    # beyond: rounding of a zero at infinity, which comes out at some 1 / (2e-16)
+    # larger values are rounding of a zero at infinity, which is computed as about 1 / (2e-16)
     finite = np.abs(beta) > 1e-14 * np.abs(alpha)
     speed = _pole_size(g)
     zeros = alpha[finite] / beta[finite]
-    size = np.maximum(np.abs(zeros), 0.1)  # double zeros at 0 come out at the root of rounding
+    size = np.maximum(np.abs(zeros), 0.1)  # double zeros at 0 have the size of the root of rounding
     off = np.abs(np.abs(zeros) - 1) if g.dt else np.abs(zeros.real) / size
     near = zeros[(off < _ON_AXIS) & (zeros.imag >= 0)]
     on = near / np.abs(near) if g.dt else 1j * near.imag
-    # several at zero frequency come out at a root of rounding, which may be far off: always tested
+    # several zeros at zero frequency have errors of a root of rounding, so that zero is always
+    # tested
     on = np.append(on, 1.0 if g.dt else 0.0)
     found: list[complex] = []
     for zero in np.sort_complex(on):

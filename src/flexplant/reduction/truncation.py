@@ -37,14 +37,15 @@ class ModalTruncation(ReductionMethod):
     Parameters
     ----------
     count : int, optional
-        : sequence of int, optional In place of `count`: mode numbers from 1, all rigid-body modes
-        among them.
+        Number of modes, rigid-body modes included.
+    modes : sequence of int, optional
+        Mode numbers from 1 in place of `count`, with all rigid-body modes.
     static_at : place or sequence of places
         Places where the static compliance is kept.
     inputs, outputs : place or sequence of places
         Channels of the a-priori bound; no outputs: the inputs.
     damping : ModalDamping or Rayleigh, optional
-        With an FEModel: of modes and vectors, in place of its D.
+        Damping of modes and vectors in place of the model's D, with an FEModel.
 
     Notes
     -----
