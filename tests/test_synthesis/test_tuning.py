@@ -217,3 +217,30 @@ def test_slopes_of_the_joint_distances():
     change = (one.distances(C + 1e-6 * D) - one.distances(C - 1e-6 * D)) / 2e-6
     for place, slope in enumerate(change):
         assert np.sum(one.slopes(C, place) * D, axis=1).real == pytest.approx(slope, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_free_axes_and_axes_on_springs_together(seed):
+    """Two bodies, one of them on a spring of a few hertz: each axis is what it is at rest."""
+    rng = np.random.default_rng(seed)
+    masses = rng.uniform(1.0, 20.0, 2)
+    K = np.diag([0.0, masses[1] * (2 * np.pi * rng.uniform(3.0, 8.0)) ** 2])
+    model = fx.FEModel(
+        np.diag(masses),
+        K,
+        dofs=fx.DofSet([1, 2], ["x", "y"], np.zeros((2, 3))),
+        joint_motions=[[1.0], [0.0]],
+    )
+    own = fx.Ports(
+        u=[fx.Actuator(f"f{i}", at=at) for i, at in enumerate(("1:x", "2:y"))],
+        z=[fx.Poi(f"p{i}", at=at, axes=(at[-1],)) for i, at in enumerate(("1:x", "2:y"))],
+        y=[fx.Sensor(f"s{i}", at=at) for i, at in enumerate(("1:x", "2:y"))],
+    )
+    modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.01))
+    plant = fx.assemble_plant(modes, own).discretized(2e3, delay=1)
+    found = tune_loops(plant, notches=0)
+    loop = fx.close_loop(plant, found)
+    assert np.abs(np.linalg.eigvals(loop.system.A)).max() < 1.0
+    assert loop.modulus_margin >= 0.4999
+    assert min(one.crossovers[0] for one in found.report.loops) > 40.0

@@ -15,6 +15,7 @@ from ..lti.interconnection import among, connect
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
+from ..plant.port import DERIVATIVES
 from ..tolerances import SAME
 from ..words import inner_names
 from .anti_windup import recovery_gain
@@ -180,8 +181,6 @@ def check_inputs(plant: AnyPlant, systems: Sequence[StateSpace]) -> None:
             raise LabelError(f"{error}{why}")
 
 
-#: what a block may read of a set-point beside its position, by the order of the derivative
-DERIVATIVES = ("velocity", "acceleration", "jerk", "snap")
 _FORCE = "feedforward"
 
 

@@ -155,7 +155,7 @@ def _shown(plant: Partition, driven: DrivenAxes, sensors: Sequence[str]) -> Floa
     """Return what sensors show (p, r) of a unit of each axis."""
     g, u = plant.system, driven.actuators
     if all(plant.assembled.ports.sensor(name).order == 0 for name in sensors):
-        return followed_at_rest(g, driven.T, u, driven.channels, sensors, plant.dt)
+        return followed_at_rest(g, driven.T, u, driven.channels, sensors, plant.dt)[..., 0]
     shown = []
     for i, f in enumerate(driven.freq):
         sigma = 2.0 * np.pi * f

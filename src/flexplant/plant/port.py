@@ -21,6 +21,10 @@ Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
 #: in the order of their time derivatives
 QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
 
+#: what a set-point profile gives of a reference, by the order of the derivative
+TERMS = ("position", "velocity", "acceleration", "jerk", "snap")
+DERIVATIVES = TERMS[1:]
+
 
 class MeasuredRow(NamedTuple):
     """What a channel measures: ``row x + direct f + carried g``.

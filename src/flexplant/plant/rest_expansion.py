@@ -107,7 +107,7 @@ def moved_at_rest(plant: Partition, channels: Sequence[str], forces: Sequence[st
         return np.zeros((len(channels), 0))
     axes = [channels[i] for i in chosen]
     T = np.asarray(np.linalg.pinv(G[chosen]), dtype=np.float64)
-    return followed_at_rest(plant.system, T, forces, axes, channels, plant.dt)
+    return followed_at_rest(plant.system, T, forces, axes, channels, plant.dt)[..., 0]
 
 
 def followed_at_rest(
@@ -117,8 +117,9 @@ def followed_at_rest(
     axes: Sequence[str],
     seen: Sequence[str],
     dt: float,
+    count: int = 1,
 ) -> FloatArray:
-    """Return where outputs are (p, r) while each axis rests at one unit: ``G_y T (G_z T)^-1``."""
+    """Return where outputs are (p, r, count) by derivatives of each axis: ``G_y T (G_z T)^-1``."""
     names = [*axes, *seen]
 
     def found(s: complex) -> ComplexArray:
@@ -126,4 +127,4 @@ def followed_at_rest(
         moved, seen_there = both[: len(axes)], both[len(axes) :]
         return np.asarray(np.linalg.solve(moved.T, seen_there.T).T, dtype=np.complex128)
 
-    return at_rest(found, dt, axes, 1)[..., 0]
+    return at_rest(found, dt, axes, count)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import positive
+from ..arrays import positive, whole
 from ..errors import AssumptionError, ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.filters import inverse_sensitivity, lead_lag_filter
@@ -18,6 +18,7 @@ from ..store import Value
 from ..tolerances import SAME, divisor
 from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
+from .port import DERIVATIVES
 from .rest_expansion import followed_at_rest
 from .standard import AnyPlant, StandardPlant, plant_of, standard_plant
 
@@ -34,7 +35,7 @@ _ELSEWHERE = 0.01
 _IDLE = 0.03
 
 
-def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSpace:
+def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int = 0) -> StateSpace:
     """Return the static block from sensors and references to errors at the sensors.
 
     ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i is while the machine rests with
@@ -42,24 +43,31 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     at rest. On a free body this is its rigid-body motion. A controller that reads these errors has
     one degree of freedom: what it does to a reference it does to a disturbance.
 
+    A move bends the machine, so that its sensors are not where they are at rest, and the controller
+    opposes the move. With an order the derivatives of the references correct y_i,ref: close the
+    loop with such errors and with the feedforward of the loop. Design with order 0.
+
     Parameters
     ----------
     plant : StandardPlant
         Assembled from a structure, with a reference and displacement sensors.
     poi : str, optional
         The POI whose references the errors follow; all that have some when not given.
+    order : int
+        Highest derivative of the references that the errors read, 0 to 4.
 
     Returns
     -------
     StateSpace
-        Static; use it as `plant.through(block)` for design, and in `close_loop`.
+        Static; use it as `plant.through(block)` for design, and in `close_loop`. With an order it
+        reads `die:ref:velocity`, ... too, which a set-point profile gives.
 
     Raises
     ------
     AssumptionError, LabelError, ModelError
         When the plant has no reference or no displacement sensors; when the named POI has no
         reference; when the actuators do not move the axes apart, or the plant was not assembled
-        from a structure.
+        from a structure; when the order is not 0 to 4.
 
     Examples
     --------
@@ -84,11 +92,14 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     driven = driven_axes(plant, freq=resting_frequency(plant), poi=poi)
     own = [(p, axis) for p, axis in ports.followed if p.channel(axis) in driven.channels]
     columns = [driven.channels.index(p.channel(axis)) for p, axis in own]
+    count = 1 + whole(order, "order", minimum=0, maximum=len(DERIVATIVES))
     g, T = plant.system, driven.T
-    moved = followed_at_rest(g, T, plant.u, driven.channels, sensors, plant.dt)[:, columns]
+    moved = followed_at_rest(g, T, plant.u, driven.channels, sensors, plant.dt, count)[:, columns]
+    refs = [p.derived(axis, "ref") for p, axis in own]
+    later = [f"{ref}:{term}" for term in DERIVATIVES[: count - 1] for ref in refs]
     return StateSpace(
-        [], [], [], np.hstack([-np.eye(len(sensors)), moved]), plant.dt,
-        inputs=[*sensors, *(p.derived(axis, "ref") for p, axis in own)],
+        [], [], [], np.hstack([-np.eye(len(sensors)), *np.moveaxis(moved, -1, 0)]), plant.dt,
+        inputs=[*sensors, *refs, *later],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
         units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},

@@ -12,12 +12,13 @@ import numpy.typing as npt
 from ..arrays import ComplexArray, FloatArray, IntArray, real_array, whole
 from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short, warn
 from ..loop import ClosedLoop, close_loop
-from ..loop.blocks import DERIVATIVES, force_name
+from ..loop.blocks import force_name
 from ..loop.broken import error_sensitivity
 from ..loop.machine_figures import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
+from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
 from ..store import Value
 from ..tolerances import SAME, divisor
@@ -36,8 +37,6 @@ _FASTEST = 0.4
 _STEPS = 2000
 #: relative: errors that feedforward leaves and that are worth a warning
 _LEFT = 0.2
-#: what a set-point gives, by the order of the derivative
-TERMS = ("position", *DERIVATIVES)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -298,9 +297,13 @@ class _Tracking(NamedTuple):
         """Return the function of s that gives [G_u, G_r] (p, r, r + 1) of a loop at p places."""
         # a place changes what is seen of the states and of u, which the feedback does not read
         g, plant, poi, axes = forced.monitored, forced.machine, self.poi, self.axes
-        acts = np.zeros((len(plant.w), self.T.shape[1] + 1))
-        acts[g.input_index([force_name(u) for u in plant.u]), :-1] = self.T
-        acts[g.input_index([self.name]), -1] = 1.0
+        r = self.T.shape[1]
+        # the reference, and those of its derivatives that the blocks read
+        signals = [self.name, *(f"{self.name}:{term}" for term in DERIVATIVES)]
+        orders = [m for m, name in enumerate(signals) if name in plant.w]
+        acts = np.zeros((len(plant.w), r + len(orders)))
+        acts[g.input_index([force_name(u) for u in plant.u]), :r] = self.T
+        acts[g.input_index([signals[m] for m in orders]), r + np.arange(len(orders))] = 1.0
         rows = g.output_index(list(axes))
         C, D = g.C[rows][None], (g.D[rows] @ acts)[None]
         if along is not None:
@@ -316,7 +319,13 @@ class _Tracking(NamedTuple):
             C[:, at, : plant.system.n_states] += places.C[:, own]
             direct = places.D[:, own][:, :, plant.system.input_index(plant.w)]
             D[:, at] = (direct + by_u @ g.D[u]) @ acts
-        return lambda s: np.asarray(C @ _states(g, g.B @ acts, s) + D)
+
+        def found(s: complex) -> ComplexArray:
+            both = C @ _states(g, g.B @ acts, s) + D
+            led = both[..., r:] @ s ** np.array(orders)[:, None]
+            return np.concatenate([both[..., :r], led], axis=-1)
+
+        return found
 
     def inverse(self, forced: ClosedLoop, along: npt.ArrayLike | None) -> OfS:
         """Return the function of s that gives F (p, r) of a loop at p places."""
@@ -370,8 +379,10 @@ def _least(
         left = float(np.linalg.norm(given + rows / unit @ gains) / divisor(np.linalg.norm(given)))
         if left > _LEFT:
             warn(
-                f"this feedforward leaves {100 * left:.2g} % of the loop's errors: zeros of the "
-                "plant are about as slow as the move. Make a slower move (move=...), lower the "
+                f"this feedforward leaves {100 * left:.2g} % of the loop's errors: the feedback "
+                "opposes the move, because the machine bends between sensors and POI, or zeros of "
+                "the plant are about as slow as the move. Close a loop of reference errors with "
+                "reference_errors(plant, order=4), make a slower move (move=...), lower the "
                 "bandwidth, or use simulation.inverse_forces."
             )
         found.append((gains / unit).reshape(wanted.shape[0], orders.size))

@@ -103,7 +103,7 @@ def _needed(
         found |= {name: forces[plant.u.index(name)] for name in forced}
     seen = [name for name in names if name in plant.y and name not in moves]
     if seen:
-        places = followed_at_rest(g, T, plant.u, axes, seen, dt)
+        places = followed_at_rest(g, T, plant.u, axes, seen, dt)[..., 0]
         found |= dict(zip(seen, places @ signals[:, 0], strict=True))
     return found
 

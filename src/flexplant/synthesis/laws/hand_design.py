@@ -12,18 +12,15 @@ import numpy as np
 from ...arrays import number, positive, real_array, whole
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known, short
 from ...fingerprints import fingerprint
-from ...loop.blocks import DERIVATIVES
 from ...loop.measured_loop import static_map
 from ...lti.frequency import Frf
 from ...lti.interconnection import among
 from ...lti.statespace import StateSpace
+from ...plant.port import TERMS
 from ...store import Value, checked
 from ...words import flag, instance, mapping
 from .law import Axes, Law, LawElement, SingleElement, axes_controller, connected
 from .loop_design import DesignedLoops, axes_of, made
-
-#: what feedforward gains act on, in this order
-TERMS = ("position", *DERIVATIVES)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -106,19 +106,14 @@ def tune_loops(
     most = whole(notches, "notches", minimum=0)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
-    powers = _powers(axes, rigid)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
-        for i, name in enumerate(axes.names):
+        for i, (name, (free, powers)) in enumerate(
+            zip(axes.names, _lines(axes, rigid), strict=True)
+        ):
             variance = None if frf.variance is None else frf.variance[i, i]
+            lines = (frf.freq, frf.data[i, i], axes.rate, free, variance)
             laws = [
-                AxisLaw(
-                    MeasuredAxis(
-                        name, frf.freq, frf.data[i, i], axes.rate, rigid > 0, variance, power
-                    ),
-                    float(peak),
-                    most,
-                )
-                for power in powers[i]
+                AxisLaw(MeasuredAxis(name, *lines, power), float(peak), most) for power in powers
             ]
             law, numbers = _fastest(laws)
             of.append(law)
@@ -163,12 +158,12 @@ def _joint_plants(
 _RESTING, _STEP_AT_REST = 1e-6, 2.0
 
 
-def _powers(axes: Axes, rigid: int) -> list[tuple[int, ...]]:
-    """Return the powers of 1 / s of the lines on which each axis may have its bandwidth."""
+def _lines(axes: Axes, rigid: int) -> list[tuple[bool, tuple[int, ...]]]:
+    """Return whether each axis is free at rest, and powers of 1 / s of lines of its bandwidth."""
     # a mass, always but of velocities; below its springs' frequency it is a spring
     if isinstance(axes.plant, Frf):
-        return [(2,) if rigid else (2, 0)] * len(axes.names)
-    found: list[tuple[int, ...]] = []
+        return [(rigid > 0, (2,) if rigid else (2, 0))] * len(axes.names)
+    found: list[tuple[bool, tuple[int, ...]]] = []
     low = 2.0 * np.pi * _RESTING * (axes.rate or float(np.abs(axes.plant.poles()).max(initial=1.0)))
     g = axes.plant
     for i in range(len(axes.names)):
@@ -177,7 +172,8 @@ def _powers(axes: Axes, rigid: int) -> list[tuple[int, ...]]:
             for s in (low, _STEP_AT_REST * low)
         )
         slope = -np.log(far / near) / np.log(_STEP_AT_REST) if near and far else 2.0
-        found.append((2,) if slope > 1.5 else (1,) if abs(slope) > 0.5 else (2, 0))
+        powers = (2,) if slope > 1.5 else (1,) if abs(slope) > 0.5 else (2, 0)
+        found.append((rigid > 0 and slope > 0.5, powers))
     return found
 
 
