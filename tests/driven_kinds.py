@@ -197,9 +197,7 @@ def mirror(rng):
         coil = {n: coil[n] for n in ("N", "W")}
     seen = {"eddy_rx": between("3:rx", "1:rx"), "eddy_ry": between("3:ry", "1:ry")}
     ports = fx.Ports(
-        w=[
-            fx.Disturbance(f"vibration_{r}", at=f"1:{r}", asd=size) for r in ("rx", "ry")
-        ],
+        w=[fx.Disturbance(f"vibration_{r}", at=f"1:{r}", asd=size) for r in ("rx", "ry")],
         u=[fx.Actuator(n, at=p, asd=1e-5) for n, p in coil.items()],
         z=[fx.Poi("beam", at="2:rx", axes=("rx", "ry"))],
         y=[fx.Sensor(n, at=p, asd=10 ** rng.uniform(-10, -8.5)) for n, p in seen.items()],
