@@ -16,9 +16,9 @@ from ..errors import FlexplantError, ModelError
 from ..export import write_c
 from ..io import write_mat
 from ..lti.statespace import StateSpace
+from ..plant.port import TERMS
 from ..store import load
 from ..synthesis import Controller, FixedBlock, Law, LoopDesign, ShapedAxis, second_order_sections
-from ..synthesis.laws.hand_design import TERMS
 from ..synthesis.laws.law import LawElement
 from .controls import digits, parsed
 from .verdict import CARD, COMPACT, SMALL, heading, remark
