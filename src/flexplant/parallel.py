@@ -302,6 +302,8 @@ BAR_DELAY = 2.0
 _AGAIN = 1.0
 #: with more than this left to do, advice on how to have less is worth its words [s]
 LONG = 20.0
+#: a promise that is wrong by this factor is corrected
+_OFF = 2.0
 #: the bars that a thread is inside of
 _open = threading.local()
 
@@ -309,20 +311,25 @@ _open = threading.local()
 class Progress:
     """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
 
-    Elsewhere (pipes, files of a cluster) one line on the standard error says after two seconds what
-    runs, and how long it will take where that can be said; where the first of several items takes
-    longer, a second line says so when it is done. What `expect` knows before is said before.
-    `advice` follows where more than 20 seconds are left. `progress=False` is silent.
+    Elsewhere (pipes, log files of a cluster) one line on the standard error says after two seconds
+    what runs, and how long it will take where this is known. An estimate follows from the work that
+    is done (`expect`, `so_far`, or the items counted). It is corrected by a further line where it
+    proves wrong by a factor of two. `advice` follows where more than 20 seconds are left.
+    `progress=False` is silent.
 
-    Work inside of other work shows no bar, neither here nor in the process of a pool.
+    Work inside other work shows no bar, neither here nor in the process of a pool.
     """
 
     def __init__(
         self, total: int | None, description: str, *, progress: bool | None = None, advice: str = ""
     ) -> None:
         self.bar: Any = None
-        #: items counted, of these what was known before, and the seconds expected in all
-        self.done, self._known, self._expected = 0, 0, 0.0
+        self._begin = monotonic()
+        #: items counted, those of them that were known before, when the last was counted [s], and
+        #: whether items show how much is done
+        self.done, self._known, self._last, self._counts = 0, 0, 0.0, True
+        #: seconds in all that were last promised, 0 before; and whether advice was given
+        self._promised, self._advised = 0.0, not advice
         self.description, self.advice = description, advice
         self._over = threading.Event()
         if not (progress is None or isinstance(progress, bool | np.bool_)):
@@ -351,7 +358,6 @@ class Progress:
     def __enter__(self) -> Self:
         try:
             _open_bars().append(self)
-            self._begin = monotonic()
             if (self.bar is not None and not self._forced) or self._unseen:
                 work = self._said if self._unseen else self._shown
                 self._thread = threading.Thread(target=work, daemon=True)
@@ -381,63 +387,88 @@ class Progress:
     def advance(self, items: int = 1, *, known: bool = False) -> None:
         """Count some items as done; `known` ones took no time, as those of a checkpoint."""
         self.done += items
-        self._known += items if known else 0
+        if known:
+            self._known += items
+        else:
+            self._last = self.elapsed
         if self.bar is not None:
             self.bar.update(items)
 
-    def expects(self, seconds: float) -> None:
-        """Say at once how long all of it will take, the first time that this is two seconds."""
-        if self._expected or seconds < BAR_DELAY or not (self._unseen or self.bar is not None):
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the work began."""
+        return monotonic() - self._begin
+
+    def expects(self, seconds: float, *, at_least: bool = False) -> None:
+        """Say how long all of it will take; again where that differs by a factor of two."""
+        known = self._promised
+        if seconds < max(BAR_DELAY, self.elapsed) or not (self._unseen or self.bar is not None):
             return
-        self._expected = seconds
-        self._write(f"some {float(f'{seconds:.1g}'):g} s expected", seconds)
+        if seconds < _OFF * known and (at_least or seconds > known / _OFF - BAR_DELAY):
+            return
+        self._promised, some = seconds, "at least" if at_least else "some"
+        if known:
+            left = seconds - self.elapsed
+            self._write(f"{self.elapsed:.0f} s, {some} {_rounded(left)} s more", left)
+        else:
+            self._write(f"{some} {_rounded(seconds)} s expected", seconds)
 
     def _shown(self) -> None:
         """Draw the bar while the first item, or any later one, takes its time."""
-        wait, advised = BAR_DELAY, not self.advice
+        wait = BAR_DELAY
         while not self._over.wait(wait):
             left = self._left()
-            if not advised and left > LONG:
-                advised = True
-                if not self._expected:
-                    self._write(f"some {left:.0f} s more", left)
+            if not self._advised and left > LONG:
+                self._write(f"some {left:.0f} s more", left)
             self.bar.refresh()
             wait = _AGAIN
 
     def _said(self) -> None:
-        """Say what runs, and how long it will take, as soon as one item of several is done."""
-        if self._over.wait(BAR_DELAY) or self._expected:
-            return
-        self._say()
-        if self._total and not self._left():
-            while not self._left():
-                if self._over.wait(min(BAR_DELAY, _AGAIN)):
-                    return
-            self._say()
+        """Say what runs, how long it will take, and again where that proves wrong."""
+        wait, said = BAR_DELAY, False
+        while not self._over.wait(wait):
+            left, spent = self._left(), self.elapsed
+            total, known = spent + left, self._promised
+            if known and left and not known / _OFF - BAR_DELAY < total < _OFF * known:
+                self._say(left)
+            elif not left and spent > (_OFF * known or LONG):
+                self._promised = spent
+                more = ", longer than expected" if known else ""
+                self._write(f"{spent:.0f} s{more}", np.inf)
+            elif not known and (left or not said):
+                self._say(left)
+            wait, said = min(BAR_DELAY, _AGAIN), True
 
     def _left(self) -> float:
         """Return the seconds that what is not done will take, by what is; 0 where unknown."""
         own = self.done - self._known
-        if not self._total or own <= 0:
+        if not (self._total and self._counts) or own <= 0:
             return 0.0
-        # not done yet
-        return max((monotonic() - self._begin) * (self._total - self.done) / own, 1e-9)
+        since = self.elapsed - self._last  # of the item under way, which may take longer
+        each = max(self._last / own, since)
+        return max(each * (self._total - self.done) - since, 1e-9)
 
-    def _say(self) -> None:
-        left, text = self._left(), f"{monotonic() - self._begin:.0f} s"
+    def _say(self, left: float) -> None:
+        text = f"{self.elapsed:.0f} s"
         if left:
+            self._promised = self.elapsed + left
             text += f", {self.done} of {self._total} done, some {left:.0f} s more"
         self._write(text, left)
 
     def _write(self, text: str, left: float) -> None:
         """Write a line, with the advice where much is left."""
         line = f"{self.description.rstrip(':')}: {text}"
-        line += f". {self.advice}" if left > LONG and self.advice else ""
+        if left > LONG and not self._advised:
+            self._advised, line = True, f"{line}. {self.advice}"
         with suppress(OSError, ValueError):  # a closed stream
             if self.bar is not None:
                 self.bar.write(line, file=self._stream or sys.stderr)
             else:
                 sys.stderr.write(line + "\n")
+
+
+def _rounded(seconds: float) -> str:
+    return f"{float(f'{seconds:.1g}'):g}"
 
 
 @cache
@@ -456,22 +487,47 @@ def _seconds_each() -> float:
 _LEAST = 1e-12
 
 
-def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
-    """Say how long the outermost work under way takes in all, where that is long."""
-    # `multiplications` are those of products of matrices that take as long
+def expect(multiplications: float = 0.0, *, seconds: float = 0.0, more: bool = False) -> None:
+    """Say how long the work under way takes in all, where that is long.
+
+    `multiplications` are those of products of matrices that take as long. Where this is `more` that
+    follows, or work inside other work, the outermost one takes at least as long.
+    """
     bars = _open_bars()
-    if bars:
-        if multiplications * _LEAST > BAR_DELAY * 1e-2:
-            seconds += multiplications * _seconds_each()
+    if not bars:
+        return
+    if multiplications * _LEAST > BAR_DELAY * 1e-2:
+        seconds += multiplications * _seconds_each()
+    if len(bars) == 1 and not more:
         bars[0].expects(seconds)
+    else:
+        bars[0].expects(bars[0].elapsed + seconds, at_least=True)
 
 
-def tick(description: str) -> None:
-    """Count an item of the innermost work, where that is its description."""
+#: share of the work from which on its time tells that of all
+_TELLS = 0.05
+
+
+def so_far(done: float, expected: float) -> None:
+    """Say how long the work under way takes in all, by what is done of what is expected."""
+    bars = _open_bars()
+    if len(bars) != 1:
+        return
+    bars[0]._counts = False
+    while done >= expected:  # as much again
+        expected *= 2.0
+    if done > _TELLS * expected:
+        bars[0].expects(bars[0].elapsed * expected / done)
+
+
+def tick(description: str, expected: float = 0.0) -> None:
+    """Count an item of the innermost work, where that is its description, of those expected."""
     # for loops far below the function that shows the bar; without such a bar it does nothing
     bars = _open_bars()
     if bars and bars[-1].description == description:
         bars[-1].advance()
+        if expected:
+            so_far(bars[-1].done, expected)
 
 
 def bars_of_thread() -> list[Progress]:

@@ -215,6 +215,9 @@ UNASKED = 5e7
 BUDGET = 5e10
 #: operations of a whole fit and of a first result relative to those of a step, on average
 _REFINED, _FIRST = 6e3, 200.0
+#: operations of a whole fit and of a first result, relative to those of a step: 300 to 800, and 50
+#: to 80, on records of ten to thirty modes
+_WHOLE, _START = 500.0, 60.0
 #: misfit of a first result above which a warning is given: deviations are enlarged by its square
 #: root
 LARGE = 4.0
@@ -308,7 +311,9 @@ def identified(
         advice="Fewer lines (band=), fewer channels or refine=False take less.",
     ) as bar:
         bar.advance()
-        expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
+        whole = refine or (refine is None and not costly)
+        expect(work * (_REFINED if whole else _FIRST))
+        task.budget.expected = work * (_WHOLE if whole else _START)
         # after one step the error is as small as the noise; differences between outputs need more
         # steps
         judged = refine is not False and not begin.at_peaks

@@ -11,7 +11,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, below_half_rate, frequency_band, positive, whole
 from ..errors import ModelError, SolverError
 from ..modes.matching import assigned, mac_matrix
-from ..parallel import Progress, tick
+from ..parallel import Progress, expect, tick
 from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
 from .spectra import signals
@@ -30,6 +30,10 @@ TOLERANCES = (0.01, 0.3, 0.9)
 
 #: label of the progress bar
 PARTS = "parts of the record"
+#: multiplications of a singular value decomposition, relative to the cube of its rows
+_DECOMPOSED = 18.0
+#: rate relative to the end of the band: the largest that suits, and one that is enough
+_HIGHEST, _ENOUGH = 10.0, 5.0
 
 
 def identify_output_only(
@@ -124,7 +128,8 @@ def identify_output_only(
             f"{parts} blocks of {long} samples are too short for {count} lags: measure longer, or "
             "give fewer blocks= or lags=."
         )
-    with Progress(2 * parts, PARTS, progress=progress):
+    with Progress(parts, PARTS, progress=progress, advice=_advice(rate, high)):
+        expect(_DECOMPOSED * (parts + 1) * (count * y.shape[1]) ** 3)
         share = max(1, round(parts / y.shape[0]))
         pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
         means = (piece - piece.mean(axis=1, keepdims=True) for piece in pieces)
@@ -136,8 +141,8 @@ def identify_output_only(
         chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
         bases = []
         for one in each:
-            tick(PARTS)
             bases.append(la.svd((parts * mean - one) / (parts - 1)))
+            tick(PARTS)
         best: tuple[OrderPoles, FloatArray, Any] | None = None
         for result in results:
             away = np.abs(chosen[:, None] - result.poles) / np.abs(chosen)[:, None]
@@ -168,9 +173,20 @@ def identify_output_only(
     return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)
 
 
+def _advice(rate: float, high: float) -> str:
+    """Return what makes the work shorter: a lower rate where it is far above the band."""
+    factor = int(rate / (_ENOUGH * high))
+    if rate <= _HIGHEST * high:
+        return "Fewer channels, lags= or blocks= take less."
+    return (
+        f"The rate is {rate / high:.0f} times the upper end of the band. Decimate the record first "
+        f"(scipy.signal.decimate(outputs, {factor}), rate={rate / factor:g}): the work then takes "
+        f"about {factor**3} times less."
+    )
+
+
 def _hankel(y: FloatArray, count: int) -> FloatArray:
     """Return H (count n, count n) of one piece."""
-    tick(PARTS)
     n, long = y.shape
     size = 1 << int(np.ceil(np.log2(2 * long)))
     Y = np.fft.rfft(y, size, axis=1)

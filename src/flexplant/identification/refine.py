@@ -12,6 +12,7 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
+from ..parallel import so_far
 from ..tolerances import RANK, TINY
 from .terms import axis, pole_terms, residual_terms
 
@@ -35,16 +36,18 @@ class Exhausted(Exception):  # noqa: N818 - not an error: the first result is ke
 
 @dataclass
 class Products:
-    """Number of operations of fits so far, and the allowed number."""
+    """Number of operations of fits so far, the allowed number, and the expected one."""
 
     most: float = np.inf
     done: float = 0.0
+    expected: float = 1.0
 
     def add(self, count: float) -> None:
-        """Count more operations; raise Exhausted above the limit."""
+        """Count more operations and tell the bar; raise Exhausted above the limit."""
         self.done += count
         if self.done > self.most:
             raise Exhausted
+        so_far(self.done, min(self.expected, self.most))
 
 
 @dataclass(frozen=True, eq=False)

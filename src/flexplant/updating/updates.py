@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from ..arrays import FloatArray, positive, whole
 from ..errors import FlexplantError, ModelError, counted, some_names, warn
-from ..parallel import Progress
+from ..parallel import Progress, expect
 from ..seeds import Rng, generator
 from ..structure.model import FEModel
 from ..tolerances import TINY
@@ -177,7 +178,7 @@ def update(
         used = basis.at(checked_values(start, listed, "start"))
     objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
-    with Progress(None, ITERATIONS, progress=progress):
+    with Progress(None, ITERATIONS, progress=progress, advice=_ADVICE):
         check_units(objective, begins[0])
         # where an answer that is drawn to its start ends is no minimum of the misfit
         if starts is None and not method.penalised:
@@ -333,6 +334,8 @@ def _complaint(fit: UpdateResult, named: str) -> str:
     )
 
 
+#: what makes an update shorter
+_ADVICE = "A smaller reduced model, fewer lines or channels of responses, or starts=1 take less."
 #: standard deviations by which a round moves the estimate that need no further round
 STILL = 1e-2
 
@@ -353,6 +356,7 @@ def corrected(
     first = end.trail.p[0]
     estimates = [end.p]
     for _ in range(rounds):
+        begin = perf_counter()
         point = objective.at(end.p)
         full = basis.objective(point)
         there = full.at(end.p)
@@ -368,6 +372,7 @@ def corrected(
         estimates.append(end.p)
         if normalised_step(objective, end.p, estimates[-2]) < STILL:
             break
+        expect(seconds=perf_counter() - begin, more=True)  # another round takes as long
     return end, estimates
 
 

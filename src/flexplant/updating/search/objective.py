@@ -252,6 +252,8 @@ def compared_modes(residual: Residual) -> tuple[int, ...]:
 
 #: what a bar calls the steps of all searches
 ITERATIONS = "update, iterations"
+#: steps that the searches from all starts of an update take together, on average
+_STEPS = 40.0
 
 
 @dataclass
@@ -265,7 +267,7 @@ class Trail:
 
     def add(self, objective: Objective, p: FloatArray, fraction: float) -> None:
         """Add the point at `p`, where the objective is."""
-        tick(ITERATIONS)
+        tick(ITERATIONS, _STEPS)
         point = objective.at(p)
         self.p.append(np.array(p))
         self.poles.append(objective.poles(point))
