@@ -1,6 +1,7 @@
 """Mistakes of a first hour: the message says which one it was."""
 
 import ast
+import operator
 import pickle
 import re
 from pathlib import Path
@@ -78,6 +79,11 @@ def test_names_of_matlab_and_python_control_lead_to_ours():
             item = fx
             for part in one.split("."):
                 item = getattr(item, part)
+            assert callable(item), "a function or a class, never a module"
+        with pytest.raises(AttributeError) as refused:
+            getattr(fx, name)
+        for one in re.findall(r"flexplant\.([\w.]+\w)", str(refused.value)):
+            assert callable(operator.attrgetter(one)(fx)), f"fx.{name} is answered with {one}"
 
 
 def test_one_over_one_plus_l():

@@ -298,10 +298,14 @@ def test_the_item_under_way_counts(spent, clock):
 def test_a_rate_far_above_the_band_is_named_before(rate, advice, monkeypatch, capsys):
     """The record is decimated to five times the end of the band."""
     monkeypatch.setattr(progress, "LONG", 0.0)
-    monkeypatch.setattr(progress, "BAR_DELAY", 1e-3)
-    noise = np.random.default_rng(0).standard_normal((2, 8000))
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.2)
+    monkeypatch.setattr(progress, "_seconds_each", lambda: 1e-6)
+    noise, to = (
+        np.random.default_rng(0).standard_normal((2, 16000)),
+        {"orders": range(4, 12, 2), "lags": 100},
+    )
     with pytest.raises(fx.FlexplantError):
-        fx.identification.identify_output_only(noise, rate=rate, band=(20.0, 50.0), orders=[4, 6])
+        fx.identification.identify_output_only(noise, rate=rate, band=(20.0, 50.0), **to)
     first = capsys.readouterr().err.splitlines()[0]
     assert "s expected" in first and advice in first
     assert ("decimate(outputs, 8), rate=250)" in first) == (rate == 2000.0)

@@ -201,7 +201,7 @@ def __getattr__(name: str) -> _Any:
     if not name.startswith("_"):
         rooms = [room for room in __all__ if hasattr(_imported(room), "__path__")]
         where = "".join(
-            f" Use flexplant.{room}.{name}." for room in rooms if hasattr(_imported(room), name)
+            f" Use flexplant.{room}.{name}." for room in rooms if name in dir(_imported(room))
         )
         ours = _import_module(".rooms", __name__).OURS.get(name)
         if ours and not where:

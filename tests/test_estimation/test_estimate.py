@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_kalman import modes, plate_plant
 
+import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
@@ -268,8 +269,8 @@ def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
     again = load(tmp_path / "e.npz")
     np.testing.assert_array_equal(again.innovations, want.innovations)
     assert again.lag.__class__ is Filter
-    with pytest.raises(KeyError, match="no channel 'die'"):
-        want["die"]
+    with pytest.raises(KeyError, match="no channel 'dye'"):
+        want["dye"]
     with pytest.raises(ValueError, match="read-only"):
         want["die:hat"][0] = 0.0
 
@@ -439,3 +440,30 @@ def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncate
         kalman.estimate(channels, path=places[:2])
     with pytest.raises(LabelError, match="no POI 'dye'"):
         kalman.estimate(channels, path={"dye": places[which]})
+
+
+def test_an_estimate_has_the_names_that_rms_takes():
+    """The POI, its channel, its estimate and its error are one, in each of two POIs."""
+    rng = np.random.default_rng(3)
+    A = np.diag(rng.uniform(0.5, 0.9, 4))
+    sys = fx.StateSpace(
+        A, rng.standard_normal((4, 3)), rng.standard_normal((5, 4)), np.zeros((5, 3)), 1e-3,
+        inputs=["w1", "n1", "n2"], outputs=["p0:rx", "p0:z", "p1:z", "y1", "y2"],
+    )  # fmt: skip
+    D = np.zeros((5, 3))
+    D[3, 1] = D[4, 2] = 1.0
+    plant = fx.plant.StandardPlant.from_statespace(
+        sys.replace(D=D), w=["w1", "n1", "n2"], u=[], z=["p0:rx", "p0:z", "p1:z"], y=["y1", "y2"],
+        asd={"w1": 1.0, "n1": 0.1, "n2": 0.1}, noise_factor=sys.B[:, :1],
+    )  # fmt: skip
+    observer = fx.design_kalman(plant)
+    found = observer.estimate({name: rng.standard_normal(50) for name in ("y1", "y2")})
+    same = {0: "p0 p0:rx p0:hat p0:error", 1: "p0:z p0:z:hat p0:z:error", 2: "p1 p1:z p1:hat"}
+    for row, names in same.items():
+        for name in names.split():
+            np.testing.assert_array_equal(found.deviation(name), found.deviations[row])
+            np.testing.assert_array_equal(found[name], found.data[row])
+            assert observer.rms(name) == observer.rms(names.split()[1])
+    for wrong in ("p2", "p0:x", "y1", 0):
+        with pytest.raises(KeyError):
+            found.deviation(wrong)

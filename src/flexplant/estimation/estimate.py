@@ -6,6 +6,7 @@ Those that use later measurements are from the adjoint pass back through the rec
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import erfc
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, real_array
-from ..errors import SolverError, counted, unknown_label, warn
+from ..errors import LabelError, SolverError, counted, unknown_label, warn
 from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
@@ -21,7 +22,7 @@ from ..parallel import PIECE, one_thread
 from ..store import Value
 from ..tolerances import TYPED
 from ..words import instance, known_units, sizes_of
-from .estimator_channels import ChannelError, estimates, recorded
+from .estimator_channels import ChannelError, estimates, recorded, row_of
 from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import STATIONARY, Moment, Start, Walk, stationary_start
@@ -68,6 +69,8 @@ class Estimate(Value, Mapping[str, FloatArray]):
         Which samples these are; (ny, 0) without a gate.
     record : (N, ny + nu) array
         The measurements and the commands it was made from.
+    channels : sequence of str
+        The POI channels that are estimated, such as `die:z`.
 
     Examples
     --------
@@ -93,6 +96,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     gate: float = np.inf
     gated: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
     record: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    channels: Sequence[str] = ()
 
     # values are compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
@@ -154,13 +158,19 @@ class Estimate(Value, Mapping[str, FloatArray]):
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
     def deviation(self, channel: str) -> FloatArray:
-        """Return the deviation (N,) of an estimate's error (`die:hat`), or of `y1:innovation`."""
+        """Return the standard deviation (N,) of an estimate's error, or of an innovation.
+
+        `die`, `die:z`, `die:hat` and `die:error` name the same estimate, as in
+        `KalmanEstimator.rms`; `y1:innovation` names an innovation.
+        """
         side, row = self._found(channel)
         return np.asarray((self.deviations, self.innovation_deviations)[side][row])
 
     def _found(self, channel: str) -> tuple[int, int]:
         if channel in self.names:
             return 0, list(self.names).index(channel)
+        with suppress(LabelError):
+            return 0, row_of(self.channels, channel)
         sensor = channel.removesuffix(":innovation") if isinstance(channel, str) else channel
         if sensor != channel and sensor in self.sensors:
             return 1, list(self.sensors).index(sensor)
@@ -218,6 +228,7 @@ def estimated(
         gate,
         passage.gated.T,
         record.both,
+        model.channels,
     )
 
 

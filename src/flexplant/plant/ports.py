@@ -90,10 +90,12 @@ class Poi(Value):
     Parameters
     ----------
     name : str
-    at : str or (3,) array [m]
-        A DOF label (whose direction is replaced by the axes) or any point of the structure.
+    at : str, (3,) array [m] or mapping {place: weight}
+        A DOF label (whose direction is replaced by the axes) or any point of the structure. Or a
+        weighted sum of places, ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``, which has one axis.
     axes : sequence of str
-        Of x, y, z [m], rx, ry, rz [rad]; a Reference follows the first one unless it names others.
+        Motions among x, y, z [m], rx, ry, rz [rad]; a Reference follows the first one unless it
+        names others. Labels in a weighted sum keep their own directions.
     absolute : bool
         Whether a BaseAcceleration moves it too; its motion relative to the floor otherwise.
     moves : mapping {position: (3,) array} or PlaceTable, optional

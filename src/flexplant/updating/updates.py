@@ -63,11 +63,11 @@ def update(
         The model. An FEModel of more than 300 DOFs is updated in a basis of its modes that is made
         anew at the estimate until that moves no more; one of more than 20 000 should be reduced.
     parameters : sequence of q Parameter
-        `AddedMass`, `AddedDamping`, `AddedStiffness`, `ModeDamping`, `MatrixParameter`, with what
-        is known of them, bounds and priors.
+        Unknowns with their bounds and priors: `AddedMass`, `AddedDamping`, `AddedStiffness`,
+        `ModeDamping`, `MatrixParameter`, `PolynomialParameter`, or a `Parameter` of your own.
     residuals : sequence of Residual
-        What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
-        `StaticCompliance`, mixed freely.
+        Measurements to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
+        `StaticCompliance`, or a `Residual` of your own, in any mixture.
     method : UpdateMethod, optional
         `GaussNewton` or `TrustRegion`. None: the trust region, for poles alone
         without bounds and priors only where Gauss-Newton leads nowhere.
