@@ -448,13 +448,13 @@ def test_an_estimate_has_the_names_that_rms_takes():
     A = np.diag(rng.uniform(0.5, 0.9, 4))
     sys = fx.StateSpace(
         A, rng.standard_normal((4, 3)), rng.standard_normal((5, 4)), np.zeros((5, 3)), 1e-3,
-        inputs=["w1", "n1", "n2"], outputs=["p0:rx", "p0:z", "p1:z", "y1", "y2"],
+        inputs=["w1", "y1:noise", "y2:noise"], outputs=["p0:rx", "p0:z", "p1:z", "y1", "y2"],
     )  # fmt: skip
     D = np.zeros((5, 3))
     D[3, 1] = D[4, 2] = 1.0
     plant = fx.plant.StandardPlant.from_statespace(
-        sys.replace(D=D), w=["w1", "n1", "n2"], u=[], z=["p0:rx", "p0:z", "p1:z"], y=["y1", "y2"],
-        asd={"w1": 1.0, "n1": 0.1, "n2": 0.1}, noise_factor=sys.B[:, :1],
+        sys.replace(D=D), w=["w1", "y1:noise", "y2:noise"], u=[], z=["p0:rx", "p0:z", "p1:z"], y=["y1", "y2"],
+        asd={"w1": 1.0, "y1:noise": 0.1, "y2:noise": 0.1}, noise_factor=sys.B[:, :1],
     )  # fmt: skip
     observer = fx.design_kalman(plant)
     found = observer.estimate({name: rng.standard_normal(50) for name in ("y1", "y2")})
