@@ -453,7 +453,8 @@ def test_an_estimate_has_the_names_that_rms_takes():
     D = np.zeros((5, 3))
     D[3, 1] = D[4, 2] = 1.0
     plant = fx.plant.StandardPlant.from_statespace(
-        sys.replace(D=D), w=["w1", "y1:noise", "y2:noise"], u=[], z=["p0:rx", "p0:z", "p1:z"], y=["y1", "y2"],
+        sys.replace(D=D),
+        w=["w1", "y1:noise", "y2:noise"], u=[], z=["p0:rx", "p0:z", "p1:z"], y=["y1", "y2"],
         asd={"w1": 1.0, "y1:noise": 0.1, "y2:noise": 0.1}, noise_factor=sys.B[:, :1],
     )  # fmt: skip
     observer = fx.design_kalman(plant)
