@@ -100,6 +100,23 @@ def test_the_scalar_optimum_lies_between_lower_and_gamma(a, dt):
     assert best * (1 - 1e-6) <= found.gamma <= 1.012 * best
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 22])
+def test_the_tolerance_is_kept_where_rounding_moves_the_norm(seed):
+    """At the optimum the loop's norm is 1e-5 above its gamma; 1e-8 gave twice the optimum."""
+    rng = np.random.default_rng(seed)
+    A, B, C = (rng.standard_normal(size) for size in ((5, 5), (5, 4), (3, 5)))
+    D = np.zeros((3, 4))
+    D[1, 3] = D[2, 2] = 1.0
+    P = StateSpace(A, B, C, D, inputs=["w1", "w2", "w3", "u"], outputs=["z1", "z2", "y"])
+    gammas = {
+        tolerance: design_hinf(P, Riccati(back_off=0.0, tolerance=tolerance), u="u", y="y").gamma
+        for tolerance in (1e-8, 1e-6, 1e-4, 1e-3)
+    }
+    for tolerance, gamma in gammas.items():
+        assert gamma <= min(gammas.values()) * (1.0 + 1.1 * tolerance + 1.5e-4), gammas
+
+
 def test_without_back_off_the_optimum_is_met_within_the_tolerance():
     found = checked(*scalar(1.0), Riccati(back_off=1e-3, tolerance=1e-4))
     assert found.gamma <= scalar_optimum(1.0) * 1.0013

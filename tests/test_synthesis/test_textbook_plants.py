@@ -7,7 +7,15 @@ import pytest
 
 from flexplant.lti import StateSpace, tf
 from flexplant.plant import StandardPlant, mixed_sensitivity
-from flexplant.synthesis import FixedOrder, Lmi, design_h2, design_hinf, design_structured
+from flexplant.synthesis import (
+    FixedOrder,
+    Lmi,
+    design_h2,
+    design_hinf,
+    design_ncf,
+    design_structured,
+    ncf_margin,
+)
 from oracles_synthesis import closed_loop, split
 from textbook_plants import KINDS, Problem, problem, strictly_proper
 
@@ -138,6 +146,42 @@ def test_the_least_h2_norm(kind):
     norm = oracle.h2_norm(oracle.scaled(loop, speed)) * np.sqrt(speed)
     assert norm == pytest.approx(found.gamma, rel=1e-3)
     assert found.gamma <= 1.002 * oracle.smallest_h2(p)
+
+
+def coprime(p):
+    """The H-infinity problem of robust loop shaping: [y; u] of noise at y and a force at u."""
+    parts = split(*p.parts, p.nu, p.ny)
+    A, B, C, D = (parts[name] for name in ("A", "B2", "C2", "D22"))
+    seen = np.hstack([np.eye(p.ny), D, D])
+    through = np.vstack([seen, np.eye(p.nu, p.ny + 2 * p.nu, p.ny + p.nu), seen])
+    drive = np.hstack([np.zeros((len(A), p.ny)), B, B])
+    return Problem("coprime", (A, drive, np.vstack([C, 0 * B.T, C]), through), p.nu, p.ny, p.dt)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["two lags", "double integrator", "two masses"])
+def test_robust_loop_shaping(kind):
+    """Weights that u and y do not know of stay in the plant; their slow poles do no harm."""
+    assert shaped_loop(kind, 2).word == "right"
+
+
+def shaped_loop(kind, seed):
+    """The verdict on `design_ncf`, by SLICOT's smallest norm of the same four blocks."""
+    p = problem(kind, seed)
+    found, best = design_ncf(posed(p), back_off=0.1), oracle.smallest_norm(coprime(p))
+    K = found.system
+    norm = oracle.loop_norm(coprime(p), (K.A, K.B, K.C, K.D))
+    return Verdict(found.gamma / best, found.lower / best, norm / best, 1.1001)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_robust_loop_shaping_in_any_unit_of_time(seed):
+    """Gains of 1e-9 to 1e9 next to 1 are another loop, but no other mathematics."""
+    P = posed(problem("other units", seed))
+    found = design_ncf(P)
+    assert found.gamma <= 1.1001 * found.lower
+    assert ncf_margin(P, found) == pytest.approx(1.0 / found.gamma, rel=1e-4)
 
 
 @pytest.mark.slow

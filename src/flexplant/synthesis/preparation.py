@@ -140,15 +140,23 @@ def less_feedthrough(K: Matrices, D22: FloatArray) -> Matrices:
 
 
 def prepared(
-    P: StateSpace, u: Sequence[str], y: Sequence[str], *, direct: bool = False
+    P: StateSpace,
+    u: Sequence[str],
+    y: Sequence[str],
+    *,
+    direct: bool = False,
+    speed: float | None = None,
 ) -> Prepared:
-    """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis."""
+    """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis.
+
+    `speed` [rad/s] is that of the loop, where it is known.
+    """
     dt, direct = P.dt, direct and bool(P.dt)
     m1, p1 = len(P.inputs) - len(u), len(P.outputs) - len(y)
     # balanced first: whether I + A can be inverted must not depend on the units of the states
     s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
     P, image = _with_image(P, *balanced(P.A, P.B, P.C, s))
-    speed = loop_speed(image, m1, p1, dt)
+    speed = speed or loop_speed(image, m1, p1, dt)
     departure = departure_from_normal(P.A, speed * (dt or 1.0))
     if departure > _MIXED:
         form = modal_form(P, largest_condition=_CONDITION * departure)
@@ -260,8 +268,11 @@ def require_stabilisable(plant: AnyPlant, problem: Prepared, what: str) -> None:
     require_reach(problem)
 
 
-def require_reach(problem: Prepared) -> None:
-    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable."""
+def require_reach(problem: Prepared, hidden: str = "") -> None:
+    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable.
+
+    `hidden`: what else may hide it.
+    """
     # weights included; Hautus' rank test in the prepared coordinates, whatever the user's units
     A = problem.A
     poles = np.linalg.eigvals(A)
@@ -279,7 +290,8 @@ def require_reach(problem: Prepared) -> None:
                 raise AssumptionError(
                     _delay_effect(problem, float(pole.real))
                     or f"{text} a mode of the plant or of a weight that is not stable "
-                    f"({_pole_in_words(problem, complex(pole))}): no controller can stabilise it. "
+                    f"({_pole_in_words(problem, complex(pole))}){hidden and ', or ' + hidden}: no "
+                    "controller can stabilise it. "
                     "Add or move an actuator or a sensor, or give the weight finite gain."
                 )
 

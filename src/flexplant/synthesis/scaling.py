@@ -97,7 +97,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     far = max(2.0 * THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
     omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
     G = responses(g, omega / (2.0 * np.pi))
-    # above the last corner of all answers nothing happens but that gains grow
+    # above the fastest pole and the last corner of all answers only gains grow
     plain = np.diff(_log_sizes(G - g.D[:, :, None], m1, p1)) * _POINTS
     corners = np.any(np.abs(plain - plain[:, -1:]) > np.log(_CORNER), axis=0)
     last = int(np.flatnonzero(corners)[-1]) if corners.any() else len(omega) - 1
@@ -114,7 +114,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     found = [omega[np.argmax(one)] for one in settled if one.any()]
     if not found:
         return float(np.exp(np.mean(np.log(sizes))))
-    return float(min(*found, omega[last]))
+    return float(min(*found, max(omega[last], sizes.max())))
 
 
 def _log_sizes(G: ComplexArray, m1: int, p1: int) -> FloatArray:

@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ...arrays import FloatArray, positive
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
-from ...lti.equations import OnAxisError, stabilising
+from ...lti.equations import OnAxisError
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
@@ -31,14 +31,17 @@ from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks,
 _REGULAR, _ADDED, _SINGULAR = 0.008, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
-#: steps of the bisection, and of going up from its result
-_BISECTION, _GROWTH = 60, 12
+#: most steps of the bisection
+_BISECTION = 60
 #: sensitivity at infinite frequency below which a central controller is taken for one of infinite
 #: gain
 _INFINITE = 1e-3
 #: relative: by how much rounding may put a gain above its gamma; a sensitivity at infinite
 #: frequency that is taken for zero
 _SLACK = 1e-6
+#: by how much a norm may exceed its gamma, relative to the distance from the smallest one. Of a lag
+#: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
+_MISSED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,14 +175,15 @@ class Riccati(Value):
         back_off: float,
         norm_of: Callable[[Prepared, StateSpace], float],
     ) -> tuple[StateSpace | None, float]:
-        """Return the backed-off controller with the norm of its loop, going up until it holds."""
+        """Return the backed-off controller with the norm of its loop."""
+        # next to the optimum rounding puts norms above their gammas, and a controller that misses
+        # by much of its distance hangs on rounding: the distance grows until the norm holds
         step = back_off if self.back_off is None else self.back_off
-        for _ in range(_GROWTH):
-            gamma = high * (1.0 + step)
-            controller = _attempt(problem, gamma).controller
+        while step < 1.0:
+            controller = _attempt(problem, high * (1.0 + step)).controller
             if controller is not None:
                 norm = norm_of(problem, controller)
-                if norm <= gamma * (1.0 + _SLACK):
+                if norm <= high * (1.0 + step + _MISSED * max(step, self.tolerance)):
                     return controller, norm
             step = max(2.0 * step, self.tolerance)
         return None, 1.0
@@ -326,8 +330,6 @@ def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArr
 
 def h2_controller(p: Prepared) -> StateSpace:
     """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
-    rows, columns = p.B2.shape[1], p.C2.shape[0]
-    _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
-    _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
-    A, D = p.A + p.B2 @ F + Ht.T @ p.C2, np.zeros((rows, columns))
+    (_, F), (_, Ht) = (side.least_squares() for side in both_sides(p))
+    A, D = p.A + p.B2 @ F + Ht.T @ p.C2, np.zeros((len(F), len(Ht)))
     return StateSpace(A, -Ht.T, F, D, inputs=p.y, outputs=p.u)

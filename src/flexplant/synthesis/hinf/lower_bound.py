@@ -140,6 +140,11 @@ class FullInformation(NamedTuple):
         B = np.hstack([self.B1, self.B2])
         return stabilising(self.A, B, self.C.T @ self.C, R, self.C.T @ D)
 
+    def least_squares(self) -> tuple[FloatArray, FloatArray]:
+        """Return X and its gain where w is zero: the least integral of |z|^2 is x' X x."""
+        R, S = self.D12.T @ self.D12, self.C.T @ self.D12
+        return stabilising(self.A, self.B2, self.C.T @ self.C, R, S)
+
     def value(self, gamma: float) -> FloatArray | None:
         """Return X (n, n) of x, None where gamma is refuted."""
         if gamma <= self.direct:

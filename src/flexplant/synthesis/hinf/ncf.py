@@ -11,16 +11,18 @@ from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
 from ...lti.discretisation import bilinear, tustin
+from ...lti.equations import OnAxisError, balanced_matrix, mean_speed
 from ...lti.frequency import Frf, frequency_response
 from ...lti.interconnection import connect, series
-from ...lti.minimal_realisations import minimal
 from ...lti.norms import peak_gain
-from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant
 from ...tolerances import TINY
+from ...words import inner_names
 from ..controller import Controller, with_left_out
+from ..preparation import Prepared, prepared, require_reach
+from .lower_bound import both_sides
 
 #: corner of the integral action of the recipe, beside the bandwidth
 _INTEGRAL = 0.1
@@ -186,10 +188,9 @@ def verified_controller(
     shaped: StateSpace, back_off: float
 ) -> tuple[StateSpace, float, Certificate]:
     """Return the controller of a shaped plant, the smallest gamma, and what was verified."""
-    part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
-    K, gamma, least = _robust(part, back_off)
+    problem = _four_blocks_of(shaped)
+    K, gamma, least, other = _robust(problem, back_off)
     margin, least_stable = loop_margin(shaped, K)
-    other = _least_by_factors(part)
     if not margin:
         raise hidden_mode(shaped, K)
     if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
@@ -242,43 +243,54 @@ def numbered(kind: str, count: int) -> list[str]:
     return [f"{kind}{i}" for i in range(count)]
 
 
-def power(M: FloatArray, exponent: float) -> FloatArray:
-    """Return a power of a symmetric, positive definite matrix."""
-    values, vectors = np.linalg.eigh(M)
-    return np.asarray((vectors * values**exponent) @ vectors.T)
+def _four_blocks_of(shaped: StateSpace) -> Prepared:
+    """Return the problem ``[n; f; u] -> [y; u; y]`` of a shaped plant, y with n and u with f."""
+    p, m = shaped.D.shape
+    u, y = shaped.inputs, shaped.outputs
+    seen = np.hstack([np.eye(p), shaped.D, shaped.D])
+    moved = np.hstack([np.zeros((m, p + m)), np.eye(m)])
+    whole = StateSpace(
+        shaped.A,
+        np.hstack([np.zeros((shaped.n_states, p)), shaped.B, shaped.B]),
+        np.vstack([shaped.C, np.zeros((m, shaped.n_states)), shaped.C]),
+        np.vstack([seen, moved, seen]),
+        shaped.dt,
+        inputs=[*inner_names(numbered("w", p + m), u), *u],
+        outputs=[*inner_names(numbered("z", p + m), y), *y],
+    )
+    # its speed is that of the loop of least |y|^2 + |u|^2, feedthrough apart
+    g = bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
+    hamiltonian = np.block([[g.A, -g.B @ g.B.T], [-g.C.T @ g.C, -g.A.T]])
+    poles = np.linalg.eigvals(balanced_matrix(hamiltonian)).astype(complex)
+    return prepared(whole, u, y, speed=mean_speed(poles))
 
 
-def continuous(shaped: StateSpace) -> StateSpace:
-    """Return the shaped plant in continuous time, gains kept."""
-    return bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
-
-
-def ncf_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
-    """Return X and Z of the Riccati equations of control and filtering (the bilinear map's too)."""
-    control, estimate = (control_dare, filter_dare) if g.dt else (control_care, filter_care)
-    R, S = np.eye(len(g.outputs)) + g.D @ g.D.T, np.eye(len(g.inputs)) + g.D.T @ g.D
+def _robust(p: Prepared, back_off: float) -> tuple[StateSpace, float, float, float]:
+    """Return the controller, its gamma, and the smallest gamma by two routes."""
+    control, estimate = both_sides(p)
     try:
-        X = control(g.A, g.B, Q=g.C.T @ g.C, R=S, S=g.C.T @ g.D).P
-        Z = estimate(g.A, g.C, Q=g.B @ g.B.T, R=R, S=g.B @ g.D.T).P
-    except SolverError as error:
+        (X, F), (Z, Ht) = control.least_squares(), estimate.least_squares()
+    except (OnAxisError, SolverError, la.LinAlgError) as error:
+        require_reach(p, "a zero of `before` or `after` lies on its pole")
         raise AssumptionError(
             f"no normalised coprime factors of the shaped plant were found: {error}"
         ) from error
-    return X, Z
-
-
-def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, float]:
-    """Return the controller of the shaped plant, its gamma, and the smallest gamma."""
-    X, Z = ncf_solutions(shaped)
-    g = continuous(shaped)
+    # X and Z do not depend on the units of u and y, F and H do
+    B, C = p.B2 @ np.linalg.inv(p.u_scale), np.linalg.solve(p.y_scale, p.C2)
+    D = np.linalg.solve(p.y_scale, np.linalg.solve(p.u_scale.T, p.D22.T).T)
+    F, H = p.u_scale @ F, Ht.T @ p.y_scale
     least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
     gamma = (1.0 + back_off) * least
-    S = np.eye(len(g.inputs)) + g.D.T @ g.D
-    F = -np.linalg.solve(S, g.D.T @ g.C + g.B.T @ X)
-    L = (1.0 - gamma**2) * np.eye(g.n_states) + X @ Z
-    gain = gamma**2 * np.linalg.solve(L.T, Z @ g.C.T)
-    K = StateSpace(g.A + g.B @ F + gain @ (g.C + g.D @ F), gain, g.B.T @ X, -g.D.T)
-    return (tustin(K, 1.0 / shaped.dt) if shaped.dt else K), gamma, least
+    L = (1.0 - gamma**2) * np.eye(len(X)) + X @ Z
+    gain = gamma**2 * np.linalg.solve(L.T, Z @ C.T)
+    plain = p.replace(u_scale=np.eye(len(p.u)), y_scale=np.eye(len(p.y)), D22=0 * p.D22)
+    K = plain.restored(p.A + B @ F + gain @ (C + D @ F), gain, B.T @ X, -D.T)
+    # of the normalised left coprime factors [N, M]; their feedthrough does not matter
+    root = la.cholesky(np.eye(len(D)) + D @ D.T, lower=True)
+    drive, sight = np.hstack([B + H @ D, H]), la.solve_triangular(root, C, lower=True)
+    factors = StateSpace(p.A + H @ C, drive, sight, np.zeros((len(sight), drive.shape[1])))
+    other = float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))
+    return K, gamma, least, other
 
 
 def require_model(plant: object) -> None:
@@ -310,19 +322,3 @@ def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
     k = np.diag(1.0 / gains / np.hypot(1.0, _INTEGRAL))
     action = StateSpace(np.zeros((count, count)), np.eye(count), _INTEGRAL * omega * k, k)
     return tustin(action, 1.0 / shaped.dt) if shaped.dt else action
-
-
-def _least_by_factors(shaped: StateSpace) -> float:
-    """Return ``(1 - |[N, M]|_H^2)^(-1/2)``, the smallest gamma by a Hankel norm."""
-    _, Z = ncf_solutions(shaped)
-    g = continuous(shaped)
-    R = np.eye(len(g.outputs)) + g.D @ g.D.T
-    H = -np.linalg.solve(R, (g.B @ g.D.T + Z @ g.C.T).T).T
-    root = power(R, -0.5)
-    factors = StateSpace(
-        g.A + H @ g.C,
-        np.hstack([g.B + H @ g.D, H]),
-        root @ g.C,
-        root @ np.hstack([g.D, np.eye(R.shape[0])]),
-    )
-    return float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))
