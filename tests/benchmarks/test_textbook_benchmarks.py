@@ -1,4 +1,4 @@
-"""H-infinity and loop shaping on 22 kinds of textbook plants: right, loose, wrong, refused, by kind.
+"""H-infinity and loop shaping, 22 kinds of textbook plants: right, loose, wrong, refused, by kind.
 
 Run with ``-m benchmark -s``; TEXTBOOK_SEEDS="100 108" draws other problems of every kind.
 """
