@@ -282,7 +282,7 @@ def _robust(p: Prepared, back_off: float) -> tuple[StateSpace, float, float, flo
     least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
     gamma = (1.0 + back_off) * least
     L = (1.0 - gamma**2) * np.eye(len(X)) + X @ Z
-    gain = gamma**2 * np.linalg.solve(L.T, Z @ C.T)
+    gain: FloatArray = np.asarray(gamma**2 * np.linalg.solve(L.T, Z @ C.T), dtype=float)
     plain = p.replace(u_scale=np.eye(len(p.u)), y_scale=np.eye(len(p.y)), D22=0 * p.D22)
     K = plain.restored(p.A + B @ F + gain @ (C + D @ F), gain, B.T @ X, -D.T)
     # of the normalised left coprime factors [N, M]; their feedthrough does not matter
