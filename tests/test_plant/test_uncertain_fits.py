@@ -140,7 +140,7 @@ def test_what_was_measured_determines_shares_or_says_that_it_does_not(seed, damp
     fit = fx.update(model, unknown, [fx.Eigenvalues(data)])
     known = fit.uncertainty()
     assert known.undetermined == open_modes
-    assert "not determined by what was measured: modes " in repr(known)
+    assert "not determined by the measurement: modes " in repr(known)
     assert known.share.max() < 1e3
     plant = fx.assemble_plant(fit.calibrated(data), PORTS)
     with pytest.raises(ModelError, match=f"mode {open_modes[0]}"):

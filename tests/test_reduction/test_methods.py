@@ -357,7 +357,7 @@ def test_refusals(plate):
 @pytest.mark.parametrize("method", [Guyan, CraigBampton])
 def test_the_degrees_of_freedom_to_add_are_named(plate, kept, method):
     """What the refusal proposes is enough, and is displacements."""
-    with pytest.raises(ModelError, match=r"Keep '.*Rubin") as caught:
+    with pytest.raises(ModelError, match=r"Keep for example '.*Rubin") as caught:
         reduce(plate, method(kept))
     more = re.findall(r"'(\d+:\w+)'", str(caught.value))
     assert more

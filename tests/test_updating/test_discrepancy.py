@@ -63,7 +63,7 @@ def fitted(individual, modes=KNOWN, elastic=True):
     unknown = [fx.AddedMass(z8)]
     if elastic:
         unknown.append(fx.MatrixParameter("E", dK=model.K))
-    with pytest.warns(FlexplantWarning, match="weigh each value by what the model can explain"):
+    with pytest.warns(FlexplantWarning, match="values are weighted by the accuracy of the model"):
         return fx.update(model, unknown, [fx.Eigenvalues(measured(individual, modes))])
 
 

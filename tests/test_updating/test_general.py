@@ -212,7 +212,7 @@ def test_a_prior_is_one_more_measurement(chain):
     off = update(chain, known, residuals, prior=False)
     assert np.abs((off.values - plain.values) / plain.std).max() < 1e-5
     # without noise nothing weighs the prior against the data
-    with pytest.warns(FlexplantWarning, match="take no part"):
+    with pytest.warns(FlexplantWarning, match="are not used"):
         exact = update(chain, known, [Eigenvalues(measured(parts))])
     np.testing.assert_allclose(exact.values, [0.3, 0.2], rtol=1e-7)
     # bounds alone: the model itself, a third of the farther bound
@@ -610,9 +610,9 @@ def test_bad_input_is_refused(chain):
         AddedMass("2:z", prior=(0.0, 0.0))
     with pytest.raises(LabelError, match="to='' is no place"):
         AddedMass("2:z", to="")
-    with pytest.raises(ModelError, match="acts on nothing"):
+    with pytest.raises(ModelError, match="has no effect"):
         update(chain, [AddedMass("2:z", to="2:z")], residuals)
-    with pytest.raises(ModelError, match="changes nothing"):
+    with pytest.raises(ModelError, match="has no effect"):
         MatrixParameter("x", dM=np.zeros((4, 4)))
     with pytest.raises(ModelError, match="symmetric"):
         MatrixParameter("x", dM=np.triu(np.ones((4, 4))))

@@ -134,7 +134,7 @@ def test_responses_that_a_model_does_not_explain_print_no_deviation(chain):
         assert any("more than noise" in str(one.message) for one in said) != printed
         named = [line for line in repr(fit).splitlines() if "mass at 2:z =" in line]
         assert len(named) == 1 and ("+-" in named[0]) == printed
-        assert ("no +-: what is left is no noise" in repr(fit)) != printed
+        assert ("no +-: the residual is coherent" in repr(fit)) != printed
 
 
 @pytest.mark.slow

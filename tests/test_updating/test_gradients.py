@@ -281,7 +281,7 @@ def test_bad_input_is_refused(plate):
         FrfResidual(frf, variance=np.ones(3))
     with pytest.raises(ModelError, match="lines"):
         FrfResidual(frf, lines=[2])
-    with pytest.raises(LabelError, match="no channels"):
+    with pytest.raises(LabelError, match="not channels"):
         FrfResidual(frf, places={"y9": "1:z"})
     with pytest.raises(ModelError, match="imaginary"):
         Antiresonances([-1.0], "1:z", "2:z")

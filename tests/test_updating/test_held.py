@@ -131,7 +131,7 @@ def test_what_a_hold_refuses(make):
     frf = as_frf(exact(cases(make)["held"], np.zeros(3)))
     with pytest.raises(ModelError, match="samples of a hold"):
         FrfResidual(frf, delay=1.0)
-    with pytest.raises(ModelError, match="nothing is known above 4 Hz"):
+    with pytest.raises(ModelError, match="only known up to 4 Hz"):
         FrfResidual(frf, hold=8.0)
     with pytest.raises(ModelError, match="jump"):
         FrfResidual(frf.replace(quantity="acceleration"), hold=RATE)

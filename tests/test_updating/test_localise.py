@@ -54,7 +54,7 @@ def test_two_masses_are_found_together(plate, uneven, seed):
         assert value == pytest.approx(hidden[name], rel=0.05)
     assert found.p_value > 1e-3
     assert found.dof == 22
-    assert "MORE THAN NOISE" not in repr(found)
+    assert "RESIDUAL EXCEEDS NOISE" not in repr(found)
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
     with pytest.warns(FlexplantWarning, match=r"more than noise: chi-square.*It fits worst mode"):
         found = localise(uneven, few, data, most=2)
     assert found.p_value < 1e-4
-    assert "MORE THAN NOISE IS LEFT" in repr(found)
+    assert "RESIDUAL EXCEEDS NOISE" in repr(found)
 
 
 @pytest.mark.slow

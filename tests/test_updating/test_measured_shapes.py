@@ -56,7 +56,7 @@ def test_shapes_and_places_come_with_the_measured_modes(chain):
         ModeShapes(MeasuredModes(poles, modes=[1, 2, 3, 4]))
     with pytest.raises(ShapeError, match="at="):
         ModeShapes(own, shapes)
-    with pytest.raises(LabelError, match="no channels"):
+    with pytest.raises(LabelError, match="not channels"):
         ModeShapes(own, at={"x": "1:z"})
 
 

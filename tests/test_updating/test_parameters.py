@@ -60,8 +60,8 @@ def test_a_parameter_survives_a_file(tmp_path):
 @pytest.mark.parametrize("kind", [AddedMass, AddedDamping, AddedStiffness])
 def test_bad_places_are_refused(kind, plate):
     for at, error, cause in [
-        ("", LabelError, "is no place"),
-        ({}, LabelError, "is no place"),
+        ("", LabelError, "is not a place"),
+        ({}, LabelError, "is not a place"),
         ((0.1, 0.2), ShapeError, "at must have shape"),
         ((0.1, 0.2, np.nan), ModelError, "at has a NaN"),
         ({"1:z": np.inf}, ModelError, "weight of '1:z'"),
@@ -75,7 +75,7 @@ def test_bad_places_are_refused(kind, plate):
         kind("999:z").matrices(rom)
     with pytest.raises(LabelError, match="off the plate"):
         kind((0.7, 0.1, 0.0)).matrices(rom)
-    with pytest.raises(ModelError, match="acts on nothing"):
+    with pytest.raises(ModelError, match="has no effect"):
         kind({plate.z8: 0.0}).matrices(rom)
 
 

@@ -92,11 +92,11 @@ def test_a_prior_that_takes_no_part_is_named(wrong):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fit = fx.update(model, fitted, [fx.Eigenvalues(bare)])
-    said = [str(one.message) for one in caught if "take no part" in str(one.message)]
+    said = [str(one.message) for one in caught if "are not used" in str(one.message)]
     assert len(said) == 1
     assert all(q.name in said[0] for q in fitted) and "modes 1, 2, 3, 4" in said[0]
-    assert "priors that took no part: " in repr(fit)
+    assert "unused priors: " in repr(fit)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fx.update(model, fitted, [fx.Eigenvalues(bare)], prior=False)
-    assert not any("take no part" in str(one.message) for one in caught)
+    assert not any("are not used" in str(one.message) for one in caught)

@@ -75,7 +75,7 @@ class ModalTruncation(ReductionMethod):
         super().__post_init__()
         if (self.count is None) == (self.modes is None):
             raise ModelError(
-                "ModalTruncation needs either count= (the lowest modes) or modes=. Give one of "
+                "ModalTruncation needs count= (the lowest modes) or modes=, not both. Give one of "
                 "them."
             )
 

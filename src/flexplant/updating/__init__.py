@@ -1,15 +1,15 @@
 """Model updating: parameters, residuals, sensitivities, searches and their judgement.
 
-What the drawing has wrong is found from what was measured, with its uncertainty.
+Errors of a model are found from measurements, together with their uncertainty.
 
 - `update(model, parameters, residuals)`: parameters are `AddedMass`, `AddedDamping`,
   `AddedStiffness`, `MatrixParameter`, ...; residuals `Eigenvalues`, `ModeShapes`, `FrfResidual`,
   `Antiresonances`, `StaticCompliance`; chi-square says whether they explain the data.
-- `localise(model, candidates, residuals)`: where the error is, among candidates.
-- `identifiability`: what the data can say at all; `validate` with data left out.
+- `localise(model, candidates, residuals)`: the place of an error, among candidates.
+- `identifiability`: parameters that the data determine; `validate` with data left out.
 - `UpdateResult.calibrated(measured)`: the measured poles in the model; `applied_to(full)`: the
   updated full model.
-- `UpdateResult.uncertainty()`: what remains open of each mode, for controllers that tolerate it.
+- `UpdateResult.uncertainty()`: remaining uncertainty of each mode, for tolerant controllers.
 
 >>> import flexplant as fx
 >>> nominal = fx.chain(masses=[1.0, 0.3, 0.2], stiffnesses=[2e4, 3e4])

@@ -1,4 +1,4 @@
-"""A model with its parameters at other values, and the full structure in a basis for them."""
+"""A model with changed parameters, and the full structure in a basis for them."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def changed_model(
     family: Family | None = None,
     std: FloatArray | None = None,
 ) -> Any:
-    """Return the model with the parameters at `p`, a reduced one with the rigid-body basis left."""
-    # `family`: of the same parameters; `std`: their standard deviations, for an error
+    """Return the model with the parameters at `p` and its remaining rigid-body motions."""
+    # `family` has the same parameters; `std` are their standard deviations, for an error message
     if isinstance(model, FEModel):
         total = _changes(model, parameters, p)
         try:
@@ -61,9 +61,9 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
         q.matrices(model)[1] is not None and v for q, v in zip(parameters, p, strict=True)
     ):
         warn(
-            "the model has no D of its own: that of the updated model holds the parameters of the "
-            "update alone, and solve_modes(..., damping=) would replace it. Apply the update to a "
-            "model that has its damping, model.with_damping(ModalDamping(0.01)), say."
+            "the model has no D: the D of the updated model would contain only the parameters of "
+            "the update, and solve_modes(..., damping=) would replace it. Apply the update to a "
+            "model with damping, for example model.with_damping(ModalDamping(0.01))."
         )
     return changed_model(model, parameters, p)
 
@@ -72,7 +72,7 @@ def _changes(
     model: FEModel, parameters: Sequence[Parameter], p: FloatArray
 ) -> dict[str, Matrix | None]:
     """Return M, D and K with the parameters at `p`."""
-    # changes of a few places each first: the model's own matrices are large
+    # add the small changes first, since the matrices of the model are large
     total: dict[str, Matrix | None] = dict.fromkeys("MDK")
     for parameter, value in zip(parameters, p.tolist(), strict=True):
         for name, part in zip("MDK", parameter.change(model, value), strict=True):
@@ -81,7 +81,7 @@ def _changes(
 
 
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
-    """Return the model when its D fails for nothing but a slight negative drag of rigid motion."""
+    """Return the model if its D fails only by a slight negative damping of rigid motion."""
     # its sign does not matter below 1e-4 of the first elastic frequency (`normal_form`)
     D = changes["D"]
     if D is None or not model.rigid_body.shape[1]:
@@ -96,7 +96,7 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     first = solve_modes(held, count=rigid.shape[1] + 1).omega[-1]
     if drag > RIGID_DRAG * float(first):
         return None
-    # the rigid-body part of D + d M comes out at 0 in theory, so twice d: above rounding
+    # the rigid-body part of D + d M is 0 in theory, so that twice d is above rounding
     shifted = matrix_sum(D, 2.0 * drag * held.M)
     try:
         model.replace(D=shifted)
@@ -113,7 +113,7 @@ def _replaced(
     std: FloatArray | None,
 ) -> Any:
     try:
-        # how a machine was joined was checked with the matrices before
+        # the joints of a machine were checked with the previous matrices
         gone = {"joining": None} if getattr(model, "joining", None) is not None else {}
         return model.replace(**changes, **gone)
     except ModelError as error:
@@ -129,7 +129,7 @@ def _replaced(
 def _impossible(
     model: Any, changes: dict[str, Any], parameters: Sequence[Parameter], p: FloatArray
 ) -> str:
-    """Return in words that D or K is indefinite, by which parameters; empty when neither is."""
+    """Return a text on an indefinite D or K and the parameters that cause it, else empty."""
     for name in "DK":
         said = "" if changes[name] is None else why_indefinite(changes[name], name)
         if not said:
@@ -142,17 +142,17 @@ def _impossible(
         ]
         keep = ", ".join(negative) or "the parameters"
         return (
-            f"{said} The measurement alone does not keep {keep} to what is possible: give bounds=, "
-            "(0.0, None) for what can only be added, or measure more."
+            f"{said} The measurement alone does not keep {keep} physical: give bounds=, (0.0, "
+            "None) for quantities that can only be added, or measure more."
         )
     return ""
 
 
-#: modes of the basis for each coordinate of the reduced model
+#: number of modes of the basis for each coordinate of the reduced model
 WIDER = 4
-#: DOFs from which an FEModel is updated in such a basis, and from which it is too large for that
+#: number of DOFs above which an FEModel is updated in such a basis, and above which it is too large
 LARGE, TOO_LARGE = 300, 20_000
-#: bases of a large FEModel until its estimate moves no more
+#: largest number of bases of a large FEModel until its estimate is constant
 MOST_ROUNDS = 10
 
 
@@ -162,9 +162,9 @@ def is_large(model: Any) -> bool:
         return False
     if model.n_dof > TOO_LARGE:
         raise ModelError(
-            f"updating an FEModel of {model.n_dof} DOFs (limit {TOO_LARGE}) solves it anew for "
-            "each estimate. Reduce it, rom = reduce(...), and pass update(rom, ..., full=model): "
-            "a few solutions then do."
+            f"updating an FEModel of {model.n_dof} DOFs (limit {TOO_LARGE}) solves it again for "
+            "each estimate. Reduce it, rom = reduce(...), and pass update(rom, ..., "
+            "full=model), which needs a few solutions."
         )
     return True
 
@@ -193,8 +193,8 @@ class FullBasis:
         if reduced is not None and full.dofs.labels != reduced.full_dofs.labels:
             raise ModelError(
                 f"full has {len(full.dofs)} DOFs that are not the {len(reduced.full_dofs)} of the "
-                "reduced model's structure, in this order: they are not of one structure. Pass "
-                "the FEModel that was reduced."
+                "reduced model's structure, in this order: they belong to different structures. "
+                "Pass the FEModel that was reduced."
             )
         self.full, self.reduced = full, reduced
         self.parameters, self.residuals = tuple(parameters), tuple(residuals)
@@ -202,19 +202,19 @@ class FullBasis:
         loads = [full.dofs.row(place, direction) for place, direction in loaded]
         for q in parameters:
             if isinstance(q, PointParameter):
-                loads += q.rows(full)  # the force of p r r^T is along r
+                loads += q.rows(full)  # the force of p r r^T acts along r
         try:
             for q in parameters:
                 q.matrices(full)
         except ShapeError as error:
             raise ShapeError(
-                f"{error} The full model needs the matrices of all its DOFs: give those, they are "
-                "projected on the reduced model."
+                f"{error} The full model needs the matrices of all its DOFs: give these; they "
+                "are projected on the reduced model."
             ) from None
         self.loads = np.array(loads).reshape(-1, full.n_dof).T
 
     def at(self, p: FloatArray) -> ReducedModel:
-        """Return the full model, its parameters at zero, in the basis that is good at `p`."""
+        """Return the full model with zero parameters, in the basis that is accurate at `p`."""
         full, V = self.full, self._basis(p)
         M, K = (np.asarray(V.T @ (part @ V)) for part in (full.M, full.K))
         D = np.zeros_like(M)
@@ -263,7 +263,7 @@ class FullBasis:
         return V
 
     def _modes(self, model: FEModel) -> FloatArray:
-        """Return the shapes of a changed model that take part."""
+        """Return the shapes of a changed model that belong to the basis."""
         n = model.n_dof
         if self.reduced is not None:
             return np.real(solve_modes(model, count=min(WIDER * self.reduced.n_dof, n)).phi)

@@ -1,4 +1,4 @@
-"""What a model cannot explain, and by what shares its modes may be off."""
+"""Errors that a model cannot explain, and the resulting uncertainty of its modes."""
 
 from __future__ import annotations
 
@@ -23,29 +23,30 @@ from .search import Objective, SearchEnd
 from .search.objective import SearchPlan
 from .sensitivities import eigenvalue_sensitivities
 
-#: degrees of freedom that the usual discrepancy of a kind counts: two measured modes outweigh it,
-#: and none measured leaves it
+#: degrees of freedom of the usual discrepancy of a kind: two measured modes outweigh it, and it
+#: holds without measured modes
 USUAL_DOF = 2.0
-#: rounds of weights and parameters, and relative change of the deviations at which they end
+#: largest number of rounds of weights and parameters, and relative change of the deviations at
+#: which they end
 _ROUNDS, _SETTLED = 20, 0.01
-#: rows that are weighed against each other: matrices of the rows' number are factored
+#: largest number of rows with a joint covariance, which is factored
 _MOST_ROWS = 1000
-#: range of the deviations searched, in units of the usual ones
+#: search range of the deviations, in units of the usual ones
 _LEAST, _MOST = 1e-3, 1e4
 
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy(Value):
-    """What a model is off by in one kind of measured values, beside the noise.
+    """Model error in one kind of measured values, in addition to noise.
 
     Parameters
     ----------
     kind : str
         ``"frequency"``, ``"damping"``, ``"mode shape"``, ...
     deviation : float
-        Standard deviation, as a share of the measured value.
+        Standard deviation relative to the measured value.
     dof : float
-        Degrees of freedom of its estimate: of Student's distribution of a further value.
+        Degrees of freedom of its estimate, for Student's distribution of a further value.
 
     Examples
     --------
@@ -63,9 +64,9 @@ def restricted(
 ) -> tuple[list[Discrepancy], FloatArray]:
     """Return the discrepancy of each kind, and the covariance V (m, m) of the residuals with them.
 
-    ``V = N + sum_k s_k^2 F_k F_k^T`` maximises the likelihood of what the parameters leave,
+    ``V = N + sum_k s_k^2 F_k F_k^T`` maximises the likelihood of the residual,
     ``-(ln|V| + ln|J^T V^-1 J| + r^T P r)/2`` with ``P = V^-1 - V^-1 J (J^T V^-1 J)^-1 J^T V^-1``,
-    times a scaled inverse chi-square density of each s_k^2 about what is usual.
+    times a scaled inverse chi-square density of each s_k^2 about the usual value.
     [PattersonThompson1971]_; [KennedyOHagan2001]_ (the discrepancy).
     """
     from scipy.optimize import minimize
@@ -112,7 +113,7 @@ def restricted(
 
 
 class _Weighed(Bound):
-    """Residuals of another model's accuracy: whitened by noise and discrepancy together."""
+    """Residuals that are whitened by noise and discrepancy together."""
 
     noisy = True
 
@@ -127,7 +128,7 @@ class _Weighed(Bound):
         return np.asarray(la.solve_triangular(self.factor, rows, lower=True))
 
     def values(self, point: Point) -> FloatArray:
-        """Return them whitened."""
+        """Return the whitened residuals."""
         return self.white(self.own.values(point))
 
     def slopes(self, point: Point) -> FloatArray:
@@ -139,16 +140,16 @@ class _Weighed(Bound):
         return self.own.row_name(row)
 
     def assigned(self, point: Point) -> Point:
-        """Return the point as the residual itself numbers it."""
+        """Return the point with the mode numbers of the residual."""
         return self.own.assigned(point)
 
 
 def weigh_discrepancy(
     objective: Objective, search: SearchPlan, end: SearchEnd
 ) -> tuple[SearchEnd, tuple[Discrepancy, ...]]:
-    """Return the end of a search with the discrepancy as part of the noise, and the discrepancy."""
-    # in turn: the variances at the estimate, the estimate with these. None with responses, where an
-    # error of a model is no noise from line to line
+    """Return the end of a search with the discrepancy as noise, and the discrepancy."""
+    # alternate: the variances at the estimate, and the estimate with these. None with responses,
+    # where a model error is correlated over lines
     rows = objective.rows(objective.at(end.p))
     kinds = [bound.kinds() for bound, _ in rows]
     count = rows[-1][1].stop
@@ -171,7 +172,7 @@ def weigh_discrepancy(
         objective.bounds, objective.defect = own, defect
         point = objective.at(end.p)
         r, J = objective.values(point), objective.slopes(point)
-        # priors are measured values without a discrepancy
+        # priors count as measured values without a discrepancy
         extra = r.size - count
         widened = [k._replace(F=np.pad(k.F, ((0, extra), (0, 0)))) for k in spread]
         found, V = restricted(r, J, la.block_diag(noise, np.eye(extra)), widened)
@@ -192,43 +193,41 @@ def weigh_discrepancy(
     return end, tuple(found)
 
 
-#: least relative errors of measured frequencies and damping: a machine drifts by more than its
+#: least relative errors of measured frequencies and damping: the drift of a machine exceeds the
 #: noise, and its damping depends on amplitude and temperature
 _DRIFT = (1e-3, 0.02)
-#: deviations that count of a measured pole
+#: number of standard deviations that count for a measured pole
 _DEVIATIONS = 2.0
-#: of the error that two meshes show: it covered 55 to 100 % of modes
+#: factor on the error between two meshes: without it 55 to 100 % of modes were covered
 _MESH = 1.5
-#: probability outside an interval, both sides together
+#: probability outside of an interval, both sides together
 _OUTSIDE = 0.05
-#: relative deviation of measured poles whose noise is not known: that of rounding
+#: relative deviation of measured poles with unknown noise: rounding only
 _EXACT = 1e-9
-#: deviation of the logarithm of a damping that says nothing
+#: standard deviation of the logarithm of a damping ratio without information
 _SILENT = 1e2
-#: relative change of the pole that a parameter changes most, by which the parameter may be off
-#: before anything is measured
+#: prior uncertainty of a parameter: relative change of the pole that it changes most
 _WIDE = 1.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalUncertainty(Value):
-    """By what shares frequencies and damping ratios of a model's elastic modes may be off.
+    """Relative uncertainty of frequencies and damping ratios of the elastic modes of a model.
 
-    ``plant.uncertain(...)`` takes it. Made by ``fit.uncertainty(...)``.
+    Made by ``fit.uncertainty(...)``; an argument of ``plant.uncertain(...)``.
 
     Parameters
     ----------
     modes : sequence of m int
-        Elastic modes, from 1, rigid-body modes included.
+        Numbers of elastic modes, counted from 1 with rigid-body modes.
     share : (2 m,) array
-        Half-widths of the intervals of frequencies, then of damping ratios: 95 % of the true values
-        are meant to lie inside.
+        Half-widths of the 95 % intervals of frequencies, then of damping ratios.
     covariance : (2 m, 2 m) array
-        Of the logarithms of frequencies, then of damping ratios, jointly: noise of the
-        measured poles, parameters and what the model cannot explain. Half-widths hold bias, drift,
-        mesh and Student's distribution beside it.
+        Joint covariance of the logarithms of frequencies, then of damping ratios: noise of the
+        measured poles, parameters and model error. The half-widths also include bias, drift, mesh
+        and Student's distribution.
     poles : (m,) complex array [rad/s]
-        Of the model.
+        Poles of the model.
 
     Examples
     --------
@@ -247,17 +246,17 @@ class ModalUncertainty(Value):
 
     @property
     def frequency(self) -> dict[int, float]:
-        """The share of each mode's frequency."""
+        """Relative uncertainty of the frequency of each mode."""
         return dict(zip(self.modes, self.share.tolist(), strict=False))
 
     @property
     def damping(self) -> dict[int, float]:
-        """The share of each mode's damping ratio."""
+        """Relative uncertainty of the damping ratio of each mode."""
         return dict(zip(self.modes, self.share[len(self.modes) :].tolist(), strict=True))
 
     @property
     def undetermined(self) -> tuple[int, ...]:
-        """Modes whose frequencies the measured poles do not determine: off by 100 % or more."""
+        """Modes with a frequency that is not determined (uncertainty of 100 % or more)."""
         return tuple(mode for mode, share in self.frequency.items() if share >= 1.0)
 
     def __repr__(self) -> str:
@@ -270,24 +269,24 @@ class ModalUncertainty(Value):
         ]
         if open_ones := self.undetermined:
             names = some_names([str(mode) for mode in open_ones])
-            parts.append(f"not determined by what was measured: modes {names}")
+            parts.append(f"not determined by the measurement: modes {names}")
         return f"<ModalUncertainty: {counted(m, 'mode')}, {', '.join(parts)}>"
 
 
 def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalUncertainty:
-    """Return by what shares modes may be off; see `UpdateResult.uncertainty`."""
+    """Return the relative uncertainty of modes; see `UpdateResult.uncertainty`."""
     instance(mesh, MeshError | None, "mesh", "Make it by modes.mesh_error(finer).")
     calibrated = measured is not None
     if measured is None:
         measured = fit.fitted_poles
         if measured is None:
             raise ModelError(
-                "what the model is off by is judged by measured poles, and the fit was not made "
-                "from one set of them. Pass them: fit.uncertainty(measured)."
+                "the model error is judged by measured poles, but the fit does not contain one "
+                "set of poles. Pass them: fit.uncertainty(measured)."
             )
     about = [q.about(v) for q, v in zip(fit.unknowns, fit.values.tolist(), strict=True)]
     found = eigenvalue_sensitivities(fit.model, about)
-    # attachment vectors stand for modes left out: no machine has their frequencies
+    # attachment vectors represent truncated modes: no machine has their frequencies
     m = len(found.modes) - getattr(fit.model, "n_vectors", 0)
     found = found.replace(modes=found.modes[:m], poles=found.poles[:m], S=found.S[:m])
     elastic = range(found.modes[0], found.modes[-1] + 1)
@@ -296,7 +295,7 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     own = found.poles[places]
     both = np.r_[places, m + places]
     S = _relative_changes(found.poles, found.S)
-    # the damping of a model or a measurement without any says nothing
+    # zero damping of a model or a measurement has no information
     damped = np.minimum(_damping(poles), _damping(own)) > ZETA
     said = np.r_[np.full(damped.size, True), damped]
     ratio = _damping(poles) / divisor(_damping(own))
@@ -309,12 +308,12 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     least = np.where(said, 0.5 * np.diag(known), 0.0)
     grown = growth(np.abs(found.poles), np.abs(poles))
     mean, covariance, dof = _conditioned(S, both, gap, noise, np.r_[grown, np.ones(m)], fit)
-    # rounding of what is known well must not make a variance negative
+    # rounding of well-known values must not make a variance negative
     covariance[both, both] = np.maximum(covariance[both, both], least)
     model = found.poles
     if calibrated:
         mean[both], model = 0.0, _calibrated_poles(fit, measured, model, places)
-        # a damping that says nothing of the model's is measured all the same
+        # a damping ratio is measured even if the model has no damping
         silent = both[~said]
         covariance[silent], covariance[:, silent] = 0.0, 0.0
         covariance[silent, silent] = np.diag(known)[~said]
@@ -322,7 +321,7 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
 
     width = np.repeat(stdtrit(dof, 1 - 0.5 * _OUTSIDE), m)
     width[both] = _DEVIATIONS
-    # of logarithms: the upper side is the wider one
+    # in logarithms, so that the upper side is wider
     share = np.expm1(np.abs(mean) + width * np.sqrt(np.diag(covariance)))
     if mesh is not None:
         for mode, error in zip(mesh.modes.tolist(), mesh.error.tolist(), strict=True):
@@ -351,10 +350,10 @@ def _calibrated_poles(
 def _conditioned(
     S: FloatArray, both: FloatArray, gap: FloatArray, noise: FloatArray, grown: FloatArray, fit: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean and covariance of the relative errors of all modes, given the measured ones."""
-    # `d = S dp + s g (e + 1 c)` with independent e of each mode and c of all, s by restricted
-    # likelihood, g how errors grow with frequency; normal, conditioned on `gap = d + noise`.
-    # Degrees of freedom of s last
+    """Return mean and covariance of relative errors of all modes, given the measured ones."""
+    # `d = S dp + s g (e + 1 c)` with independent e of each mode and common c, s from restricted
+    # likelihood, and g the growth of errors with frequency; normal, conditioned on `gap = d +
+    # noise`. The last result is the degrees of freedom of s
     m, measured = len(S) // 2, both.size // 2
     shared = np.kron(np.eye(2), np.ones((m, 1))) * grown[:, None]
     each = np.diag(grown[both])
@@ -367,7 +366,7 @@ def _conditioned(
     s = np.repeat([one.deviation for one in sizes], m)
     alone = all(isinstance(one, Eigenvalues) for one in fit.residuals)
     if alone or fit.covariance is None:
-        # of all modes: measured ones may not move with a parameter that others hang on
+        # over all modes: measured modes may not depend on a parameter that others depend on
         wide = _WIDE * S / divisor(np.abs(S).max(axis=0))
         parameters = wide @ wide.T
     else:
@@ -386,6 +385,6 @@ def _damping(poles: ComplexArray) -> FloatArray:
 def _relative_changes(poles: ComplexArray, changes: ComplexArray) -> FloatArray:
     """Return relative changes (2m, q) of frequencies and of damping ratios by those of poles."""
     part = np.real(changes / poles[:, None])
-    # an undamped pole has no relative damping: nothing is said of it
+    # an undamped pole has no relative damping, so that it is left out
     damped = np.where(_damping(poles) > ZETA, poles.real, np.inf)
     return np.vstack([part, changes.real / damped[:, None] - part])

@@ -54,9 +54,9 @@ class Eigen:
 class Family:
     """The pencils of a model over its parameters, in coordinates where M = I and K is diagonal.
 
-    In SI rigid-body modes come out at 1e-4 rad/s and the lowest elastic ones lose digits to the
-    highest. With DOFs that have neither mass nor damper the coordinates are the model's own: these
-    are condensed statically at each value of the parameters.
+    In SI, rigid-body modes would be computed as 1e-4 rad/s and the lowest elastic modes would lose
+    digits. With DOFs that have neither mass nor damper, the coordinates of the model are kept, and
+    these DOFs are condensed statically at each value of the parameters.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Family:
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
-        #: the modes without any change, once for all families of some of the parameters
+        #: the unchanged modes, shared by all families of some of the parameters
         self._unchanged: list[Eigen] = []
 
     def of(self, parameters: Sequence[int]) -> Family:
@@ -156,7 +156,7 @@ class Family:
         return ", ".join(q.text(v) for q, v in zip(self.parameters, p.tolist(), strict=True))
 
     def changes(self, p: FloatArray) -> list[FloatArray]:
-        """Return what the parameters add to M, D and K of the model itself."""
+        """Return the terms that the parameters add to M, D and K of the model."""
         return [np.tensordot(self._curves(p)[0], stack, axes=1) for stack in self.physical]
 
     def rigid_left(self, p: FloatArray) -> FloatArray:
@@ -184,7 +184,7 @@ class Family:
         try:
             if self.condensed:
                 return self._condensed(M, D, K, self.rigid @ self.rigid_left(p))
-            # a search meets many impossible masses: they are refused before anything is solved
+            # a search tries many impossible masses, which are refused before anything is solved
             _require_inertia(M)
             rigid = self.rigid @ self.rigid_left(p)
             omega, W = _modal_basis(M, K, rigid)
@@ -209,7 +209,7 @@ class Family:
 
     @cached_property
     def _holds(self) -> list[FloatArray]:
-        """What the stiffness of each term does to rigid-body modes (k, r), zero if but rounding."""
+        """Effect of the stiffness of each term on rigid-body modes (k, r), zero within rounding."""
         found = []
         for part in self.terms[2]:
             force = part @ self.rigid / max(float(np.abs(part).max(initial=0.0)), TINY)
@@ -289,7 +289,7 @@ class Family:
         return np.asarray(-np.linalg.solve(eigen.scale(columns), change), dtype=np.complex128)
 
     def strength(self, omega: float) -> FloatArray:
-        """Return (q,) how strongly each parameter can move an eigenvalue near `omega` at most."""
+        """Return (q,) the largest effect of each parameter on an eigenvalue near `omega`."""
         sizes = [np.linalg.norm(part, axis=(1, 2)) for part in (self.dM, self.dD, self.dK)]
         return np.asarray((sizes[0] * omega + sizes[1] + sizes[2] / omega) / 2, dtype=np.float64)
 
@@ -338,8 +338,8 @@ def _modal_basis(
 def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray, ComplexArray]:
     """Return poles in the upper half plane and vectors (k, m) of I lambda^2 + D lambda + Omega^2.
 
-    The states (omega q, dq/dt) make the matrix skew but for the damping, so that all eigenvalues
-    are good to rounding; the positions of rigid-body modes, r zero eigenvalues, are left out.
+    The states (omega q, dq/dt) make the matrix skew except for the damping, so that all eigenvalues
+    are accurate to rounding; the positions of rigid-body modes, r zero eigenvalues, are left out.
     """
     k = omega.size
     e = k - r
@@ -347,7 +347,7 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     if np.sum(size) - np.trace(size) <= RANK * np.max(size, initial=0.0):
         half = np.diag(D) / 2
         root = np.sqrt(np.maximum(omega**2 - half**2, 0.0))
-        # rigid-body modes come out at the root of rounding of the highest one
+        # rigid-body modes are computed as the root of rounding of the highest one
         keep = np.flatnonzero(root > 1e-7 * np.max(omega, initial=0.0))
         keep = keep[keep >= r]
         poles = -half[keep] + 1j * root[keep]
@@ -357,7 +357,7 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     A[e + r + np.arange(e), np.arange(e)] = -omega[r:]
     A[e:, e:] = -D
     poles, states = la.eig(A, check_finite=False)
-    # rigid-body modes come out at the root of rounding of the fastest pole
+    # rigid-body modes are computed as the root of rounding of the fastest pole
     keep = np.flatnonzero(poles.imag > 1e-7 * np.abs(poles).max(initial=0.0))
     keep = keep[np.argsort(np.abs(poles[keep]), kind="stable")]
     # the velocity lambda q of each mode, its length 1, is its shape
@@ -366,9 +366,9 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     return np.asarray(poles[keep], dtype=np.complex128), np.asarray(vectors, dtype=np.complex128)
 
 
-#: largest rank that is looked for, and relative size below which an entry is rounding
+#: largest rank that is searched, and relative size below which an entry is rounding
 FEW, ROUNDING = 4, 1e-11
-#: relative size of what one outer product may leave of a matrix that is replaced by it
+#: relative remainder of a matrix up to which one outer product replaces it
 EXACT = 1e-14
 
 
@@ -377,7 +377,7 @@ def factors(
 ) -> list[tuple[float, FloatArray]] | None:
     """Return s_i = +-1 and b_i of ``A = sum_i s_i b_i b_i^T``, by pivots; None when there are more.
 
-    None too where no diagonal entry is left to begin with, [[0, 1], [1, 0]].
+    Also None without a non-zero diagonal entry, as for [[0, 1], [1, 0]].
     """
     size = float(np.abs(matrix).max(initial=0.0))
     found: list[tuple[float, FloatArray]] = []
@@ -396,7 +396,7 @@ def factors(
 
 
 def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
-    """Return ``V^T A V`` of all A (q, k, k): of one factor by its own, ``s (V^T b)(V^T b)^T``."""
+    """Return ``V^T A V`` for all A (q, k, k), as ``s (V^T b)(V^T b)^T`` for a single factor."""
     found = np.zeros((stack.shape[0], V.shape[1], V.shape[1]))
     for A, own in zip(stack, found, strict=True):
         if not A.any():
@@ -410,7 +410,7 @@ def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
     return found
 
 
-#: entries of bordered systems that are solved together
+#: number of entries of bordered systems that are solved together
 TOGETHER = 1_000_000
 
 
@@ -442,9 +442,9 @@ class Point:
         lost = [n for n in numbers if n not in where]
         if lost:
             raise ModelError(
-                f"modes {lost} cease to oscillate: with {self.family.text(self.p)} they have no "
-                "pole, or no shape, to compare with the measured one. Keep dampers to what is "
-                "possible (bounds=), or begin nearer to the answer (start=)."
+                f"modes {lost} stop oscillating: with {self.family.text(self.p)} they have no "
+                "pole, or no shape, to compare with the measured one. Limit dampers to physical "
+                "values (bounds=), or begin closer to the solution (start=)."
             )
         return [where[n] for n in numbers]
 
@@ -503,7 +503,7 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
     k, q = X.shape[0], point.p.size
     changes = point.family.moved(X, (poles**2, poles, np.ones_like(poles))).transpose(2, 1, 0)
     MX, DX = M @ X, D @ X
-    # undamped: all is real but the border, imaginary, and its unknown
+    # undamped: everything is real except the imaginary border and its unknown
     real = not (np.any(DX) or np.any(X.imag) or np.any(poles.real) or np.any(changes.imag))
     turn = -1j if real else 1.0
     kind = np.float64 if real else np.complex128
@@ -527,18 +527,18 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
     return list(zip(dX.transpose(0, 3, 2, 1), dL.transpose(0, 3, 2, 1), strict=True))
 
 
-#: modes closer than this, relatively, are a cluster: their shapes mix at the least change
+#: relative distance below which modes form a cluster: their shapes mix at the smallest change
 CLUSTER = 0.02
-#: MAC below which two shapes of a cluster have nothing of each other
+#: MAC below which two shapes of a cluster are independent
 FOREIGN = 1e-4
 
 
 def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
     """Return for each old mode the column of the new mode that continues it, -1 for none."""
     # a one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
-    # together, by what of each new shape lies in their subspace; inside it, shapes that have
-    # nothing of each other keep to themselves and may cross, all others keep their order of
-    # frequency, since two modes that couple veer instead of crossing
+    # together, by the projection of each new shape on their subspace. Inside it, independent shapes
+    # may cross, and all others keep their order of frequency, since two coupled modes veer instead
+    # of crossing
     shapes = mac_matrix(old_X, X)
     score, close = shapes.copy(), clusters(old_poles, CLUSTER)
     for cluster in close:
@@ -555,10 +555,10 @@ def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray
     s, new = old.size, np.sort(new)
     near = shapes[np.ix_(old, new)] > FOREIGN
     if near.all() or np.array_equal(near, np.eye(s)):
-        return new  # nearly always, at every point of a search: a graph costs ten times as much
+        return new  # the usual case at every point of a search; a graph costs ten times as much
     linked = np.zeros((2 * s, 2 * s), dtype=bool)
     linked[:s, s:] = near
-    # what modes reach through shapes in common
+    # groups of modes that are connected by common shapes
     count, side = connected_components(linked, directed=False)
     found = new.copy()
     for k in range(count):

@@ -1,4 +1,4 @@
-"""What is not known of a machine after an update, as draws of whole machines."""
+"""Uncertainty of a machine after an update, as random draws of whole machines."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from .parameters import AddedMass, Parameter, PointParameter
 from .residuals.modal_residuals import ZETA
 from .trend import Trend, trend_of
 
-#: draws of which a log-normal distribution makes an interval: the deviation of its logarithm is
+#: number of draws for an interval by a log-normal distribution: the deviation of the logarithm is
 #: then known to 11 %
 COUNT = 40
-#: draws refused in a row after which the posterior holds no machine
+#: number of consecutive refused draws after which the posterior counts as empty
 _REFUSED = 200
 
 
 class Draw(NamedTuple):
-    """One machine: the deviation s, changes (p,) of all parameters, the slope, its share as mass.
+    """One machine: deviation s, changes (p,) of all parameters, slope, fraction of it as mass.
 
     `damping` are the mean and deviation of the logarithm of a damping ratio over the model's.
     """
@@ -43,19 +43,19 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Machines(Value):
-    """What is not known of a machine after an update: draws of whole machines.
+    """Uncertainty of a machine after an update: random draws of whole machines.
 
-    Made by ``fit.machines(measured)``; ``plant.uncertain(machines)`` puts it on a plant, and a
-    plant of ``fit.calibrated(measured)`` has it without asking. Machines are drawn in modal
+    Made by ``fit.machines(measured)``; ``plant.uncertain(machines)`` passes it to a plant, and a
+    plant of ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal
     coordinates of the plant's evaluation model, with frequencies Omega and unit mass:
 
     - deviation s, changes dp of the parameters and slope b from their posterior (`Trend`);
-    - trend ``t = sign(b) log(1 + 2 |b| g) / 2`` with g the frequency over the largest measured, a
-      share r of it, uniform between 0 and 1, as mass and the rest as stiffness;
+    - trend ``t = sign(b) log(1 + 2 |b| g) / 2`` with g the frequency over the largest measured one;
+    a fraction r of it, uniform between 0 and 1, acts as mass and the rest as stiffness;
     - ``M' = exp(-r t) (I + sum dp dM) exp(-r t)``, ``K' = Omega exp(E) Omega + sum dp dK``, E
       symmetric with ``2 (s e + (1 - r) t)`` on its diagonal and deviations ``sqrt(2) s`` off it:
-      frequencies and shapes move together. Rigid-body masses have the deviation 2 s, as nobody
-      weighed them;
+      frequencies and shapes change together. Rigid-body masses have the deviation 2 s, since they
+      were not measured;
     - poles of measured modes from their covariance; other dampings from Student's predictive
       distribution of the measured ones.
 
@@ -68,7 +68,7 @@ class Machines(Value):
     count : int
         Number of machines that are drawn for an interval.
     seed : int
-        Seed of the draws: machine i is the same whatever `count` is.
+        Seed of the draws: machine i does not depend on `count`.
 
     Examples
     --------
@@ -94,12 +94,12 @@ class Machines(Value):
 
     @cached_property
     def trend(self) -> Trend:
-        """What is left of the measured frequencies."""
+        """Trend of the residual of measured frequencies."""
         return trend_of(self.fit, self.measured)
 
     @property
     def missing(self) -> str:
-        """What is missing for an interval, one sentence; empty where nothing is."""
+        """Reason why no interval exists, in one sentence; empty if there is an interval."""
         return self.trend.missing
 
     @cached_property
@@ -117,7 +117,7 @@ class Machines(Value):
         return np.where(zeta > ZETA, zeta, 1.0)
 
     def draw(self, rng: np.random.Generator) -> Draw:
-        """Return one machine that the measurement allows, masses not negative."""
+        """Return one machine that agrees with the measurement, without negative masses."""
         for _ in range(_REFUSED):
             s, moved, b = self.trend.posterior(rng)
             dp = np.zeros(self.fit.values.size)
@@ -130,8 +130,8 @@ class Machines(Value):
             if all(masses):
                 return Draw(s, dp, b, rng.random(), self._damping(rng), self._poles(rng), rng)
         raise ModelError(
-            f"{_REFUSED} draws in a row have a negative added mass: nothing was added there, or "
-            "the model lacks something else. Leave the parameter out."
+            f"{_REFUSED} consecutive draws have a negative added mass: nothing was added there, "
+            "or the model has another error. Leave the parameter out."
         )
 
     def _damping(self, rng: np.random.Generator) -> tuple[float, float]:
@@ -153,7 +153,7 @@ class Machines(Value):
         return np.minimum(found.real, 0.0) + 1j * found.imag
 
     def located(self) -> list[Parameter]:
-        """Return the parameters with points in place of labels, which another mesh has too."""
+        """Return the parameters with points in place of labels, which are valid on another mesh."""
         model = self.fit.model
         dofs = getattr(model, "full_dofs", None) or model.dofs
         return [_located(q, dofs) for q in self.fit.unknowns]

@@ -1,4 +1,4 @@
-"""Parameters of whole matrices: elements, modal damping, sizes by polynomials."""
+"""Parameters of whole matrices: elements, modal damping, dimensions by polynomials."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class _GivenParameter(Parameter):
         return part if isinstance(part, tuple) else () if part is None else (part,)
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices of all powers in the model's DOFs, of which they have to be."""
+        """Return the matrices of all powers in the DOFs of the model."""
         project = partial(_projected_matrix, model=model, name=self.name)
         powers = zip_longest(*(self._powers(label) for label in PARTS))
         return [(project(M), project(D), project(K)) for M, D, K in powers]
@@ -80,16 +80,17 @@ class _GivenParameter(Parameter):
 class MatrixParameter(_GivenParameter):
     """A parameter with given derivatives of the matrices: M + p dM, D + p dD, K + p dK.
 
-    A group of elements (the stiffness of a region, say, with p its relative change) is the sum of
-    its element matrices. Matrices of the full structure are projected once, ``T^T dK T``.
+    For a group of elements (for example the stiffness of a region, with its relative change p) dK
+    is the sum of its element matrices. Matrices of the full structure are projected once,
+    ``T^T dK T``.
 
     Parameters
     ----------
     name : str
     dM, dD, dK : (k, k) or (n, n) array or sparse matrix, optional
-        Symmetric; of the model's own DOFs or of the full structure's.
+        Symmetric matrices in the DOFs of the model or of the full structure.
     unit : str
-        Of p; none for a relative change.
+        Unit of p; empty for a relative change.
     bounds, prior : as for `AddedMass`
 
     Raises
@@ -122,20 +123,20 @@ class MatrixParameter(_GivenParameter):
     ) -> MatrixParameter:
         """Return the parameter p = v - value of a full model `build(v)`, by central differences.
 
-        For anything that changes elements affinely: a density, Young's modulus. Where the matrices
-        are not affine (a bending stiffness goes with thickness^3) this holds for small changes
-        only: `PolynomialParameter.from_build` is exact.
+        It serves quantities that change elements affinely: a density, Young's modulus. Where the
+        matrices are not affine (a bending stiffness goes with thickness^3) this holds for small
+        changes only: `PolynomialParameter.from_build` is exact.
 
         Parameters
         ----------
         name, unit, bounds, prior
-            As of the class; bounds and prior of p, the change.
+            As for the class; bounds and prior are those of the change p.
         build : callable
-            From the value to an FEModel; the same DOFs at every value.
+            Function from the value to an FEModel, with the same DOFs at every value.
         value : float
             Of the model that is updated.
         step : float, optional
-            Of the difference; 1e-3 of the value when not given.
+            Step of the difference; 1e-3 of the value by default.
 
         Raises
         ------
@@ -173,13 +174,13 @@ class MatrixParameter(_GivenParameter):
         Parameters
         ----------
         build : callable
-            From the quantity of every element, an array, to an FEModel.
+            Function from an array with the quantity of every element to an FEModel.
         regions : mapping {name: bool array}
-            Which elements, in the shape that `build` takes. They may overlap.
+            Masks of the elements, in the shape of the argument of `build`. They may overlap.
         value : float or array
-            Of the model that is updated; an array has the shape of the regions.
+            Value in the model that is updated; an array has the shape of the regions.
         bounds, prior : optional
-            Of each relative change, as for `AddedMass`.
+            Bounds and prior of each relative change, as for `AddedMass`.
 
         Raises
         ------
@@ -260,7 +261,7 @@ class ModeDamping(Parameter):
         return f"<ModeDamping: {self.name}>"
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (None, dD, None); LabelError of a mode that the model has not."""
+        """Return (None, dD, None); LabelError if the model does not have the mode."""
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         k, r = rigid.shape
         if not r < self.mode <= k:
@@ -283,7 +284,7 @@ class ModeDamping(Parameter):
 
 
 def _projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | None:
-    """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure."""
+    """Return a matrix in the DOFs of a model, ``T^T A T`` from the full structure."""
     if part is None:
         return None
     k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))
@@ -333,12 +334,12 @@ def _checked_matrix(value: Any, name: str) -> Matrix | None:
     return checked
 
 
-#: relative to the change of a matrix: what its polynomial may miss between the points of it, and
-#: what rounding makes it miss where the matrix is one
+#: errors of a polynomial relative to the change of the matrix: largest accepted error between its
+#: points, and rounding where the matrix is a polynomial
 CLOSE, EXACT = 1e-6, 1e-9
 #: degrees that are tried where none is given
 DEGREES = (3, 6, 12)
-#: where polynomials are compared with the matrices, in parts of the width
+#: points at which polynomials are compared with the matrices, relative to the width
 CHECKS = (-0.97, -0.77, 0.31)
 
 
@@ -356,7 +357,7 @@ class PolynomialParameter(_GivenParameter):
     name, unit, bounds, prior
         As for `MatrixParameter`, as are errors.
     missed : float
-        Part of the largest change of a matrix that the polynomials were seen to miss.
+        Largest error of the polynomials relative to the largest change of a matrix.
 
     Examples
     --------
@@ -406,16 +407,16 @@ class PolynomialParameter(_GivenParameter):
 
         The matrices at degree + 1 Chebyshev points make the polynomials, three points more check
         them. Exact where the matrices are polynomials of this degree (3 for a plate's thickness).
-        Where they are smooth functions of another kind (a length, an angle), `missed` says how good
-        the polynomials are, and bounds keep the parameter where they were compared.
+        Where they are other smooth functions (a length, an angle), `missed` is the error of the
+        polynomials, and bounds limit the parameter to the compared range.
 
         Parameters
         ----------
         name, build, value, unit, bounds, prior : as for `MatrixParameter.from_difference`
         degree : int, optional
-            Highest power. None: the first of 3, 6 and 12 that is good enough.
+            Highest power. None: the first of 3, 6 and 12 that is accurate enough.
         width : float, optional
-            Of the interval on either side of the value; a fifth of it when not given.
+            Width of the interval on either side of the value; a fifth of the value by default.
 
         Raises
         ------
@@ -435,8 +436,9 @@ class PolynomialParameter(_GivenParameter):
         else:
             part, at = missed[worst]
             raise ModelError(
-                f"{worst} of {name} is no polynomial of degree {powers}: it misses by {part:.2g} "
-                f"of the change at {middle + half * at:.6g}. Raise degree=, or make width= smaller."
+                f"{worst} of {name} is not a polynomial of degree {powers}: the error is "
+                f"{part:.2g} of the change at {middle + half * at:.6g}. Raise degree=, or make "
+                "width= smaller."
             )
         if missed[worst][0] > EXACT:
             low, high = checked_bounds(bounds, name) or (-np.inf, np.inf)
@@ -471,7 +473,7 @@ def _interpolated(
     powers: int,
     name: str,
 ) -> tuple[dict[str, list[Matrix | None]], dict[str, tuple[float, float]]]:
-    """Return the matrices of all powers, and what they miss at most and where, of M, D and K."""
+    """Return the matrices of all powers, and their largest errors for M, D and K with places."""
     # `points` holds the models made so far, by place; those at the nodes join them
     nodes = np.cos(np.pi * (np.arange(powers + 1) + 0.5) / (powers + 1)).tolist()
     for x in nodes:

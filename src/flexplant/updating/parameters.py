@@ -1,4 +1,4 @@
-"""What may differ between the model and the machine: parameters of M, D and K."""
+"""Parameters of M, D and K that may differ between model and machine."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ..store import Value
 from ..structure import FEModel
 from ..words import instance, with_deviation
 
-#: how the function that builds a model is written
-MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."
+#: advice for the function that builds a model
+MAKES = "It returns an FEModel, for example lambda t: kirchhoff_plate(thickness=t, ...)."
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = tuple[Matrix | None, Matrix | None, Matrix | None]
 
@@ -28,7 +28,7 @@ class Parameter(Value):
     """One unknown p on which M, D and K depend, affinely (M(p) = M + p dM) unless stated.
 
     A subclass has a unique `name`, a `unit` and its `matrices`; `bounds` (lowest, highest) and
-    `prior` (mean, standard deviation) may say what is known of p beforehand.
+    `prior` (mean, standard deviation) may state prior knowledge of p.
 
     Examples
     --------
@@ -55,7 +55,7 @@ class Parameter(Value):
         return np.array([value]), np.ones(1)
 
     def change(self, model: FEModel | ReducedModel, value: float) -> Derivatives:
-        """Return what the parameter at a value adds to M, D and K of the model."""
+        """Return the terms that the parameter at a value adds to M, D and K of the model."""
         total: list[Any] = [None, None, None]
         for size, parts in zip(self.curve(value)[0].tolist(), self.terms(model), strict=True):
             for i, part in enumerate(parts):
@@ -68,7 +68,7 @@ class Parameter(Value):
         return self
 
     def _check_known(self) -> None:
-        """Check what is known beforehand."""
+        """Check bounds and prior."""
         bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
         self._set(bounds=bounds, prior=prior)
 
@@ -91,7 +91,7 @@ class PointParameter(Parameter):
 
     quantity: ClassVar[str] = ""
     acts_on: ClassVar[int] = 0
-    #: directions that stand for several
+    #: directions that mean several motions
     together: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -117,7 +117,7 @@ class PointParameter(Parameter):
         found = np.array(self.rows(model)).T
         if not np.any(found):
             raise ModelError(
-                f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
+                f"{self.name} has no effect: its weights are all zero. Give a place that moves."
             )
         columns: Any = sp.csc_array(found) if sp.issparse(model.M) else found
         parts: list[Matrix | None] = [None, None, None]
@@ -125,7 +125,7 @@ class PointParameter(Parameter):
         return parts[0], parts[1], parts[2]
 
     def rows(self, model: FEModel | ReducedModel) -> list[FloatArray]:
-        """Return r of each motion it acts along, of those together the ones the model has."""
+        """Return r of each motion along which it acts; of several, those that the model has."""
         of = model if hasattr(model, "row") else model.dofs
         along: tuple[str, ...] = (self.direction,)
         if self.direction in self.together:
@@ -147,16 +147,16 @@ class AddedMass(PointParameter):
         DOF label, point (interpolated between nodes) or {label: weight}; the mass moves in this
         direction only.
     direction : str
-        Of the motion at a point; labels carry their own. "xyz": a mass that rides on all three
-        translations, as a `PointMass` does; of a plate in bending on z alone.
+        Direction of the motion at a point; labels contain a direction. "xyz": the mass moves in all
+        three translations, as a `PointMass`; on a plate in bending only in z.
     name : str, optional
-        For results; made from the place when not given.
+        Name in results; by default made from the place.
     to : str, (3,) array [m] or mapping, optional
-        The other end; the ground when not given.
+        The other end; the ground by default.
     bounds : (lowest, highest), optional
-        The parameter is kept between them; None or an infinity is no bound.
+        Limits of the parameter; None or infinity means unlimited.
     prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+        Prior knowledge as a normal distribution.
 
     Examples
     --------
@@ -194,9 +194,9 @@ class AddedDamping(PointParameter):
 class AddedStiffness(PointParameter):
     """A spring [N/m] between a place and the ground, or another: K + p r r^T.
 
-    On a free structure a spring to the ground takes away the rigid-body modes that move it; they
-    become suspension modes, with sqrt(p) as frequency, so they can only be fitted from a start
-    that is not zero.
+    On a free structure a spring to the ground turns the rigid-body modes that move it into
+    suspension modes, with a frequency proportional to sqrt(p), so that they can only be fitted from
+    a start that is not zero.
 
     Parameters
     ----------
@@ -218,11 +218,13 @@ def named_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
     """Return a place and its name."""
     if isinstance(at, str):
         if not at:
-            raise LabelError(f"{what}='' is no place: give a DOF label such as '41:z', or a point.")
+            raise LabelError(
+                f"{what}='' is not a place: give a DOF label such as '41:z', or a point."
+            )
         return at, at
     if isinstance(at, Mapping):
         if not at:
-            raise LabelError(f"{what}={{}} is no place: give {{DOF label: weight}}.")
+            raise LabelError(f"{what}={{}} is not a place: give {{DOF label: weight}}.")
         weights = {
             str(label): float(real_array(weight, f"weight of {label!r}", ()))
             for label, weight in at.items()
@@ -240,7 +242,7 @@ def checked_text(value: Any, what: str) -> str:
 
 
 def checked_bounds(value: Any, name: str) -> tuple[float, float] | None:
-    """Return (lowest, highest), None when there are none."""
+    """Return (lowest, highest), None without bounds."""
     if value is None:
         return None
     pair = np.asarray(value, dtype=object)
@@ -259,14 +261,14 @@ def checked_bounds(value: Any, name: str) -> tuple[float, float] | None:
 
 
 def checked_prior(value: Any, name: str) -> tuple[float, float] | None:
-    """Return (mean, standard deviation), None when there is no prior."""
+    """Return (mean, standard deviation), None without a prior."""
     if value is None:
         return None
     mean, std = real_array(value, f"prior of {name}", (2,)).tolist()
     if std <= 0:
         raise ModelError(
             f"the prior of {name} needs a positive standard deviation, got {std:g}: a parameter "
-            "that is known exactly belongs to the model."
+            "that is known exactly should be part of the model."
         )
     return mean, std
 
@@ -275,9 +277,9 @@ def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
     """Return the parameters as a tuple, checked."""
     listed = tuple(parameters) if isinstance(parameters, Sequence) else (parameters,)
     if not listed:
-        raise ModelError("parameters is empty: there is nothing to update.")
+        raise ModelError("parameters is empty: give at least one parameter to update.")
     for parameter in listed:
-        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
+        instance(parameter, Parameter, "a parameter", "Pass for example [AddedMass('41:z')].")
     names = [parameter.name for parameter in listed]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

@@ -31,19 +31,20 @@ from .search import Objective, SearchEnd, TrustRegion
 from .search.objective import SearchPlan, Trail
 from .update_result import Starts
 
-#: the end of a search, or why there is none
+#: the end of a search, or the reason why it failed
 Reached: TypeAlias = SearchEnd | FlexplantError
 
-#: relative variance of each entry of a response in the first fit, beside its noise
+#: relative variance of each entry of a response in the first fit, in addition to its noise
 EVEN = 0.1
-#: relative tolerance of a fit that only has to come near
+#: relative tolerance of an approximate fit
 ENOUGH = 1e-3
 
 
 def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchEnd:
     """Return the end of a search from `begin` that goes through easier problems first."""
     # responses have a minimum wherever a peak of the model lies between two measured ones; the
-    # logarithm of their magnitude hardly any. Shapes turn when modes are near: poles come first
+    # logarithm of their magnitude hardly has any. Shapes mix when modes are close, so that poles
+    # come first
     easier = _easier(objective.residuals)
     if easier is None:
         return search.begun(objective, begin)
@@ -71,7 +72,7 @@ def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchE
 
 
 def _easier(residuals: Sequence[Residual]) -> list[Residual] | None:
-    """Return residuals that converge from farther away, None when they are those given."""
+    """Return residuals that converge from farther away, None if these are the given ones."""
     has_poles = any(isinstance(r, Eigenvalues) for r in residuals)
     found = [
         _magnitude(r) if isinstance(r, FrfResidual) else r
@@ -92,40 +93,41 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
     return residual.replace(magnitude=True, variance=variance)
 
 
-#: part of the measured power that a minimum leaves which has little to do with the measurement
+#: remaining fraction of the measured power above which a minimum does not explain the measurement
 POOR_FIT = 0.1
-#: relative distance of a pole from the measured one, beyond noise, that a wrong pairing may leave
+#: relative distance of a pole from the measured one, beyond noise, above which a wrong pairing is
+#: possible
 FAR = 1e-3
-#: starts that are always tried beside the first, for models of up to so many DOFs and larger ones;
-#: near a second minimum about half of them end in the other one
+#: number of additional starts that are always tried, for models up to a number of DOFs and for
+#: larger ones; near a second minimum about half of them end in the other one
 ALWAYS, ALWAYS_LARGE, SMALL = 4, 2, 100
-#: starts that are tried where the best end so far may be no answer, likewise
+#: the same for cases where the best end may not be the solution
 RETRIES, RETRIES_LARGE = 20, 4
-#: steps from another start once an end is found, and how much larger than there the cost may then
-#: be for the search to go on
+#: number of steps from another start after an end is found, and largest ratio of costs for the
+#: search to continue
 GLANCE, WORTH = 10, 10.0
-#: number of starts that end in the best minimum from which on no other is tried: a minimum that
-#: a third of all starts leads to is then missed in 4 % of cases
+#: number of starts in the best minimum after which no other is tried: a minimum that a third of all
+#: starts reach is then missed in 4 % of cases
 AGREED = 8
-#: relative difference of costs that is none: what the tolerance of a search leaves
+#: relative difference of costs that counts as zero, from the tolerance of a search
 SAME_COST = 1e-6
-#: what is left of exact data, relatively to all that is fitted, when a search ends
+#: relative residual of exact data at the end of a search
 EXACT = 1e-8
-#: tolerance of a search that shows where it ends; the best is settled to the one that is given
+#: tolerance of a first search; the best one is refined to the given tolerance
 NEARLY = 1e-6
-#: relative change of all that is fitted between two ends that are one, the noise not known
+#: relative change of the fitted values below which two ends are one, if the noise is not known
 SAME_END = 1e-4
 
 
 class _GradedEnd(NamedTuple):
-    """An end, and how good it was where it was found."""
+    """An end of a search, and its quality."""
 
     end: SearchEnd
-    #: whether its modes are paired from the start given or from the default
+    #: whether its modes are paired from the given start or from the default
     named: bool
     #: whether another start may lead to a better one
     improvable: bool
-    #: whether noise explains what is left, and the model is possible
+    #: whether noise explains the residual, and the model is possible
     likely: bool
 
 
@@ -138,7 +140,7 @@ class _Tried:
         self.begins: list[FloatArray] = []
         self.ends: list[Reached] = []
         self.found: list[_GradedEnd] = []
-        #: difference of costs that rounding makes
+        #: difference of costs due to rounding
         self.rounding = 0.0
 
     def add(self, begin: FloatArray, *, led: bool, named: bool = False) -> None:
@@ -164,7 +166,7 @@ class _Tried:
     @property
     def best(self) -> _GradedEnd | None:
         """The end of least cost, of those that noise explains where one does; the earliest."""
-        # poles are only paired anew where that explains them: an outlier is no wrong pairing
+        # poles are only paired again if this explains them: an outlier is not a wrong pairing
         pool = [one for one in self.found if one.named or not one.improvable] or self.found
         pool = [one for one in pool if one.likely] or pool
         best: _GradedEnd | None = None
@@ -175,7 +177,7 @@ class _Tried:
 
     @property
     def agreed(self) -> bool:
-        """Whether several starts ended in the best minimum: more of them would as well."""
+        """Whether several starts ended in the best minimum, so that more starts would too."""
         best = self.best
         if best is None or not best.end.converged:
             return False
@@ -184,7 +186,7 @@ class _Tried:
 
     @property
     def alike(self) -> bool:
-        """Whether all starts met the same: more of them would as well."""
+        """Whether all starts failed in the same way, so that more starts would fail too."""
         return not self.found and len({_message(end) for end in self.ends}) == 1
 
 
@@ -192,11 +194,10 @@ def from_one_start(
     objective: Objective, begin: FloatArray, search: SearchPlan, rng: Rng, *, given: bool
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends."""
-    # a few others are always tried, the default first where a start was given; more where none
-    # leads to an end, or the best leaves what noise does not (a peak on a wrong one, a wrong
-    # pairing)
+    # a few others are always tried, the default first where a start was given; more where no start
+    # leads to an end, or the residual exceeds noise (a peak on a wrong one, a wrong pairing)
     if given:
-        # a start that is no model is a mistake of the call
+        # a start with an impossible model is an error of the caller
         objective.family.at(begin)
     default = objective.default_start
     tried = _Tried(objective, search)
@@ -242,19 +243,19 @@ def _other_starts(
 def none_found(
     objective: Objective, begins: list[FloatArray], ends: list[Reached]
 ) -> FlexplantError:
-    """Return the error that no start leads to an end: what all of them met."""
+    """Return the error for the case that no start leads to an end, with all reasons."""
     failed = [end for end in ends if isinstance(end, FlexplantError)]
     met = Counter(map(_message, failed))
     if len(met) == 1:
-        # what is met at the default start is no matter of the values there
+        # the values at the default start are not the reason
         default = (np.array_equal(begin, objective.default_start) for begin in begins)
         return next((end for end, one in zip(failed, default, strict=True) if one), failed[0])
     said = "; ".join(f"{head} ({counted(count, 'start')})" for head, count in met.most_common())
     error = SolverError(
-        f"none of {len(begins)} starts leads anywhere: {said}. Begin nearer to the answer (start=) "
-        "or keep the parameters to what is possible (bounds=); whether the measurement determines "
-        "them at all, identifiability(model, parameters, residuals) says. The notes of this error "
-        "have every start."
+        f"none of {len(begins)} starts leads to a solution: {said}. Begin closer to the solution "
+        "(start=) or limit the parameters to physical values (bounds=). identifiability(model, "
+        "parameters, residuals) shows whether the measurement determines them. The notes of "
+        "this error list every start."
     )
     for begin, end in zip(begins, failed, strict=True):
         error.add_note(f"from {objective.family.text(begin)}: {end}")
@@ -262,12 +263,12 @@ def none_found(
 
 
 def _message(end: Reached) -> str:
-    """Return what a search met without where."""
+    """Return the reason of a failed search without its place."""
     return str(end).split(": ")[0]
 
 
 def _graded_end(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
-    """Return an end, where the objective is, with how good it is."""
+    """Return the present end with its quality."""
     point = objective.at(end.p)
     chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
     explained = end.converged and chi2 is not None and not is_bad(chance(chi2, dof))
@@ -281,7 +282,7 @@ def _graded_end(objective: Objective, end: SearchEnd, *, named: bool) -> _Graded
 
 
 def _reached(search: Callable[..., SearchEnd], *given: Any) -> Reached:
-    """Return the end of a search, or why there is none."""
+    """Return the end of a search, or the reason why it failed."""
     try:
         return search(*given)
     except FlexplantError as error:
@@ -289,7 +290,7 @@ def _reached(search: Callable[..., SearchEnd], *given: Any) -> Reached:
 
 
 def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
-    """Return whether another start may lead to a better end than one that noise leaves open."""
+    """Return whether another start may lead to a better end."""
     if not objective.numbers:
         r, size = objective.values(point, prior=False), objective.size(point)
         return bool(np.sum(r**2) > POOR_FIT * np.sum(size[: r.size] ** 2))
@@ -317,13 +318,13 @@ def from_starts(
     return best, ends
 
 
-#: relative change of the model's eigenvalues that starts far away make at most, each parameter
-#: alone, and how many decades they may be nearer
+#: largest relative change of eigenvalues by each parameter of a distant start, and range of smaller
+#: changes in decades
 FIRST_CHANGE, DECADES = 0.1, 1.5
 
 
 def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[FloatArray]:
-    """Return the start and the others: those given, or a Latin hypercube in bounds or priors."""
+    """Return the start and the others: given ones, or a Latin hypercube in bounds or priors."""
     first = objective.default_start
     if start is not None:
         first = checked_values(start, objective.parameters, "start")
@@ -344,7 +345,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
 def summary(
     objective: Objective, best: SearchEnd, begins: list[FloatArray], ends: list[Reached]
 ) -> Starts:
-    """Return what every start led to, the objective being at the best end."""
+    """Return the results of all starts, with the objective at the best end."""
     point, nan = objective.at(best.p), np.full(best.p.size, np.nan)
     found = [end for end in ends if isinstance(end, SearchEnd) and end.converged]
     minima: list[SearchEnd] = []
@@ -366,9 +367,9 @@ def summary(
 
 
 def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd) -> bool:
-    """Return whether two ends are one minimum: their difference changes what is fitted by nothing.
+    """Return whether two ends are one minimum: their difference does not change the fit.
 
-    By less than a standard deviation where the noise is known, and relatively.
+    The change is less than a standard deviation if the noise is known, and relatively small.
     """
     change = np.abs(objective.slopes(point) @ (a.p - b.p))
     noise = objective.noise_known and float(np.linalg.norm(change)) < a.p.size**0.5
@@ -376,8 +377,8 @@ def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd
 
 
 def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> FloatArray:
-    """Return by how much -2 ln of the likelihood is larger at other minima."""
-    # the difference of chi-square, or `n ln(e/e_least)` where noise is not all that is left
+    """Return the increase of -2 ln of the likelihood at other minima."""
+    # the difference of chi-square, or `n ln(e/e_least)` where the residual exceeds noise
     if not minima:
         return np.zeros(0)
     point, free = objective.at(best.p), np.ones(best.p.size, dtype=bool)
@@ -395,8 +396,8 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
 
 
 def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
-    """Return starts around one, as far as each parameter moves eigenvalues by 10 %."""
-    # sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away
+    """Return starts around one, at which each parameter changes eigenvalues by up to 10 %."""
+    # sizes are drawn uniformly over decades; masses, springs and dampers are added, not removed
     objective.path = []
     eigen = objective.begin(middle).eigen
     every = list(range(eigen.poles.size))
@@ -441,19 +442,20 @@ def _check_inside(objective: Objective, start: FloatArray) -> None:
             )
 
 
-#: how near the ratio of measured poles to those of the model is to 2 pi, all of them
+#: largest relative deviation from 2 pi of the ratio of measured poles to those of the model, for
+#: all poles
 NEAR = 0.15
 
 
 def check_units(objective: Objective, begin: FloatArray) -> None:
-    """Raise ModelError where all measured poles are 2 pi below or above those of the model."""
+    """Raise ModelError if all measured poles differ from those of the model by a factor of 2 pi."""
     data = objective.poles_measured
     if data is None:
         return
     try:
         start = objective.poles(objective.begin(begin))
     except FlexplantError:
-        return  # the search raises what is wrong at the start
+        return  # the search raises errors of the start
     known = dict(zip(objective.numbers, np.abs(start), strict=True))
     ratio = np.abs(data.target) / np.array([known[n] for n in data.numbers])
     below = bool(np.all(np.abs(2 * np.pi * ratio - 1) < NEAR))

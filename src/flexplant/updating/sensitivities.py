@@ -18,14 +18,14 @@ from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import BoundEigenvalues
 
-#: what turns exactly repeated modes to the vectors in which a change of parameters splits them; and
-#: the derivatives (q,) along these, by the modes' columns
+#: matrices that rotate exactly repeated modes to the vectors in which a change of parameters splits
+#: them; and the derivatives (q,) along these, by columns of modes
 Split: TypeAlias = Callable[[FloatArray], tuple[Eigen, dict[int, ComplexArray]]]
 
 
 def splitting(family: Family, eigen: Eigen) -> Split:
-    """Return how repeated modes split along a direction, to eigenvectors of their derivative."""
-    # the modes of a group come in the order of the frequencies they move to
+    """Return the split of repeated modes along a direction, by eigenvectors of the derivative."""
+    # the modes of a group have the order of their new frequencies
     groups = [(one, family.group_derivative(eigen, one)) for one in repeated_groups(eigen.poles)]
 
     def split(direction: FloatArray) -> tuple[Eigen, dict[int, ComplexArray]]:
@@ -75,21 +75,22 @@ def eigenvalue_sensitivities(
     modes: Sequence[int] | None = None,
     values: Sequence[float] | FloatArray | None = None,
 ) -> Sensitivities:
-    """Return how the complex eigenvalues of a model move with parameters.
+    """Return the sensitivities of the complex eigenvalues of a model to parameters.
 
-    ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)`` with
-    right and left eigenvectors x, y of ``lambda^2 M + lambda D + K`` (the paper, eq. (11)).
-    Modes that are exactly repeated are first turned to the eigenvectors of the derivative; they
-    are given by rising frequency for growing parameters.
+    ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)`` with right
+    and left eigenvectors x, y of ``lambda^2 M + lambda D + K`` (the paper, eq. (11)). Exactly
+    repeated modes are first rotated to the eigenvectors of the derivative, in the order of rising
+    frequency for growing parameters.
 
     Parameters
     ----------
     model, parameters
         As for `update`; an FEModel is treated densely.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; all elastic modes when not given.
+        Mode numbers from 1, rigid-body modes included; all elastic modes by default.
     values : (q,) array, optional
-        Values of the parameters to derive at; zeros (the model itself) when not given.
+        Values of the parameters at which derivatives are taken; zeros (the model itself) by
+        default.
 
     Returns
     -------
@@ -99,8 +100,8 @@ def eigenvalue_sensitivities(
     ------
     LabelError, ModelError
         When a mode number or a place is unknown, names are doubled, the matrices are indefinite at
-        `values`, or several parameters split repeated modes along different vectors, so that no
-        derivatives to them all exist.
+        `values`, or several parameters split repeated modes along different vectors, so that
+        derivatives with respect to all of them do not exist.
 
     References
     ----------
@@ -132,7 +133,8 @@ def eigenvalue_sensitivities(
                 raise ModelError(
                     f"modes {[i + eigen.n_rigid + 1 for i in group]} are repeated, and "
                     f"{', '.join(p.name for p in listed)} split them along different vectors: "
-                    "no derivatives to all of them exist. Take one parameter at a time."
+                    "derivatives with respect to all of them do not exist. Use one parameter at "
+                    "a time."
                 )
     return Sensitivities(
         modes=tuple(i + eigen.n_rigid + 1 for i in columns),
@@ -146,7 +148,7 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     """Return the columns of the modes with the given numbers."""
     first, last = eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size
     if not eigen.poles.size:
-        raise ModelError("the model has no oscillating mode: there is no eigenvalue to follow.")
+        raise ModelError("the model has no oscillating mode and therefore no eigenvalue to follow.")
     if not several(modes) or not len(modes):
         raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
     for number in modes:
@@ -165,9 +167,9 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     return [int(number) - first for number in modes]
 
 
-#: a parameter's effect below this share of what it could have is rounding
+#: fraction of its possible effect below which the effect of a parameter is rounding
 UNSEEN = 1e-9
-#: singular values of S, its columns of length one, below which a step leaves them out
+#: singular value of S, with columns of length one, below which a step leaves it out
 SINGULAR = 1e-7
 
 
@@ -188,9 +190,9 @@ class PoleRows:
 
 def split_point(point: Point, data: PoleRows) -> Point:
     """Return the point with exactly repeated modes turned to the split of the next step."""
-    # how they split depends on the step, and the step on how they split: of both directions of
-    # every parameter, the step that fits best by the split it causes itself. Their numbers rise
-    # with the frequencies they move to
+    # the split depends on the step, and the step on the split: among both directions of every
+    # parameter, the step that fits best with its own split is used. Their numbers rise with their
+    # new frequencies
     groups = repeated_groups(point.eigen.poles)
     if not groups:
         return point
@@ -202,7 +204,7 @@ def split_point(point: Point, data: PoleRows) -> Point:
     try:
         columns = point.columns(data.numbers)
     except ModelError:
-        return point  # a mode is lost: an error where it is needed
+        return point  # a mode is lost, which raises an error where it is needed
     family = point.family
     S = family.sensitivity(point.eigen, columns)
     eigen = point.eigen

@@ -1,4 +1,4 @@
-"""Whether what an update leaves grows with frequency: a test that needs no other machine."""
+"""Test whether the residual of an update grows with frequency."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from ..store import Value
 from ..tolerances import ROUNDING, TINY
 from .sensitivities import eigenvalue_sensitivities
 
-#: probability with which a model that lacks nothing is said to lack something
+#: probability of a false alarm for a correct model
 LEVEL = 0.003
-#: share of the machines that an interval of a frequency holds where pairs are compared
+#: probability of an interval of a frequency in the comparison of pairs
 _HELD = 0.95
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trend(Value):
-    """What is left of measured frequencies, regressed on the parameters and on frequency.
+    """Residual of measured frequencies, regressed on the parameters and on frequency.
 
     ``log(f_measured / f_model) = S dp + b g + s e`` of m measured modes: S are the derivatives of
     the logarithms of the q parameters that move frequencies, g the measured frequency over the
-    largest, e standard normal. Where the errors of a model are those of its parameters and scatter
-    b is zero: its estimate over its deviation follows Student's distribution with ``m - q - 1``
-    degrees of freedom. A slope means that the model lacks something that grows with frequency:
-    shear, rotary inertia, smaller elements.
+    largest, e standard normal. If a model only has errors of its parameters and scatter, b is zero,
+    and its estimate over its deviation follows Student's distribution with ``m - q - 1`` degrees of
+    freedom. A slope means that the model neglects an effect that grows with frequency: shear,
+    rotary inertia, smaller elements.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Trend(Value):
     S : (m, q) array [1/unit]
         Derivatives of the logarithms of the model's frequencies to its parameters.
     moves : sequence of int
-        Places, among all parameters of the fit, of the q that move frequencies.
+        Positions, among all parameters of the fit, of the q that change frequencies.
     shaped : bool
         Whether the modes were numbered by measured shapes.
 
@@ -72,7 +72,7 @@ class Trend(Value):
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom ``m - q - 1``; below 1 there is no estimate of what is left."""
+        """Degrees of freedom ``m - q - 1``; below 1 the residual cannot be estimated."""
         return len(self.modes) - int(self.S.shape[1]) - 1
 
     @cached_property
@@ -89,7 +89,7 @@ class Trend(Value):
 
     @property
     def deviation(self) -> float:
-        """s, the relative deviation of a frequency that parameters and slope leave."""
+        """s, the remaining relative deviation of a frequency."""
         return self._regression[2]
 
     @property
@@ -104,7 +104,7 @@ class Trend(Value):
 
     @property
     def p_value(self) -> float:
-        """The probability of a larger slope of either sign where the model lacks nothing."""
+        """Probability of a larger slope of either sign for a correct model."""
         from scipy.special import stdtr
 
         if self.dof < 1:
@@ -114,12 +114,12 @@ class Trend(Value):
 
     @property
     def is_significant(self) -> bool:
-        """Whether chance makes such a slope in less than 0.3 % of cases."""
+        """Whether the slope is significant (probability by chance below 0.3 %)."""
         return self.p_value < LEVEL
 
     @property
     def unshaped_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Neighbouring modes that scatter may have swapped, and no measured shape tells apart."""
+        """Neighbouring modes that scatter may have swapped, without shapes to distinguish them."""
         from scipy.special import stdtrit
 
         if self.shaped or self.dof < 1:
@@ -132,7 +132,7 @@ class Trend(Value):
 
     @cached_property
     def outlier(self) -> tuple[int, float] | None:
-        """The mode that does not belong to the others, and its error beside theirs; or None.
+        """The mode that is an outlier, and its error relative to the others; or None.
 
         By its externally studentised residual, which follows Student's distribution with one degree
         of freedom less: chance alone names a mode in 0.3 % of fits.
@@ -154,22 +154,22 @@ class Trend(Value):
 
     @property
     def missing(self) -> str:
-        """What is missing for a statement about machines, one sentence; empty where nothing is."""
+        """Reason why no statement about machines is possible, in one sentence, or empty."""
         q = self.S.shape[1]
         if self.dof < 1:
             return (
-                f"{len(self.modes)} measured frequencies for {q} parameters and a trend leave "
-                f"nothing to judge the model by: measure {q + 2} modes or more"
+                f"{len(self.modes)} measured frequencies are too few for {q} parameters, a trend "
+                f"and a judgement: measure {q + 2} modes or more"
             )
         if self.outlier is not None:
             mode, off = self.outlier
             return (
-                f"mode {mode} is {100 * off:+.2g} % off by what the other modes say: its number "
-                "may be wrong, or its pole is not of this structure"
+                f"mode {mode} deviates by {100 * off:+.2g} % from the other modes: its number "
+                "may be wrong, or its pole does not belong to this structure"
             )
         if self.is_significant:
             return (
-                f"the model lacks something that grows with frequency ({self.text}): shear, "
+                f"the model neglects an effect that grows with frequency ({self.text}): shear, "
                 "rotary inertia or smaller elements"
             )
         if self.unshaped_pairs:
@@ -182,7 +182,7 @@ class Trend(Value):
 
     @property
     def text(self) -> str:
-        """The slope in words."""
+        """Text of the slope."""
         return (
             f"{100 * self.slope:+.2g} +- {100 * self.slope_deviation:.1g} % at "
             f"{self.highest:.4g} Hz"
@@ -194,7 +194,7 @@ class Trend(Value):
         ``s^2 = dof s_hat^2 / chi^2_dof``, and dp and b normal about their estimates with s.
         """
         if self.dof < 1:
-            raise ModelError(f"there is no posterior: {self.missing}.")
+            raise ModelError(f"the posterior does not exist: {self.missing}.")
         found, root, s_hat = self._regression
         s = s_hat * float(np.sqrt(self.dof / rng.chisquare(self.dof)))
         drawn = found + s * (root @ rng.standard_normal(found.size))
@@ -233,6 +233,6 @@ def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
 
 
 def _amounts(fit: Any) -> FloatArray:
-    """Return the size of each parameter, so that their effects compare whatever their units."""
+    """Return the size of each parameter, so that effects in different units compare."""
     std = np.zeros(fit.values.size) if fit.std is None else fit.std
     return np.asarray(np.maximum(np.abs(fit.values), std))

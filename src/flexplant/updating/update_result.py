@@ -25,9 +25,9 @@ from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
 from .trend import Trend, trend_of
 
-#: share of machines that two printed deviations hold
+#: probability of the interval of two printed deviations
 SHARE = 0.95
-#: most DOFs of a full model whose modes are solved for a print
+#: largest number of DOFs of a full model whose modes are solved for printing
 _DENSE = 1500
 
 
@@ -45,8 +45,7 @@ class History(Value):
         ``e_i`` of the paper's (12); with other residuals the sum of their whitened squares, without
         priors.
     fraction : (i + 1,) array
-        The part of the Gauss-Newton step that was taken; 1 but where the safeguard halved it,
-        0 for the start.
+        Fraction of the Gauss-Newton step; 1 unless it was halved, 0 for the start.
 
     Examples
     --------
@@ -83,13 +82,13 @@ class Starts(Value):
     cost : (s,) array
         Half the sum of squares at the end, infinite where a search failed.
     reason : sequence of s str
-        Why each search ended, or failed; of all methods that were tried.
+        Reason why each search ended or failed, for all tried methods.
     minima : (r, q) array
-        Other minima than the best, by rising cost.
+        Minima other than the best, by rising cost.
     above : (r,) array
-        By how much -2 ln of the likelihood is larger there than at the best: the difference of
-        chi-square where noise explains what is left, else ``n ln(cost / least cost)``. Below zero
-        where the FEModel refuses that one (a negative damper, say) and takes the best.
+        Increase of -2 ln of the likelihood relative to the best: the difference of chi-square where
+        noise explains the residual, else ``n ln(cost / least cost)``. It is negative where the
+        FEModel refuses that minimum (for example for a negative damper) but accepts the best.
 
     Examples
     --------
@@ -107,7 +106,7 @@ class Starts(Value):
 
     @property
     def rivals(self) -> list[tuple[FloatArray, float]]:
-        """Other minima that the data hardly distinguish from the best, and how far above they are.
+        """Other minima that the data hardly distinguish from the best, and their distance.
 
         A likelihood ratio that chance alone makes in one of 10 000 cases (`p_value`).
         """
@@ -122,7 +121,7 @@ class Starts(Value):
 
     def __repr__(self) -> str:
         best = float(np.min(self.cost))
-        # minima that are one but for where the search ended
+        # minima that only differ by the end of the search
         same = int(np.sum(self.cost <= best + 1e-6 * max(abs(best), 1e-12)))
         failed = int(np.sum(~np.isfinite(self.cost)))
         return f"<Starts: {same} of {self.cost.size} at the least cost {best:.3g}, {failed} failed>"
@@ -138,50 +137,49 @@ class UpdateResult(Value):
     units : sequence of q str
     values : (q,) array
     covariance : (q, q) array or None
-        Of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
-        ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
-        ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which holds the
-        model's own error too; None when 2 m = q. Where some residuals have a covariance and others
-        none, s^2 is that of the others. Where `chi2` is more than noise (`p_value` below
-        1e-4) C holds the discrepancy too, or with responses is widened by ``chi2 / dof``.
+        Covariance of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
+        ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], for any weights. Without:
+        ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which includes the
+        model error; None when 2 m = q. Where only some residuals have a covariance, s^2 is that of
+        the others. Where `chi2` exceeds noise (`p_value` below 1e-4) C includes the discrepancy, or
+        with responses is multiplied by ``chi2 / dof``.
     correlation : (q, q) array
         The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
         there is one).
     model : ReducedModel or FEModel
-        Of the kind given, with M, D and K changed.
+        Updated model of the same type, with changed M, D and K.
     history : History
     converged : bool
         Whether a tolerance was met and the data determine the parameters.
     reason : str
-        Why the iteration ended.
+        Reason why the iteration ended.
     at_bound : sequence of str
-        Names of the parameters that ended at one of their bounds: the data pull beyond it, and
-        the covariance does not include it.
+        Names of the parameters that ended at one of their bounds: the data point beyond it, and the
+        covariance does not include it.
     starts : Starts or None
-        What every start led to: all that was tried, and other minima.
+        Results of all starts, including other minima.
     unknowns : sequence of Parameter
-        What was estimated, as it was given to `update`.
+        Estimated parameters, as given to `update`.
     chi2 : float or None
-        What is left of the residuals (and priors), squared and summed in units of their noise, by
-        the parameters that leave least: about `dof` when the model explains the measurement. Only
-        residuals whose noise is known count where others stand next to them, at the estimate; None
-        where there are none.
+        Smallest sum of squares of the residuals (and priors) in units of their noise: about `dof`
+        when the model explains the measurement. Only residuals with known noise count; None without
+        such residuals.
     dof : int
-        Degrees of freedom: residuals and priors that count, less what the parameters that did not
-        end at a bound take of them.
+        Degrees of freedom: number of counted residuals and priors, minus the part of the parameters
+        that did not end at a bound.
     rounds : (r, q) array or None
         The estimate of the reduced model alone and after each round of defect correction.
     residuals : sequence of Residual
-        What was fitted.
+        Fitted residuals.
     discrepancy : sequence of Discrepancy
-        What the model is off by in each kind of residual, beside noise; empty where noise explains
-        what is left.
+        Model error in each kind of residual, in addition to noise; empty where noise explains the
+        residual.
     determined : sequence of str or None
-        None where the data determine all parameters. Else the combinations that they determine
-        to first order, in words: no other value means anything.
+        None where the data determine all parameters. Else a text for each combination that they
+        determine to first order; other values have no meaning.
     prior_std : (q,) array or None
-        Standard deviations of the priors that took part, infinite where a parameter has none; None
-        where no prior did.
+        Standard deviations of the used priors, infinite for a parameter without a prior; None if no
+        prior was used.
     """
 
     parameters: tuple[str, ...]
@@ -215,28 +213,28 @@ class UpdateResult(Value):
 
     @property
     def p_value(self) -> float | None:
-        """The probability that noise alone leaves a larger `chi2`, None when that is not known.
+        """Probability of a larger `chi2` by noise, None if not known.
 
-        Below 1e-4 the model is wrong somewhere else, or the noise was understated.
+        Below 1e-4 the model has another error, or the noise was understated.
         """
         return chance(self.chi2, self.dof)
 
     @property
     def fitted_poles(self) -> MeasuredModes | None:
-        """The measured poles that were fitted, None where not one set of them was."""
+        """The fitted measured poles, None unless exactly one set was fitted."""
         found = [r.measured for r in self.residuals if isinstance(r, Eigenvalues)]
         return found[0] if len(found) == 1 else None
 
     @property
     def discrepancy_text(self) -> str:
-        """The discrepancy in words."""
+        """Text of the discrepancy."""
         return ", ".join(f"{d.deviation:.2g} of {d.kind}" for d in self.discrepancy)
 
     @property
     def negative_masses(self) -> tuple[str, ...]:
         """Names of added masses that are negative by more than two standard deviations.
 
-        Where nothing was taken away the model is too heavy there, or the change is elsewhere.
+        If no mass was removed, the model is too heavy there, or the change is elsewhere.
         """
         margin = np.zeros(self.values.size) if self.std is None else 2 * self.std
         return tuple(
@@ -259,7 +257,7 @@ class UpdateResult(Value):
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
         unused = [q.name for q in self.unknowns if getattr(q, "prior", None) is not None]
         if unused and self.prior_std is None:
-            lines.append(f"  priors that took no part: {', '.join(unused[:5])}")
+            lines.append(f"  unused priors: {', '.join(unused[:5])}")
         if self.determined is not None:
             lines.append(f"  determined only: {'; '.join(self.determined) or 'nothing':.200}")
         lines += self._trend_lines
@@ -271,9 +269,9 @@ class UpdateResult(Value):
             lines.append(f"  ANOTHER MINIMUM, chi2 {sign} {abs(more):.3g}: {other}")
         if self.discrepancy:
             off = f"{self.discrepancy_text} (relative)"
-            lines.append(f"  off by, beside noise: {off}; the +- count it")
+            lines.append(f"  model error in addition to noise: {off}; the +- include it")
         elif is_bad(self.p_value):
-            lines.append("  no +-: what is left is no noise, and coherent")
+            lines.append("  no +-: the residual is coherent and not noise")
         ended = "converged" if self.converged else "NOT CONVERGED"
         head = f"<UpdateResult: {ended} in {counted(len(self.history), 'step')} ({self.reason})"
         if self.p_value is not None:
@@ -282,24 +280,24 @@ class UpdateResult(Value):
 
     @cached_property
     def _trend_lines(self) -> list[str]:
-        """What the fitted frequencies say of the model: a trend, and pairs that may be swapped."""
+        """Text on the trend of the fitted frequencies, and pairs that may be swapped."""
         model = self.model
         if self.fitted_poles is None or not (hasattr(model, "T") or model.n_dof <= _DENSE):
             return []
         found = None
-        with attempted("the trend of what is left", ModelError):
+        with attempted("the trend of the residual", ModelError):
             found = self.trend()
         if found is None or found.dof < 1 or not found.missing:
             return []
         return [f"  {found.missing}"]
 
     def interval(self, level: float = 0.95) -> FloatArray:
-        """Return confidence (credible) intervals (q, 2) of the parameters, of a level in 0 .. 1.
+        """Return confidence (credible) intervals (q, 2) of the parameters for a level in 0 .. 1.
 
-        Of the normal distribution; of Student's where the discrepancy was estimated, with the
-        degrees of freedom that the data alone give the kind that has fewest of them: an error of
-        all modes together takes one, since no mode shows it. ModelError where the covariance is
-        not known.
+        The intervals follow the normal distribution, or Student's distribution if the discrepancy
+        was estimated, with the smallest degrees of freedom of any kind from the data: a common
+        error of all modes takes one, since no mode shows it. ModelError where the covariance is not
+        known.
         """
         from scipy.special import ndtri
 
@@ -308,15 +306,15 @@ class UpdateResult(Value):
         return np.column_stack([self.values - half, self.values + half])
 
     def widened(self, factor: float) -> FloatArray:
-        """Return the covariance (q, q) where that of all data is larger by a factor.
+        """Return the covariance (q, q) if that of all data is larger by a factor.
 
-        What the priors say holds whatever the data are worth: no parameter is known less well than
-        by its prior. ModelError where the covariance is not known.
+        Priors do not change with the factor: every parameter is known at least as well as by its
+        prior. ModelError where the covariance is not known.
         """
         std, factor = self._known_std(), positive(factor, "factor")
         wide: FloatArray = np.asarray(self.covariance) * factor
         if self.prior_std is not None:
-            # information adds up: that of the priors is no part of what is divided
+            # information adds up: that of the priors is not divided by the factor
             size = np.outer(std, std)
             held = np.diag((std / self.prior_std) ** 2)
             told = np.linalg.inv(np.asarray(self.covariance) / size) - held
@@ -324,14 +322,14 @@ class UpdateResult(Value):
         return wide
 
     def _wider_std(self, share: float) -> FloatArray:
-        """Return deviations of which the normal quantile holds a share of each distribution."""
+        """Return deviations that give a probability of each distribution by normal quantiles."""
         from scipy.special import ndtri
 
         ratio = self._quantile(share) / float(ndtri((1 + share) / 2))
         return np.sqrt(np.diag(self.widened(ratio**2)))
 
     def _quantile(self, share: float) -> float:
-        """Return how many standard deviations hold a share of a parameter's distribution."""
+        """Return the number of standard deviations for a probability of a parameter."""
         from scipy.special import ndtri, stdtrit
 
         if not self.discrepancy:
@@ -340,8 +338,8 @@ class UpdateResult(Value):
         return float(stdtrit(least, (1 + share) / 2))
 
     def _printed_deviations(self) -> list[float | None]:
-        """Return deviations of which two hold 95 % of machines, None where nothing says so."""
-        # of responses that a model does not explain, the misfit is coherent from line to line
+        """Return deviations of which two contain 95 % of machines, None if not known."""
+        # for responses that a model does not explain, the misfit is coherent over lines
         std, rejected = self.std, is_bad(self.p_value)
         if std is None or (rejected and not self.discrepancy):
             return [None] * len(self.parameters)
@@ -370,11 +368,11 @@ class UpdateResult(Value):
         return std
 
     def applied_to(self, model: Any) -> Any:
-        """Return another model of the same structure, the full FEModel say, updated likewise.
+        """Return another model of the same structure, such as the full FEModel, with the update.
 
         The estimated values of the parameters go into M, D and K of the model as it was before the
-        update. Damping that a model is given later, in ``solve_modes(model, damping=)``, is not
-        in it: give it first, ``fit.applied_to(model.with_damping(ModalDamping(0.01)))``.
+        update. Damping that is given later, in ``solve_modes(model, damping=)``, is not included:
+        give it first, ``fit.applied_to(model.with_damping(ModalDamping(0.01)))``.
 
         Parameters
         ----------
@@ -385,8 +383,8 @@ class UpdateResult(Value):
         Raises
         ------
         ModelError, LabelError, ShapeError
-            When it is no model, its matrices become indefinite, it lacks the place of a parameter,
-            or matrices of a parameter belong to another number of DOFs.
+            When it is not a model, its matrices become indefinite, it does not have the place of a
+            parameter, or matrices of a parameter have another number of DOFs.
         """
         if not hasattr(model, "rigid_body") or not hasattr(model, "dofs"):
             raise ModelError(
@@ -400,24 +398,24 @@ class UpdateResult(Value):
     def calibrated(self, measured: Any) -> Any:
         """Return the updated model with the measured poles of some modes; see `ReducedModel`.
 
-        The parameters explain shapes, POIs and modes that were not measured; what is measured of
-        a mode is put in as it is. ModelError of an FEModel: calibrate its `modes()`.
+        The parameters explain shapes, POIs and modes that were not measured; measured poles replace
+        those of the model. ModelError of an FEModel: calibrate its `modes()`.
 
         Parameters
         ----------
         measured : MeasuredModes
-            With mode numbers.
+            Measured poles with mode numbers.
         """
         if not hasattr(self.model, "calibrated"):
             raise ModelError(
-                "a full model has more modes than can be solved and put back. Use "
+                "a full model has too many modes for a calibration. Use "
                 "fit.modes(count=...).calibrated(measured)."
             )
         found = self.model.calibrated(measured)
         return found.replace(machines=self.machines(measured)) if self.unknowns else found
 
     def machines(self, measured: MeasuredModes, *, count: int = COUNT, seed: int = 0) -> Machines:
-        """Return what is not known of the machine, as draws of whole machines; see `Machines`.
+        """Return the uncertainty of the machine as draws of whole machines; see `Machines`.
 
         Parameters
         ----------
@@ -432,12 +430,12 @@ class UpdateResult(Value):
         return Machines(self, measured, count, seed)
 
     def trend(self, measured: MeasuredModes | None = None) -> Trend:
-        """Return whether the model lacks something that grows with frequency; see `Trend`.
+        """Return a test for neglected effects that grow with frequency; see `Trend`.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
-            Measured modes with numbers; the poles that were fitted when not given.
+            Measured modes with numbers; by default the fitted poles.
         """
         poles = self.fitted_poles if measured is None else measured
         if poles is None:
@@ -450,23 +448,24 @@ class UpdateResult(Value):
     def uncertainty(
         self, measured: Any = None, *, mesh: MeshError | None = None
     ) -> ModalUncertainty:
-        """Return by what shares frequencies and damping of modes may be off, and their covariance.
+        """Return the uncertainty of frequencies and damping of modes, and their covariance.
 
-        The relative error of a mode is ``S dp + s (e + c)``: the parameters' error, one of each
-        mode and one of all together. Their deviation s, one for frequencies and one for damping,
-        follows from what the parameters leave of the measured modes by restricted likelihood; it is
-        near 0.25 % and 15 % where little was measured. Measured poles condition all of it, so that
-        the covariance of modes and parameters is joint.
+        The relative error of a mode is ``S dp + s (e + c)``: errors of the parameters, of each
+        mode, and common to all modes. Their deviation s, one for frequencies and one for damping,
+        follows from the residual of the measured modes by restricted likelihood; it is near 0.25 %
+        and 15 % where little was measured. All errors are conditioned on the measured poles, so
+        that the covariance of modes and parameters is joint.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
-            The modes with which the model is calibrated: the answer is that of
-            ``fit.calibrated(measured)``, where a measured mode is off by its two deviations, at
-            least by 0.1 % (damping by 2 %). None: of `model`, whose measured modes are off by what
-            the update left, with the poles that were fitted.
+            Modes with which the model is calibrated: the result holds for
+            ``fit.calibrated(measured)``, where a measured mode has an uncertainty of two
+            deviations, at least 0.1 % (damping 2 %). None: for `model`, whose measured modes have
+            the residual of the update as error, with the fitted poles.
         mesh : MeshError, optional
-            Of ``modes.mesh_error(finer)``; 1.5 times of it count for modes that were not measured.
+            Result of ``modes.mesh_error(finer)``; 1.5 times the error counts for modes that were
+            not measured.
 
         Raises
         ------
@@ -483,18 +482,18 @@ class UpdateResult(Value):
     def modes(self, *, count: int | None = None) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.
 
-        Those of a reduced model are expanded by the paper's (7) and (4): ``phi_n = T phi_k``.
+        Modes of a reduced model are expanded by the paper's (7) and (4): ``phi_n = T phi_k``.
 
         Parameters
         ----------
         count : int, optional
-            How many, rigid-body modes included. None: all; of an FEModel of more than 1500 DOFs
-            there must be a count.
+            Number of modes, rigid-body modes included. None: all; an FEModel of more than 1500 DOFs
+            needs a count.
 
         Raises
         ------
         ModelError
-            When dampers to the ground drag the rigid-body modes, or the count is none.
+            When dampers to the ground damp the rigid-body modes, or the count is not valid.
         """
         if not hasattr(self.model, "T"):
             return solve_modes(self.model, count=count)
@@ -502,5 +501,5 @@ class UpdateResult(Value):
         if count is not None:
             reduced = reduced.select(range(whole(count, "count", maximum=reduced.n_modes)))
         if not self.model.is_physical:
-            return reduced  # generalised coordinates: the shapes are expanded already
+            return reduced  # generalised coordinates: the shapes are already expanded
         return reduced.replace(phi=self.model.T @ reduced.phi, dofs=self.model.full_dofs)

@@ -1,4 +1,4 @@
-"""The update of a model from measurements: the paper's equations (9) to (14), and beyond."""
+"""The update of a model from measurements: the paper's equations (9) to (14), extended."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .update_result import History, UpdateResult
 
-#: a parameter this close to its bound, relative to their distance, is at it
+#: distance to a bound, relative to that between bounds, below which a parameter is at its bound
 AT_BOUND = 1e-6
-#: standard deviations by which the last round of defect correction may move the estimate
+#: number of standard deviations by which the last round of defect correction may change the
+#: estimate
 UNSETTLED = 0.5
 
 
@@ -51,17 +52,19 @@ def update(
     """Find the parameters with which the model reproduces the measurement.
 
     ``fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``: `fit.values`,
-    `fit.std` and `fit.parameters` are the answer, `fit.model` the updated model for
+    `fit.std` and `fit.parameters` are the result, `fit.model` the updated model for
     `assemble_plant`, `fit.applied_to(full)` the full one, and `fx.plot.update` draws all of it.
-    Start with poles (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. Which parameters the
-    data determine, `identifiability` says, and where to look first, `localise`. Modes are followed
-    by number and shape, so they may swap order. How it works: `algorithms`.
+    Start with poles (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. `identifiability`
+    shows which parameters the data determine, and `localise` finds the place of an error. Modes are
+    followed by number and shape, so that they may swap order. The method is described in
+    `algorithms`.
 
     Parameters
     ----------
     model : ReducedModel or FEModel
-        The model. An FEModel of more than 300 DOFs is updated in a basis of its modes that is made
-        anew at the estimate until that moves no more; one of more than 20 000 should be reduced.
+        The model. An FEModel of more than 300 DOFs is updated in a basis of its modes, which is
+        computed again at the estimate until the estimate is constant; one of more than 20 000 DOFs
+        should be reduced.
     parameters : sequence of q Parameter
         Unknowns with their bounds and priors: `AddedMass`, `AddedDamping`, `AddedStiffness`,
         `ModeDamping`, `MatrixParameter`, `PolynomialParameter`, or a `Parameter` of your own.
@@ -69,69 +72,68 @@ def update(
         Measurements to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, or a `Residual` of your own, in any mixture.
     method : UpdateMethod, optional
-        `GaussNewton` or `TrustRegion`. None: the trust region, for poles alone
-        without bounds and priors only where Gauss-Newton leads nowhere.
+        `GaussNewton` or `TrustRegion`. None: the trust region; for poles without bounds and priors
+        Gauss-Newton, and the trust region only where it fails.
     start : (q,) array [kg, N s/m, N/m], optional
-        Values to begin with. None: zeros, or the means of priors, inside the bounds; then responses
-        are fitted by the logarithm of their magnitude first, all entries about equally weighted,
-        and poles before shapes, since these converge from farther away. Four other starts are
-        always tried (two with more than 100 DOFs), the default the first of them, since a minimum
-        does not show that there is another; print(fit) names those of similar chi-square. Up to 20
-        (or 4) are tried where none leads to an end, or noise does not explain that responses leave
-        a tenth of their power or that a pole is 0.1 % off (`UpdateResult.starts`). Once an end is
-        found, others are searched for ten steps, and on where their cost comes near to its cost;
-        eight starts in one best minimum are enough.
+        Start values. None: zeros, or the means of priors, inside the bounds; then responses are
+        first fitted by the logarithm of their magnitude, and poles before shapes, since these
+        converge from farther away. Four other starts are always tried (two with more than 100
+        DOFs), to find other minima; print(fit) names those with a similar chi-square. Up to 20 (or
+        4) are tried if no start leads to an end, or if noise does not explain a residual of a tenth
+        of the power of responses or of 0.1 % of a pole (`UpdateResult.starts`). After an end is
+        found, other starts get ten steps, and more if their cost is close; the search stops with
+        eight starts in the best minimum.
     starts : int or (s, q) array, optional
-        Search from these starts alone, or from so many that are drawn between the bounds (or from
-        the priors), and keep the best; `start` is one of them. 1: from `start` alone.
+        Start values, or their number; a number of starts is drawn between the bounds (or from the
+        priors), including `start`. The best result is kept. 1: only `start`.
     rng : int, SeedSequence or Generator
-        For drawn starts.
+        Random generator of drawn starts, or its seed.
     prior : bool
-        Whether priors take part; they can where the noise of all residuals is known. Two finite
-        bounds without a prior make one: zero (or the bound nearest to it) most probable, the
-        farther bound three standard deviations away.
+        Whether to use priors, which is possible if the noise of all residuals is known. Two finite
+        bounds without a prior imply one: zero (or the bound closest to it) is most probable, and
+        the farther bound is three standard deviations away.
     max_iterations : int, optional
-        Most steps from one start; 20 for Gauss-Newton, 200 for the others when not given.
+        Largest number of steps from one start; by default 20 for Gauss-Newton, 200 for the others.
     tolerance : float
-        Done when a full step, or the residual, changes no eigenvalue by more than this, relatively.
+        Relative change of every eigenvalue by a full step, or by the residual, at which the search
+        ends.
     full : FEModel, optional
-        That the reduced model was made from. The reduction makes an error that can be larger than
-        the noise, which chi-square does not always show; it is taken out by defect correction:
-        solve the full model at the estimate, add the difference of its residuals from those of the
-        reduced one, fit again. Damping is that of the full model's D, else of the reduced model.
+        FEModel of the reduced model. The reduction error may be larger than the noise, which
+        chi-square does not always show. Defect correction removes it: the full model is solved at
+        the estimate, the difference of its residuals from those of the reduced model is added, and
+        the fit is repeated. Damping comes from the full model's D, else from the reduced model.
     rounds : int
-        Of defect correction, at most; fewer where one moves the estimate by less than 0.01
-        standard deviations.
+        Largest number of rounds of defect correction; fewer if one changes the estimate by less
+        than 0.01 standard deviations.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------
     UpdateResult
-        With `converged` False when the tolerance was not met, or the data do not determine the
+        Result; `converged` is False if the tolerance was not met, or the data do not determine the
         parameters.
 
     Warns
     -----
     FlexplantWarning
-        When the tolerance was not met; when the data do not determine the parameters (their rank at
-        the end, bounds that are reached and priors included, is too low): the combinations that
-        they determine are named; when an end is found, but not from the `start` that was
-        given; when the last round of defect correction still moved the estimate by more than half
-        a standard deviation; when the residuals of known noise leave more than it does in one of
-        10 000 cases: parameters, and for each kind of residual the standard deviation of what the
-        model cannot explain, are then estimated together (`UpdateResult.discrepancy`; with
-        responses the covariance is widened instead, by chi-square over its degrees of freedom, and
-        no +- is printed).
+        When the tolerance was not met; when the data, with active bounds and priors, do not
+        determine the parameters (the warning names the determined combinations); when an end is
+        found, but not from the given `start`; when the last round of defect correction changed the
+        estimate by more than half a standard deviation; when the residual exceeds known noise with
+        a p-value below 1e-4. In the last case parameters and the model error of each kind of
+        residual are estimated together (`UpdateResult.discrepancy`); with responses the covariance
+        is multiplied by chi-square over its degrees of freedom, and no +- is printed.
 
     Raises
     ------
     ModelError
         When the measured eigenvalues do not depend on a parameter or cannot distinguish some (S is
-        singular), the matrices are indefinite at `start`, or the FEModel refuses the answer (a
-        damper came out negative: give it bounds).
+        singular), the matrices are indefinite at `start`, or the FEModel refuses the result (for
+        example a negative damper: give it bounds).
     SolverError
-        When no part of a step keeps the model physical, or no start leads anywhere.
+        When every step makes the model unphysical, or no start leads to a solution.
 
     References
     ----------
@@ -159,7 +161,7 @@ def update(
     rounds = whole(rounds, "rounds")
     bounded = any(getattr(q, "bounds", None) is not None for q in listed)
     known = any(getattr(q, "prior", None) is not None for q in listed)
-    # the paper's problem: eigenvalues alone, nothing known beforehand
+    # the paper's problem: only eigenvalues, no prior knowledge
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
     if method is None:
         method = Auto() if plain and not bounded else TrustRegion()
@@ -180,7 +182,7 @@ def update(
     begins = all_starts(objective, start, starts, rng)
     with Progress(None, ITERATIONS, progress=progress, advice=_ADVICE):
         check_units(objective, begins[0])
-        # where an answer that is drawn to its start ends is no minimum of the misfit
+        # a result that depends on its start is not a minimum of the misfit
         if starts is None and not method.penalised:
             best, begins, ends = from_one_start(
                 objective, begins[0], search, rng, given=start is not None
@@ -206,7 +208,7 @@ def update(
     if found:
         again = _result(model, objective, method, end, begins[0])
         kept = {"starts": fit.starts, "rounds": fit.rounds, "residuals": given}
-        # whether the model is right is judged by the noise alone, at the least chi-square
+        # the model is judged by the noise only, at the smallest chi-square
         fit = again.replace(chi2=fit.chi2, dof=fit.dof, discrepancy=found, **kept)
     elif fit.covariance is not None and fit.chi2 is not None:
         fit = fit.replace(covariance=fit.widened(fit.chi2 / fit.dof))
@@ -217,21 +219,21 @@ def update(
 def _ends_warned(
     objective: Objective, best: SearchEnd, estimates: list[FloatArray], lost: FlexplantError | None
 ) -> None:
-    """Warn of rounds that have not settled, of a start that leads nowhere, of a search cut short.
+    """Warn of rounds without convergence, a failed start, or a search that was cut short.
 
-    `estimates`: the first and that of each round; `lost`: why the start given has no end.
+    `estimates`: the first and that of each round; `lost`: reason of failure of the given start.
     """
     still = normalised_step(objective, best.p, estimates[-2]) if len(estimates) > 1 else 0.0
     if still > UNSETTLED:
         warn(
-            f"defect correction has not settled: round {len(estimates) - 1} still moved the "
+            f"defect correction has not converged: round {len(estimates) - 1} still changed the "
             f"estimate by {still:.2g} standard deviations. Give more rounds=, or a reduced model "
             "with more modes."
         )
     if lost is not None:
         warn(
-            f"from the start that was given no end is found: {lost} The answer is that from "
-            "another start (.starts has all of them)."
+            f"the search from the given start failed: {lost} The result is from another start "
+            "(.starts lists all of them)."
         )
     if not best.converged:
         error = best.trail.error
@@ -245,7 +247,7 @@ def _ends_warned(
 def _result(
     model: Any, objective: Objective, method: UpdateMethod, best: SearchEnd, begin: FloatArray
 ) -> UpdateResult:
-    """Return what the best search found and how well it is known."""
+    """Return the result of the best search with its covariance."""
     point = objective.at(best.p)
     low, high, p = objective.lower, objective.upper, best.p
     unit = unit_changes(objective, objective.slopes(point, prior=False))
@@ -259,7 +261,7 @@ def _result(
     spread, correlation = covariance(objective, point)
     determined: tuple[str, ...] | None = None
     if not method.penalised:
-        # what a bound or a prior holds is known, whatever the data determine
+        # a parameter at a bound or with a prior is known, independent of the data
         found = resolution(objective, point, ~fitted | (objective.has_prior & objective.uses_prior))
         if not found.clear.all():
             determined = tuple(found.combinations(names.tolist()))
@@ -288,43 +290,44 @@ def _result(
 
 
 def _unused_priors(objective: Objective) -> str:
-    """Return that the priors take no part, and of which residuals the noise is not known."""
+    """Return a text on unused priors, and the residuals with unknown noise."""
     named = [q.name for q in objective.parameters if getattr(q, "prior", None) is not None]
     silent = " and ".join(bound.name for bound in objective.bounds if not bound.noisy)
     return (
-        f"the priors of {some_names(named)} take no part: their weight against {silent}, whose "
-        "noise is not known, is open. Give the noise (covariance=, std=, variance=) without "
+        f"the priors of {some_names(named)} are not used: their weight relative to {silent}, "
+        "whose noise is not known, is undefined. Give the noise (covariance=, std=, variance=) "
+        "without "
         "weights, or pass prior=False."
     )
 
 
 def _undetermined(fit: UpdateResult, text: str) -> str:
-    """Return what the data determine of a fit of which they do not determine every parameter."""
+    """Return a text on the combinations that the data determine, if not all parameters."""
     names, known = fit.parameters, fit.determined or ()
     listed = f": {'; '.join(known[:6])}" if known else ""
     return (
         f"the parameters are not determined: {text} determine {len(known)} of "
         f"{counted(len(names), 'combination')} of {some_names(names)}, to first order{listed}. "
-        "Other values fit as well as those that were found, and there is no covariance. Measure "
+        "Other values fit equally well, and the covariance is not known. Measure "
         "more (identifiability(model, parameters, residuals) names the modes), drop parameters, or "
         "give priors and the noise of the measurement."
     )
 
 
 def _complaint(fit: UpdateResult, named: str) -> str:
-    """Return what is wrong with a fit that leaves more than noise; `named`: its worst residuals."""
+    """Return a text on a fit whose residual exceeds noise; `named`: its worst residuals."""
     masses = fit.negative_masses
-    negative = f"{', '.join(masses)} came out negative. " if masses else ""
+    negative = f"{', '.join(masses)} became negative. " if masses else ""
     tried = f"{counted(len(fit.starts or ()), 'start')} tried. "
     kept = (
-        f"The covariance is widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for "
-        "small errors of the model only."
+        f"The covariance is multiplied by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and is valid "
+        "for small model errors only."
     )
     if fit.discrepancy:
         kept = (
-            f"A discrepancy of {fit.discrepancy_text} counts as noise, so that the parameters "
-            "weigh each value by what the model can explain; fit.uncertainty() says by how much "
-            "modes may be off."
+            f"A discrepancy of {fit.discrepancy_text} counts as noise, so that values are "
+            "weighted by the accuracy of the model; fit.uncertainty() gives the uncertainty of "
+            "modes."
         )
     return (
         f"the updated model leaves more than noise: chi-square {fit.chi2:.4g} for {fit.dof} "
@@ -343,15 +346,15 @@ STILL = 1e-2
 def corrected(
     objective: Objective, basis: FullBasis, search: SearchPlan, end: SearchEnd, rounds: int
 ) -> tuple[SearchEnd, list[FloatArray]]:
-    """Return the end of the last round, the objective being there, and the estimates on the way.
+    """Return the end of the last round, with the objective there, and all estimates.
 
     In each round the full model is solved at the estimate, and the difference of its residuals
     from those of the reduced model, with its derivative, is added to the reduced model's::
 
         r(p) = r_reduced(p) + d + d' (p - p_0),   d = r_full(p_0) - r_reduced(p_0)
 
-    Where a round moves the estimate no more, r and dr/dp are those of the full model.
-    [Stetter1978]_; [AlexandrovLewis2001]_ (the derivative).
+    When the estimate is constant, r and dr/dp are those of the full model. [Stetter1978]_;
+    [AlexandrovLewis2001]_ (the derivative).
     """
     first = end.trail.p[0]
     estimates = [end.p]
@@ -366,7 +369,7 @@ def corrected(
             full.values(there, prior=False) - objective.values(point, prior=False),
             full.slopes(there, prior=False) - objective.slopes(point, prior=False),
         )
-        # what is drawn to the start is so anew; modes keep the numbers they have there
+        # terms that depend on the start are set again; modes keep their numbers
         drawn = search.method.penalised
         end = search.begun(objective, first) if drawn else search.resumed(objective, end)
         estimates.append(end.p)

@@ -1,4 +1,4 @@
-"""Where was something added: every candidate scored alone, then the best subset."""
+"""Localisation of changes: every candidate is scored separately, then the best subset."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from .goodness import chance, is_bad
 from .subsets import Subsets
 from .twins import ALIKE, alike_sets
 
-#: part of what the best candidate explains to first order that makes another worth a fit, and how
-#: many are fitted in any case
+#: fraction of the first-order effect of the best candidate above which another one is fitted, and
+#: number that is always fitted
 WORTH, FEWEST = 0.25, 10
-#: DOFs of an FEModel above which a basis replaces it
+#: number of DOFs of an FEModel above which a basis replaces it
 LARGE = 150
 
 
@@ -40,33 +40,33 @@ def localise(
 ) -> Localisation:
     """Find which of many candidate changes explains a measurement.
 
-    Arguments are as for `update`: ``found = fx.updating.localise(drawing, candidates,
-    residuals)``, with a candidate for every place, for example
-    ``[fx.AddedMass(at) for at in drawing.dofs.labels]``.
-    `found.chosen` names up to `most` of them, none where nothing is wrong; `found.ranking` all by
-    what each explains alone. `found.alike_sets` are the sets that explain the data as well as the
-    chosen one, which on a symmetric structure are many: pass each to `update`, or tell them apart
-    with shapes or responses; `found.alike` has all of their members. What is wrong everywhere
-    (Young's modulus, damping) goes into `nuisance`. How it works: `algorithms`.
+    Arguments are as for `update`: ``found = fx.updating.localise(drawing, candidates, residuals)``,
+    with a candidate for every place, for example
+    ``[fx.AddedMass(at) for at in drawing.dofs.labels]``. `found.chosen` names up to `most` of them,
+    and is empty if nothing is wrong; `found.ranking` sorts all by their separate effect.
+    `found.alike_sets` are the sets that explain the data equally well, which are many on a
+    symmetric structure: pass each to `update`, or distinguish them with shapes or responses;
+    `found.alike` has all of their members. Errors of the whole structure (Young's modulus, damping)
+    belong into `nuisance`. The method is described in `algorithms`.
 
     Parameters
     ----------
     model : ReducedModel or FEModel
-        Without the change. An FEModel of more than 150 DOFs is replaced by a basis of its modes
-        and the static responses to loads at the candidates.
+        Model without the change. An FEModel of more than 150 DOFs is replaced by a basis of its
+        modes and the static responses to loads at the candidates.
     candidates : sequence of c Parameter
-        Added masses or springs at every DOF in question, say.
+        Possible changes, for example added masses or springs at every DOF.
     residuals : sequence of Residual
-        Measured with the change.
+        Residuals measured with the change.
     nuisance : sequence of Parameter, optional
-        Unknowns beside the candidates; their priors are not used.
+        Unknowns in addition to the candidates; their priors are not used.
     most : int
         Largest subset.
     screen : int
-        How many are fitted, at most: those that explain, to first order, a quarter of what
-        the best one does, and ten in any case.
+        Largest number of fitted candidates: those with at least a quarter of the first-order effect
+        of the best one, and always ten.
     progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
 
     Returns
     -------
@@ -75,21 +75,20 @@ def localise(
     Warns
     -----
     FlexplantWarning
-        When the chosen subset leaves more than noise does in one of 10 000 cases (`p_value`).
+        When the residual of the chosen subset exceeds noise with a p-value below 1e-4 (`p_value`).
 
     Raises
     ------
     ModelError, LabelError
-        As `update`; or when the counts make no sense, a nuisance is a candidate too, or there
-        are no more data than nuisance parameters.
+        As for `update`; or when counts are not valid, a nuisance parameter is a candidate too, or
+        the data are at most as many as the nuisance parameters.
 
     Notes
     -----
-    One candidate too many is chosen at a known rate. Another of c candidates joins k when it
-    lowers chi-square by more than its price, ``ln n + 2 ln((c - k) / (k + 1))`` for n data. By
-    chance alone the best of the others does so with probability
-    ``(c - k) P(chi2_1 > price)``: in 10 to 13 of 100 measurements with one change, for 12 to 25
-    candidates and 20 to 24 data. `margin` then is small.
+    The rate of superfluous candidates is known. Another of c candidates joins k when it lowers
+    chi-square by more than ``ln n + 2 ln((c - k) / (k + 1))`` (the price) for n data. By chance the
+    best of the others does so with probability ``(c - k) P(chi2_1 > price)``: in 10 to 13 of 100
+    measurements with one change, for 12 to 25 candidates and 20 to 24 data. `margin` then is small.
 
     References
     ----------
@@ -111,7 +110,8 @@ def localise(
     both = sorted({q.name for q in listed} & {q.name for q in beside})
     if both:
         raise ModelError(
-            f"{', '.join(both)}: a candidate and a nuisance at once. Leave it out of one of them."
+            f"{', '.join(both)}: both a candidate and a nuisance parameter. Leave it out of one "
+            "of them."
         )
     given = checked_residuals(residuals)
     most, screen = counted(most, "most"), counted(screen, "screen")
@@ -121,8 +121,8 @@ def localise(
     fits = Subsets(whole, given, len(listed))
     if fits.rows <= len(beside):
         raise ModelError(
-            f"{fits.rows} data do not determine {counted(len(beside), 'nuisance parameter')}, let "
-            "alone a candidate beside them: measure more modes or lines."
+            f"{fits.rows} data do not determine {counted(len(beside), 'nuisance parameter')} and "
+            "a candidate: measure more modes or lines."
         )
     values, score, criterion = _singles(fits, screen, progress)
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
@@ -157,12 +157,12 @@ def localise(
     if fit is not None and is_bad(found.p_value):
         full = len(best) >= most
         warn(
-            f"{' and '.join(found.chosen) or 'no change'}, the best that {len(listed)} candidates "
-            f"give, {'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
+            f"{' and '.join(found.chosen) or 'no change'}, the best of {len(listed)} candidates, "
+            f"{'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
             f"{chi2:.4g} for dof = {dof}. It fits worst {fits.worst(best)}. "
             "Something else differs between model and machine, or the noise is understated: give "
-            f"{'most= more, ' if full else ''}candidates at other places or of another kind, "
-            "or what is wrong everywhere as nuisance=."
+            f"{'most= more, ' if full else ''}candidates at other places or of another kind, or "
+            "errors of the whole structure as nuisance=."
         )
     return found
 
@@ -188,16 +188,16 @@ def _singles(
                 criterion[i] = fits.score((i,))
             bar.advance()
     for i in order[tried.size :].tolist():
-        # known to first order only: never better than what was fitted exactly
+        # only known to first order: never better than an exact fit
         score[i] = min(score[i], float(np.nanmin(score[np.isfinite(criterion)], initial=1.0)))
     return values, score, criterion
 
 
-#: share of the residual by which rivals explain less than the best at most
+#: largest fraction of the residual by which rivals explain less than the best
 NEAR = 0.01
 #: difference of BIC that is very strong evidence ([KassRaftery1995]_: 10)
 CERTAIN = 10.0
-#: names in a line of a repr, lines in a table
+#: number of names in a line of a repr, and of lines in a table
 SHOWN, ROWS = 6, 12
 
 
@@ -209,30 +209,29 @@ class Localisation(Value):
     ----------
     candidates : sequence of c str
     values : (c,) array
-        What each candidate would have to be if it were the only change; NaN when it could not
-        be fitted.
+        Value of each candidate if it were the only change; NaN if the fit failed.
     score : (c,) array
-        The share of the residual's sum of squares that each explains alone, at most 1.
+        Fraction of the residual's sum of squares that each explains separately, at most 1.
     bic : (c,) array
-        Extended Bayesian information criterion of each alone.
+        Extended Bayesian information criterion of each candidate alone.
     chosen : sequence of str
-        The subset of least BIC; empty when nothing at all is best.
+        Subset with the smallest BIC; empty when no change is best.
     chosen_values : array
-        Its values.
+        Values of the chosen candidates.
     chosen_bic, nothing_bic : float
         BIC of the subset, and of no change.
     nuisance : sequence of n str
         Parameters that were fitted along with every candidate, and with none.
     nuisance_values : (n,) array
-        Theirs beside the chosen subset.
+        Values of the nuisance parameters with the chosen subset.
     chi2 : float or None
-        What the chosen subset leaves, None where the noise is not known.
+        Chi-square of the chosen subset, None where the noise is not known.
     dof : int
-        Residuals less the parameters that were fitted.
+        Number of residuals minus number of fitted parameters.
     units : sequence of c str, optional
-        Of the candidates.
+        Units of the candidates.
     next_best : sequence of str
-        The best set that was fitted and lacks a place of the chosen one; empty for no change.
+        The best fitted set without a place of the chosen one; empty for no change.
     next_bic : float
         Its criterion, infinite where no other set was fitted.
     alike_sets : sequence of tuples of str
@@ -260,11 +259,11 @@ class Localisation(Value):
 
     @property
     def margin(self) -> float:
-        """By how much the criterion of the next set is above that of the chosen one.
+        """Difference of the criterion between the next set and the chosen one.
 
         A difference d is a likelihood ratio of ``exp(d/2)``: below 10 the next set is possible too.
-        Where more than noise is left (`p_value`), the ratio is that of errors of the model, and the
-        difference is divided by ``chi2 / dof``.
+        Where the residual exceeds noise (`p_value`), the ratio is that of errors of the model, and
+        the difference is divided by ``chi2 / dof``.
         """
         wrong = is_bad(self.p_value) and self.chi2 is not None
         size = (self.chi2 or 0.0) / max(self.dof, 1) if wrong else 1.0
@@ -277,7 +276,7 @@ class Localisation(Value):
 
     @property
     def p_value(self) -> float | None:
-        """The probability that noise leaves a larger `chi2`, None when that is not known."""
+        """Probability of a larger `chi2` by noise, None if not known."""
         return chance(self.chi2, self.dof)
 
     @property
@@ -288,7 +287,7 @@ class Localisation(Value):
 
     @property
     def leading(self) -> tuple[str, ...]:
-        """The best dozen candidates alone, and those chosen that are not among them."""
+        """The best twelve single candidates, and chosen ones that are not among them."""
         best = self.ranking[:ROWS]
         return (*best, *(name for name in self.chosen if name not in best))
 
@@ -308,8 +307,8 @@ class Localisation(Value):
     def rivals(self) -> tuple[str, ...]:
         """Candidates that alone explain nearly as much as the best one, at most 1 % less.
 
-        The data distinguish those that are not `alike` from the best, but only by a small part of
-        the residual, which an error of the model itself could make or hide: mirror images on a
+        The data distinguish those that are not `alike` from the best, but only by a small fraction
+        of the residual, which a model error could cause or hide: for example mirror images on a
         symmetric structure.
         """
         least = float(np.max(self.score)) - NEAR
@@ -341,7 +340,7 @@ class Localisation(Value):
                 f"{name} = {value:.4g}"
                 for name, value in zip(self.nuisance, self.nuisance_values.tolist(), strict=True)
             )
-            found = f"{found or 'no change'} beside {beside}"
+            found = f"{found or 'no change'} with {beside}"
         text = (
             f"<Localisation: {found or 'no change'} (BIC {self.chosen_bic:.4g}, no change "
             f"{self.nothing_bic:.4g})\n  explained alone: {best}"
@@ -361,5 +360,5 @@ class Localisation(Value):
             text += f"\n  {said}: {other}, worse by {self.margin:.3g}"
             text += " (likelihood ratio exp(d/2))"
         if is_bad(self.p_value):
-            text += f"\n  MORE THAN NOISE IS LEFT: chi2 {self.chi2:.4g} for {self.dof} dof"
+            text += f"\n  RESIDUAL EXCEEDS NOISE: chi2 {self.chi2:.4g} for {self.dof} dof"
         return text + ">"

@@ -1,4 +1,4 @@
-"""How well an update explains the data, and how well its parameters are known."""
+"""Goodness of fit of an update, and covariance of its parameters."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from ...tolerances import TINY, divisor
 from ..family import Point
 from ..search import Objective
 
-#: a chi-square that noise exceeds more rarely than this is no noise
+#: p-value below which noise does not explain the misfit
 CHANCE = 1e-4
 #: number of residuals that are named
 NAMED = 3
-#: singular values of the scaled sensitivities below this part of the largest count as zero
+#: singular values of the scaled sensitivities below this fraction of the largest count as zero
 SINGULAR = 1e-9
-#: a combination of parameters with a singular value below this part of the largest is lost
+#: singular value of a combination of parameters, relative to the largest, below which it is not
+#: determined
 LOST = 1e-6
 
 
 def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[float | None, int]:
     """Return `noise_misfit` and its degrees of freedom; those of all rows where no noise is known.
 
-    They are the rows less what the parameters take of them: the trace of these rows of the
-    projector on all slopes, which is its rank where all noise is known.
+    The degrees of freedom are the number of rows minus the part of the parameters: the trace of
+    these rows of the projector on all slopes, which is its rank where all noise is known.
     """
     misfit = noise_misfit(objective, point, free)
     J = objective.slopes(point)[:, free]
@@ -43,10 +44,10 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
 
 
 def noise_misfit(objective: Objective, point: Point, free: FloatArray) -> float | None:
-    """Return ``|N^-1/2 r|^2`` of the residuals whose noise N is known, None where there is none.
+    """Return ``|N^-1/2 r|^2`` of the residuals with known noise N, None without such.
 
     ``min_d |N^-1/2 (r + J d)|^2``, to first order, where all noise is known but other weights are
-    given: whatever these are, it is distributed as chi-square.
+    given: it is distributed as chi-square for any weights.
     """
     if not any(bound.has_noise for bound in objective.bounds):
         return None
@@ -85,7 +86,7 @@ def _whitened(noise: Any, rows: FloatArray) -> FloatArray:
 
 
 def chance(chi2: float | None, dof: int) -> float | None:
-    """Return the probability that noise leaves a larger chi-square, None when not known."""
+    """Return the probability of a larger chi-square by noise, None if not known."""
     if chi2 is None or dof < 1:
         return None
     from scipy.special import chdtrc
@@ -94,7 +95,7 @@ def chance(chi2: float | None, dof: int) -> float | None:
 
 
 def is_bad(probability: float | None) -> bool:
-    """Return whether noise alone hardly explains what is left."""
+    """Return whether noise hardly explains the residual."""
     return probability is not None and probability < CHANCE
 
 
@@ -117,7 +118,7 @@ def worst(objective: Objective, point: Point) -> str:
 def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, FloatArray]:
     """Return covariance (or None) and correlation of the estimate, to first order."""
     # `G N G^T` with `G = (J^T J)^-1 J^T` and N the covariance of the weighted residuals where it is
-    # known, the variance s^2 of what is left of the residuals without a scale
+    # known, the residual variance s^2 of the residuals without a scale
     J, r = objective.slopes(point), objective.values(point)
     q = J.shape[1]
     length = np.linalg.norm(J, axis=0)
@@ -140,7 +141,7 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     known += U[data:].T @ U[data:]
     found: FloatArray | None = None
     if objective.noise_known or spare > 0.5:
-        # half a row: what the trace of a projector leaves of none is rounding
+        # half a row: a smaller trace of a projector is rounding
         variance = left / spare if spare > 0.5 else 0.0
         found = half @ (known + variance * other) @ half.T
         unit = found if objective.noise_known else unit
@@ -152,18 +153,18 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     return (found if regular else None), correlation
 
 
-#: a relative change of the data below this part of the relative change of an eigenvalue that the
-#: parameter can cause at most is rounding
+#: relative change of the data, relative to the largest change of an eigenvalue by the parameter,
+#: below which it is rounding
 ROUNDING = 1e-12
 
 
-#: part of a combination below which a parameter is not printed in it
+#: fraction of a combination below which a parameter is not printed
 MINOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """What residuals determine of q parameters at a point: a singular value decomposition.
+    """Combinations of q parameters that residuals determine at a point, by singular values.
 
     The sensitivities have columns of length one: ``J diag(1/length) = U diag(values) axes``.
     """
@@ -181,8 +182,9 @@ class Resolution:
         return np.asarray(self.values > LOST * self.values[0])
 
     def combinations(self, names: Sequence[str]) -> list[str]:
-        """Return the determined combinations in words, each of as few parameters as possible."""
-        # the rows that span them, solved for as many parameters: each of these appears once
+        """Return a text for each determined combination, with as few parameters as possible."""
+        # the rows that span them, solved for the same number of parameters, each of which appears
+        # once
         rows = self.axes[self.clear] * self.length
         rank = len(rows)
         pivots = la.qr(self.axes[self.clear], mode="r", pivoting=True)[1][:rank]
@@ -206,17 +208,17 @@ class Resolution:
 def resolution(
     objective: Objective, point: Point, pinned: npt.NDArray[np.bool_] | None = None
 ) -> Resolution:
-    """Return what the residuals determine at a point; `pinned`: known anyhow, by a prior, say."""
+    """Return what the residuals determine at a point; `pinned`: known otherwise, as by a prior."""
     J = objective.slopes(point, prior=False)
     length = np.linalg.norm(J, axis=0)
     own = np.abs(J).max(initial=0.0) * ROUNDING
     omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
     reach = objective.family.strength(omega)
-    # a column far below what the parameter can do to this model is rounding: compared with the
-    # strongest one, and, as a single one is its own strongest, as a relative change of the data
+    # a column far below the possible effect of the parameter on this model is rounding: relative to
+    # the strongest one, and, for a single parameter, as a relative change of the data
     strongest = float(np.max(length / reach, initial=0.0))
     change = np.linalg.norm(J / divisor(objective.size(point)[: len(J)])[:, None], axis=0)
-    # nine decades below the strongest nothing is seen but rounding
+    # nine decades below the strongest there is only rounding
     seen = (length > own) & (length > 1e-9 * strongest * reach)
     seen &= change > ROUNDING * reach / omega
     length = np.where(seen, length, 1.0)

@@ -1,4 +1,4 @@
-"""Which parameters, or combinations of them, the residuals determine."""
+"""Identifiability: parameters, or combinations of them, that the residuals determine."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
 from .goodness import LOST, resolution
 
-#: correlations beyond this are listed
+#: correlation above which a pair is listed
 CORRELATED = 0.99
-#: an eigenvalue that changes by less than this part of what the parts of a combination change it
-#: by does not determine the combination
+#: change of an eigenvalue by a combination, relative to that by its parts, below which it does not
+#: determine the combination
 CANCELS = 1e-3
 #: number of modes that are named as missing
 NAMED = 3
@@ -28,28 +28,29 @@ NAMED = 3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiabilityReport(Value):
-    """What the residuals determine of the parameters, to first order.
+    """Parameters that the residuals determine, to first order.
 
     Parameters
     ----------
     parameters : sequence of q str
     singular_values : (q,) array
-        Of the sensitivities, each column scaled to length one: sqrt(q) to zero.
+        Singular values of the sensitivities, with each column scaled to length one: sqrt(q) to
+        zero.
     combinations : (q, q) array
-        Columns: the combinations of (scaled) parameters of each singular value.
+        Combinations of (scaled) parameters of each singular value, in columns.
     std : (q,) array
-        Standard deviations to be expected where the noise is known (else for unit noise of the
-        weighted residuals); infinite where a parameter cannot be found.
+        Expected standard deviations with known noise (otherwise for unit noise of the weighted
+        residuals); infinite where a parameter cannot be determined.
     correlation : (q, q) array
-        Of the errors to be expected; zero with parameters that cannot be found.
+        Correlation of the expected errors; zero for parameters that cannot be determined.
     unseen : sequence of str
         Parameters that no residual depends on.
     mixed : sequence of (str, ...)
         Groups of parameters of which a combination cannot be determined.
     missing : mapping {str: (int, ...)}
-        For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
-        would determine the lost combinations, those that change most first; none where no
-        eigenvalue does, as of mirror images on a symmetric structure.
+        For parameters that are unseen or mixed: unmeasured modes whose eigenvalues would determine
+        the lost combinations, those with the largest change first; empty where no eigenvalue helps,
+        as for mirror images on a symmetric structure.
     """
 
     parameters: tuple[str, ...]
@@ -102,14 +103,14 @@ def identifiability(
 ) -> IdentifiabilityReport:
     """Return which parameters the residuals determine at a start, before solving.
 
-    The singular values of the weighted sensitivities S, the correlation
-    ``(S^T S)^-1`` of the estimate, and which modes are missing. Priors take no part.
+    The singular values of the weighted sensitivities S, the correlation ``(S^T S)^-1`` of the
+    estimate, and which modes are missing. Priors are not used.
 
     Parameters
     ----------
     model, parameters, start : as for `update`
     residuals : sequence of Residual
-        Data; the values are not used, only what they would depend on (and their noise).
+        Data; only their noise and their dependence on parameters are used, not the values.
 
     Returns
     -------
@@ -139,7 +140,7 @@ def identifiability(
     s, Vt, clear, seen, length = found.values, found.axes, found.clear, found.seen, found.length
     half = Vt[clear].T / s[clear]
     unit = half @ half.T
-    # squares: a share of 1e-3 of a lost combination
+    # squared: a fraction of 1e-3 of a lost combination
     lost = np.sum(Vt[~clear] ** 2, axis=0) > 1e-6
     std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / length)
     size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), TINY)))
@@ -176,23 +177,23 @@ def _missing_modes(
     columns = point.columns(numbers)
     size = np.abs(point.eigen.poles[columns])[:, None]
     S = objective.family.sensitivity(point.eigen, columns) / size
-    # how repeated modes split has no sign: only their mean has a direction
+    # the split of repeated modes has no sign: only their mean has a direction
     for group in repeated_groups(point.eigen.poles):
         mean = np.trace(objective.family.group_derivative(point.eigen, group), axis1=1, axis2=2)
         for i in [i for i, column in enumerate(columns) if column in group]:
             S[i] = mean / len(group) / size[i]
     along = np.abs(S @ lost.T)
     parts = np.abs(S) @ np.abs(lost.T)
-    # what cancels but for rounding, or the truncation of the model, determines nothing
+    # terms that cancel except for rounding, or truncation of the model, determine nothing
     felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
     clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
     found = {}
     for name in poor:
-        # takes part
+        # contributes
         own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
         share = np.max(clear[:, own], axis=1, initial=0.0)
         order = np.argsort(-share, kind="stable")[:NAMED]
         largest = share.max(initial=0.0)
-        # modes that take no part but for rounding
+        # modes that contribute only rounding
         found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)
     return found

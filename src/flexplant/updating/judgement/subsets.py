@@ -1,4 +1,4 @@
-"""Which subset of many parameters explains a measurement: grown, screened again and exchanged."""
+"""Search for the subset of many parameters that explains a measurement."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
 from .goodness import chance, is_bad, noise_misfit, worst
 
-#: best subsets of each size that grow
+#: number of best subsets of each size that are extended
 BEAM = 3
-#: candidates that join a subset, pairs that are tried at once
+#: number of candidates that extend a subset, and number of pairs that are tried together
 JOIN = 6
-#: rounds of exchanging members
+#: number of rounds of exchanging members
 ROUNDS = 4
-#: relative tolerance of the fits that are compared, and of the one that is chosen
+#: relative tolerance of the compared fits, and of the chosen one
 COMPARED, CHOSEN = 1e-4, 1e-9
-#: parts of the way to a guess at which modes are followed, where their shapes change much on it
+#: number of parts of the way to a guess at which modes are followed, if their shapes change much
 WAY = (0.0, 0.25, 0.5, 0.75)
-#: least MAC of every mode with itself at which it is the same mode without a step between
+#: least MAC of every mode with its start at which no step between is needed
 SAME = 0.8
-#: part of the residuals, or of those without a change, by which few coordinates may be off
+#: fraction of the residuals, or of those without a change, up to which few coordinates may be in
+#: error
 FAITHFUL, NEGLIGIBLE = 1e-2, 1e-6
-#: how much more than to first order a candidate may explain of what noise could have left
+#: ratio of the effect of a candidate to its first-order effect, where noise may explain the
+#: residual
 REACH = 4.0
 
 Subset = tuple[int, ...]
@@ -45,22 +47,22 @@ def bic(error: float, rows: int, count: int, noisy: bool) -> float:
 
 
 class SubsetFit(NamedTuple):
-    """The fit of a subset: its values (those of the nuisance last) and what it leaves."""
+    """The fit of a subset: its values (those of nuisance parameters last) and its residual."""
 
     p: FloatArray
     #: sum of squares of the residuals
     error: float
-    #: the same in units of the noise and its correlation, None where that is not known
+    #: the same in units of the noise and its correlation, None if not known
     chi2: float | None
     #: the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``
     score: float
 
 
 class Subsets:
-    """Fits of subsets of the candidates, the nuisance beside them, each done once.
+    """Fits of subsets of the candidates together with the nuisance parameters, each done once.
 
-    Of modes alone and changes of low rank in few `coordinates`, where these suffice, until
-    `polish`.
+    Fits of modes with changes of low rank use few `coordinates`, where these are accurate enough,
+    until `polish`.
     """
 
     def __init__(self, whole: Objective, residuals: Any, count: int) -> None:
@@ -68,7 +70,7 @@ class Subsets:
         self.beside = list(range(count, len(whole.parameters)))
         self.start = whole.default_start
         self.done: dict[Subset, SubsetFit | None] = {}
-        #: what each candidate would be alone, to first order
+        #: value of each candidate alone, to first order
         self.linear: FloatArray | None = None
         #: the points each fit went through, and the model where it ended
         self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
@@ -103,11 +105,11 @@ class Subsets:
         return self.done[subset]
 
     def polish(self, subset: Subset) -> None:
-        """Fit a subset to all digits, from where its fit ended."""
+        """Fit a subset to full accuracy, from the end of its previous fit."""
         if self.fit(subset) is None or not (subset or self.beside):
             return
         objective = self._objective([*subset, *self.beside])
-        # fits in few coordinates may pass through values that no machine has
+        # fits in few coordinates may pass through impossible values
         way = self.ways[subset][:-1]
         objective.path = [p for p in way if is_physical(objective.family, p)]
         end = self.ways[subset][-1]
@@ -131,10 +133,10 @@ class Subsets:
     def _left(
         self, objective: Objective, values: FloatArray, point: Point, subset: Subset
     ) -> SubsetFit:
-        """Return what the model at a point leaves; `values`: of the parameters that were fitted."""
+        """Return the residual of the model at a point; `values`: those of fitted parameters."""
         r, k = objective.values(point), len(subset)
         error = float(r @ r)
-        # residuals without a scale weigh as much as the others: their squares count alike
+        # residuals without a scale have the same weight as the others
         free = np.full(point.p.size, bool(values.size))
         chi2 = noise_misfit(objective, point, free) if objective.noise_known else None
         misfit = error if chi2 is None else chi2
@@ -142,15 +144,15 @@ class Subsets:
         return SubsetFit(values, error, chi2, score + 2 * log(comb(self.count, k)))
 
     def chi2(self, subset: Subset) -> tuple[float | None, int]:
-        """Return what a subset leaves (None where the noise is not known) and its freedom."""
+        """Return the chi-square of a subset (None if the noise is not known) and its freedom."""
         found = self.fit(subset)
         lost = sum(bound.lost for bound in self.whole.bounds)
         dof = self.rows - lost - len(subset) - len(self.beside)
         return (None if found is None else found.chi2), dof
 
     def runner_up(self, best: Subset) -> tuple[Subset, float]:
-        """Return the fitted set of least criterion that names another place, and its criterion."""
-        # a set with more candidates beside those of the best names no other place
+        """Return the best fitted set that names another place, and its criterion."""
+        # a set that only adds candidates to the best set names no other place
         other = [
             (found.score, one)
             for one, found in self.done.items()
@@ -170,7 +172,7 @@ class Subsets:
             ranked[0] = self._exchanged(ranked[0])
             better = self.score(ranked[0]) < self.score(best)
             best = ranked[0] if better else best
-            # more are worth a try while something is gained, or missing
+            # larger sets are tried while they improve the fit, or the residual exceeds noise
             enough = self._is_enough(best)
             if not better and enough:
                 break
@@ -181,12 +183,12 @@ class Subsets:
         return best
 
     def _is_enough(self, subset: Subset) -> bool:
-        """Return whether noise could have left what a subset leaves, where it is known."""
+        """Return whether noise could explain the residual of a subset, if the noise is known."""
         return self.whole.noise_known and not is_bad(chance(*self.chi2(subset)))
 
     def explained(self, subset: Subset) -> FloatArray:
-        """Return what each candidate explains to first order of what a subset leaves."""
-        # what the subset and the nuisance explain is taken out of its slopes:
+        """Return the first-order effect of each candidate on the residual of a subset."""
+        # the projection on the subset and the nuisance parameters is removed from the slopes:
         # `(J_c^T r)^2 / (J_c^T J_c)` with r and J_c free of them
         if self.fit(subset) is None:
             return np.zeros(self.count)
@@ -199,7 +201,7 @@ class Subsets:
                 if not subset:
                     self.linear = _alone(J[:, : self.count], J[:, fixed], r)
                 return _explained(J[:, : self.count], J[:, fixed], r)
-            # slopes of repeated modes depend on the candidate: each by itself
+            # slopes of repeated modes depend on the candidate, so that each is treated separately
             return np.array([self._alone(b, subset, r) for b in range(self.count)])
         except ModelError:
             return np.zeros(self.count)
@@ -220,14 +222,14 @@ class Subsets:
         return objective.place(Point(objective.family, p, end.eigen, end.labels))
 
     def _joining(self, subset: Subset) -> list[int]:
-        """Return the candidates that explain most beside a subset, as far as that could pay."""
+        """Return the candidates that explain most in addition to a subset, if this may pay off."""
         explained = self.explained(subset)
         explained[list(subset)] = -1.0
         order = np.argsort(-explained, kind="stable")[:JOIN]
         return [int(i) for i in order if explained[i] > self._least(subset) / REACH]
 
     def _least(self, subset: Subset) -> float:
-        """Return what a candidate beside a subset must explain to lower the BIC, 0 if unknown."""
+        """Return the effect that lowers the BIC of a subset with a candidate, 0 if unknown."""
         c, k = self.count, len(subset)
         price = log(self.rows) + 2 * log(comb(c, min(k + 1, c)) / comb(c, k))
         if not self.whole.noise_known:
@@ -263,7 +265,7 @@ class Subsets:
         a, overlap = J.T @ r, J.T @ J
         room = 1 - overlap**2
         both = a[:, None] ** 2 + a[None] ** 2 - 2 * overlap * np.outer(a, a)
-        # parallel columns are one parameter: the second explains nothing more
+        # parallel columns count as one parameter: the second adds nothing
         gain = np.where(room > 1e-6, both / np.maximum(room, 1e-6), 0.0)
         i, j = np.triu_indices(self.count, 1)
         order = np.argsort(-gain[i, j], kind="stable")[: 2 * JOIN]
@@ -307,7 +309,8 @@ class Subsets:
             off = float(np.sum((r - few.values(made)) ** 2))
             close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
             left = self._left(exact, found.p, point, subset)
-            # what is not physical leaves less than what is: of interest if it is the best
+            # an impossible model fits better than a possible one: of interest only if it is the
+            # best
             if close and (left.score > self.least or is_physical(exact.family, found.p)):
                 self.ways[subset], self.ends[subset] = way, point
                 return left
@@ -354,7 +357,8 @@ class Subsets:
         """Return values near the fit of a subset: of the best part of it, or to first order."""
         if subset in self.guesses:
             return self.guesses[subset]
-        # from zero a trust region grows by a factor of two a step to where one of these begins
+        # from zero a trust region would grow by a factor of two per step to the start of one of
+        # these
         parts = [tuple(k for k in subset if k != out) for out in subset]
         parts = [part for part in parts if part and self.done.get(part) is not None]
         if parts:
@@ -373,13 +377,13 @@ class Subsets:
 
 
 def _beside(J: FloatArray, beside: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return J and r without what the columns `beside` explain of them."""
+    """Return J and r without their projection on the columns `beside`."""
     Q = np.linalg.qr(beside)[0]
     return J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
 
 
 def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
-    """Return what each parameter alone would be to first order, beside others."""
+    """Return the first-order value of each single parameter in addition to others."""
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
     return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
@@ -389,21 +393,22 @@ def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     whole = np.sum(J**2, axis=0)
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
-    # a candidate that is all nuisance explains nothing of its own
+    # a candidate that depends on nuisance parameters explains nothing
     own = length > ROUNDING * whole
     return np.asarray((J.T @ r) ** 2 / np.where(own, length, np.inf))
 
 
-#: modes up to this part above the highest frequency that is compared are coordinates themselves
+#: relative distance above the highest compared frequency up to which modes are coordinates
 BEYOND = 1.5
-#: frequencies at which the others follow a load, and part of all coordinates that pay
+#: number of frequencies at which the other modes follow a load, and fraction of coordinates that
+#: saves time
 SHIFTS, WORTHWHILE = 3, 0.7
-#: part of the softest mode's stiffness by which rounding may leave K negative
+#: fraction of the stiffness of the softest mode by which rounding may make K negative
 NEARLY = 1e-3
 
 
 def load_vectors(family: Family, parameter: int) -> FloatArray | None:
-    """Return the forces (k, r) by which a parameter couples the modes; None if it does by many."""
+    """Return the forces (k, r) by which a parameter couples the modes; None if they are many."""
     # `dM = sum_i s_i b_i b_i^T`, and so dD and dK. A diagonal matrix couples none
     found: list[FloatArray] = []
     for stack in family.terms:
@@ -418,10 +423,10 @@ def load_vectors(family: Family, parameter: int) -> FloatArray | None:
 
 
 def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | None:
-    """Return B (k, k') of few coordinates for modes up to `top` [rad/s], None if not worth it."""
-    # the modes up to 1.5 `top`; and of those beyond, what a load b moves of them at three
-    # frequencies, `b_i/(\omega_i^2 - \sigma)`: eigenvalues have the error of this rational
-    # interpolation squared. Columns are orthonormal, and diagonal in K
+    """Return B (k, k') of few coordinates for modes up to `top` [rad/s], None if many."""
+    # the modes up to 1.5 `top`; and the response of the others to a load b at three frequencies,
+    # `b_i/(\omega_i^2 - \sigma)`: eigenvalues have the error of this rational interpolation
+    # squared. Columns are orthonormal, and diagonal in K
     squares = np.diag(family.K)
     low = squares <= (BEYOND * top) ** 2
     high = np.flatnonzero(~low)
@@ -436,7 +441,7 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     shifts = top**2 * (1 - np.cos(angle)) / 2
     moved = np.hstack([forces / (squares[high] - shift)[:, None] for shift in shifts])
     size = np.linalg.norm(moved, axis=0)
-    # the shifts give vectors that are nearly alike: what differs less is rounding
+    # the shifts give vectors that are nearly equal: smaller differences are rounding
     Z = la.orth(moved / divisor(size), rcond=1e-10)
     turn = la.eigh((Z.T * squares[high]) @ Z)[1]
     B = np.zeros((squares.size, kept + Z.shape[1]))
@@ -446,8 +451,8 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
 
 
 def is_physical(family: Family, p: FloatArray) -> bool:
-    """Return whether M is positive definite and K indefinite nowhere, in all coordinates."""
-    # a negative mass that few coordinates allow may be more than there is at its place
+    """Return whether M is positive definite and K positive semi-definite, in all coordinates."""
+    # a negative mass that few coordinates allow may exceed the mass at its place
     M, _, K = family.matrices(p)
     elastic = np.sort(np.diag(family.K))[family.n_rigid]
     try:
@@ -459,16 +464,15 @@ def is_physical(family: Family, p: FloatArray) -> bool:
 
 
 def lifted_point(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
-    """Return a point of few coordinates in all those of `family`, corrected to second order."""
-    # what the coordinates miss, `\rho = P(\lambda) B x`, moves the shape by
-    # `-P_0(\lambda)^{-1} \rho` and the eigenvalue by
-    # `\rho^T P_0^{-1} \rho/(x^T (2 \lambda M + D) x)`, P_0 the pencil's diagonal
+    """Return a point of few coordinates in all coordinates of `family`, to second order."""
+    # the missing part, `\rho = P(\lambda) B x`, moves the shape by `-P_0(\lambda)^{-1} \rho` and
+    # the eigenvalue by `\rho^T P_0^{-1} \rho/(x^T (2 \lambda M + D) x)`, P_0 the pencil's diagonal
     M, D, K = family.matrices(point.p)
     X, poles = B @ point.eigen.X, point.eigen.poles.copy()
     followed = np.array(point.columns(numbers))
     own, lam = X[:, followed], poles[followed]
     left = (M @ own) * lam**2 + (D @ own) * lam + K @ own
-    # coordinates that are kept miss nothing but rounding
+    # kept coordinates have only rounding errors
     beyond = np.flatnonzero(~np.any(B == 1.0, axis=1))
     inside = B[beyond]
     left = left[beyond] - inside @ (inside.T @ left[beyond])

@@ -1,4 +1,4 @@
-"""Sets of candidates that explain a measurement as well as the best: mirror images, combined."""
+"""Sets of candidates that explain a measurement as well as the best, such as mirror images."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ...tolerances import divisor
 from ..search import Objective
 from .subsets import Subset, Subsets, bic
 
-#: part of the effect of a change by which an equal change elsewhere may differ in it and still be
-#: its twin: mirror images in a reduced model differ by up to some per cent
+#: relative difference of effect up to which an equal change elsewhere is a twin: mirror images in a
+#: reduced model differ by up to a few per cent
 TWIN = 0.05
 #: difference of the criterion within which two sets explain the data equally well
 ALIKE = 2.0
-#: difference of the criterion, as predicted to first order, from which on a set is not fitted
+#: predicted difference of the criterion above which a set is not fitted
 HOPELESS = 20.0
 
 
 def alike_sets(fits: Subsets, best: Subset) -> list[Subset]:
     """Return the sets of the size of `best` that explain the data as well, the best first.
 
-    Members are exchanged for candidates that have the same effect alone, in all combinations:
-    which of these fit depends on how the changes act together.
+    Members are exchanged for candidates with the same separate effect, in all combinations: the
+    joint effect of the changes decides which of these fit.
     """
     fit = fits.fit(best)
     if fit is None or not best:

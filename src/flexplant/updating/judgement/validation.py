@@ -1,4 +1,4 @@
-"""How alike model and measurement are: MAC, FRAC, FDAC, and data that were not fitted."""
+"""Agreement of model and measurement: MAC, FRAC, FDAC, and data that were not fitted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..update_result import UpdateResult
 from ..updates import update
 from .goodness import chance, is_bad
 
-#: groups of modes in a repr
+#: number of groups of modes in a repr
 SHOWN = 4
 
 
@@ -103,7 +103,7 @@ def fdac(H: Any, G: Any) -> FloatArray:
     """Return the frequency domain assurance criterion of all pairs of lines, from -1 to 1.
 
     ``Re(h_f^H g_g) / (|h_f| |g_g|)`` with h_f all channels of H at line f: a frequency shift shows
-    as a ridge beside the diagonal.
+    as a ridge next to the diagonal.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ class Correlation(Value):
     zeta_error : (m,) array [-]
         Error of its damping ratios.
     mac : (m, m) array
-        Of measured shapes (rows) with the model's; empty without shapes.
+        MAC of measured shapes (rows) with those of the model; empty without shapes.
     frac : (n_out, n_in) array
         Of the responses; empty without.
     fdac : (n_freq, n_freq) array
@@ -261,29 +261,29 @@ def _nonzero_shapes(value: Any, name: str) -> ComplexArray:
     return array
 
 
-#: part of the rms of unused data that a helpful update leaves where the noise is not known
+#: largest remaining fraction of the rms of unused data after a helpful update, if the noise is not
+#: known
 HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Value):
-    """An update judged by data that were not fitted.
+    """An update, judged by data that were not fitted.
 
     Parameters
     ----------
     fit : UpdateResult
-        Of the fitted data.
+        Update with the fitted data.
     fitted, unused : (2,) array
-        Rms of the whitened residuals before and after the update, of the data that were fitted and
-        of those that were not. Where the noise is known, 1 is what noise and the uncertainty of
-        the parameters would leave: after the update residuals of unused data are whitened by
-        ``I + J C J^T``, of fitted data counted per degree of freedom.
+        RMS of the whitened residuals before and after the update, for fitted and for unused data.
+        Where the noise is known, 1 is the expected value from noise and parameter uncertainty:
+        after the update residuals of unused data are whitened by ``I + J C J^T``, of fitted data
+        counted per degree of freedom.
     p_value : float or None
-        The probability that these alone leave more of the unused data than the updated model
-        does; None where the noise is not known. Below 1e-4 a change is missing, or in the wrong
-        place.
+        Probability of a larger residual of unused data by these alone; None where the noise is not
+        known. Below 1e-4 a change is missing or in the wrong place.
     before, after : Correlation
-        Of the unused data with the model before and after.
+        Correlation of the unused data with the model before and after the update.
     """
 
     fit: UpdateResult
@@ -297,9 +297,9 @@ class Validation(Value):
     def helped(self) -> bool:
         """Whether the updated model predicts data that were not fitted.
 
-        Nearer than before, and where the noise is known up to that and the uncertainty of the
-        parameters (`p_value` of 1e-4 at least); where it is not, to a half of what was left. A
-        mass in the wrong place comes nearer too, and predicts nothing.
+        The prediction must be better than before and, with known noise, agree within noise and
+        parameter uncertainty (`p_value` of at least 1e-4); with unknown noise the residual must
+        fall to half. A mass in the wrong place reduces the residual too, but does not predict.
         """
         if self.p_value is None:
             return bool(self.unused[1] < HALF * self.unused[0])
@@ -331,7 +331,7 @@ def validate(
     ----------
     model, parameters, method, start, starts, rng, prior : as for `update`
     residuals, unused : sequences of Residual
-        To fit, and to judge by. `Eigenvalues.select`, `ModeShapes.select` and
+        Fitted data, and data for the judgement. `Eigenvalues.select`, `ModeShapes.select` and
         `FrfResidual.select` take parts, as does `split`.
 
     Returns
@@ -377,16 +377,16 @@ def validate(
 
 
 def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]:
-    """Return two residuals of a measurement: a random share of its modes or lines to fit, the rest.
+    """Return two residuals of a measurement: a random part of its modes or lines, and the rest.
 
     Parameters
     ----------
     residual : Eigenvalues, ModeShapes or FrfResidual
-        To take apart.
+        Residual to split.
     share : float
-        To fit, between 0 and 1.
+        Fraction to fit, between 0 and 1.
     rng : int, SeedSequence or Generator
-        For the choice.
+        Random generator of the choice, or its seed.
 
     Raises
     ------
@@ -409,7 +409,7 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
             f"split takes modes or lines apart, got {type(residual).__name__}. Pass Eigenvalues, "
             "ModeShapes or an FrfResidual."
         )
-    share = between(share, "share", 0.0, 1.0, "Choose 0.7, say.")
+    share = between(share, "share", 0.0, 1.0, "Choose for example 0.7.")
     items = np.asarray(parts)
     count = round(share * items.size)
     if not 0 < count < items.size:
@@ -429,7 +429,7 @@ def _misfit(
     *,
     spread: bool,
 ) -> tuple[FloatArray, float | None]:
-    """Return the rms before and after, and the chance that noise leaves more than after."""
+    """Return the rms before and after, and the probability of a larger residual by noise."""
     # with `spread`, that of the parameters counts as noise: r^T (N + J C J^T)^-1 r / m
     objective = Objective(model, parameters, residuals, prior=False)
     before = objective.values(objective.begin(start))
@@ -461,9 +461,8 @@ def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:
             if _same_data(one, other) and (common or not parts):
                 which = f"parts {', '.join(map(str, common[:6]))}" if common else "all"
                 raise ModelError(
-                    f"{other!r} is not unused: {which} of it were fitted, and fitting "
-                    "them says nothing of others. Take a measurement apart with split(residual), "
-                    "or keep another one back."
+                    f"{other!r} is not unused: {which} of it were fitted and do not test the "
+                    "prediction. Divide a measurement with split(residual), or use another one."
                 )
 
 

@@ -1,1 +1,1 @@
-"""What an update compares: poles, shapes, responses, antiresonances, static compliance."""
+"""Residuals of an update: poles, shapes, responses, antiresonances, static compliance."""

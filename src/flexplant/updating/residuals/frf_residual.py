@@ -20,9 +20,9 @@ from ..family import Family, Point
 from .point_residuals import Held
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 
-#: lines whose response is below so many standard deviations of the noise are left out
+#: number of standard deviations of the noise below which a line is left out
 SIGNAL = 3.0
-#: degrees of freedom of a variance below which chi-square is not to be trusted
+#: degrees of freedom of a variance below which chi-square is not reliable
 LEAST = 1.5
 
 
@@ -33,7 +33,7 @@ class FrfResidual(Residual):
     ``r = (H_exp - H(p)) / sigma`` as [Re; Im], or ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)``,
     with ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B`` and ``sigma^2 = variance / 2``; of a
     sampled machine, ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``, its exact equivalent
-    behind a zero-order hold.
+    after a zero-order hold.
 
     Parameters
     ----------
@@ -41,30 +41,32 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
         (also when None), velocity or acceleration.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        ``E|noise|^2`` of each entry; that of the Frf when not given, times ``nu / (nu - 1)`` where
-        it was estimated with `freedom` nu; the correlation of lines follows from the Frf's window.
-        Where neither is known, each entry is divided by the rms of its channel pair.
+        ``E|noise|^2`` of each entry; by default that of the Frf, times ``nu / (nu - 1)`` where it
+        was estimated with `freedom` nu; the correlation of lines follows from the window of the
+        Frf. Where neither is known, each entry is divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
-        Frequency lines to use. None: those where the median over the channels of
-        ``|H|^2 / variance`` is above 9 (all without a variance), and none at 0 Hz.
+        Frequency lines to use. None: lines where the median over the channels of
+        ``|H|^2 / variance`` is above 9 (all lines without a variance), except 0 Hz.
     places : mapping {channel: place}, optional
-        Where channels are; a channel that is not named here is a DOF label itself.
+        Places of channels; other channels are DOF labels themselves.
     direction : str
-        Of the motion and force at points.
+        Direction of motion and force at points.
     magnitude : bool
-        Compare ln |H| instead of H: forgiving of phase errors, convergent from farther away.
+        Whether to compare ln |H| instead of H, which tolerates phase errors and converges from
+        farther away.
     hold : float, optional [Hz]
         Rate of the zero-order hold between the inputs and the machine, where the response is that
         of the sampled machine (modes above half the rate then fold into the band).
     delay : float [samples]
-        From the command to the held force, of any fraction, where the measurement contains it.
+        Delay from the command to the held force, including fractions, if the measurement contains
+        it.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When no line is left, the variance is not positive, channels are unknown, lines lie above
-        half the rate of the hold, a delay comes without one, or accelerations with one (they jump
-        at the very instant they are sampled).
+        When no line remains, the variance is not positive, channels are unknown, lines lie above
+        half the rate of the hold, a delay is given without a hold, or accelerations with a hold
+        (they jump at the sampling instants).
 
     Examples
     --------
@@ -127,7 +129,7 @@ class FrfResidual(Residual):
     def select(self, lines: Sequence[int]) -> FrfResidual:
         """Return the residual on some of the lines (numbers in the measured Frf)."""
         if lines is None:
-            raise ModelError("select takes numbers of lines, got None. Pass [0, 4], say.")
+            raise ModelError("select needs numbers of lines, got None. Pass for example [0, 4].")
         return self.replace(lines=lines)
 
     def bound(self, family: Family) -> Bound:
@@ -177,7 +179,7 @@ class _BoundFrf(Bound):
         self._last: tuple[Point, ComplexArray, Any] | None = None
 
     def kinds(self) -> list[Kind]:
-        """Return none: what a model is off by at a line it is off by at the next one too."""
+        """Return no discrepancy, since model errors are correlated over lines."""
         return []
 
     def row_name(self, row: int) -> str:
@@ -240,8 +242,8 @@ def _fair(frf: Frf) -> FloatArray | None:
     if frf.freedom <= LEAST:
         warn(
             f"the variance of this Frf has {frf.freedom:.3g} degrees of freedom: |error|^2 / "
-            "variance has hardly a mean, and chi-square says little. Average more runs or periods, "
-            "or give variance= that is known otherwise."
+            "variance hardly has a mean, and chi-square is not reliable. Average more runs or "
+            "periods, or give variance= from another source."
         )
     nu = max(frf.freedom, LEAST)
     return np.asarray(frf.variance * (nu / (nu - 1)))
@@ -265,8 +267,8 @@ def _checked_hold(hold: Any, delay: Any, frf: Frf, lines: Any) -> tuple[float | 
         )
     if frf.freq[lines].max() >= rate / 2:
         raise ModelError(
-            f"lines up to {frf.freq[lines].max():g} Hz and a hold at {rate:g} Hz do not go "
-            f"together: nothing is known above {rate / 2:g} Hz. Choose lines= below it."
+            f"lines up to {frf.freq[lines].max():g} Hz and a hold at {rate:g} Hz do not match: "
+            f"the response is only known up to {rate / 2:g} Hz. Choose lines= below it."
         )
     return rate, late
 
@@ -297,6 +299,6 @@ def _checked_lines(lines: Any, frf: Frf, variance: FloatArray | None) -> Any:
         chosen = np.unique(chosen)
     if not chosen.size:
         raise ModelError(
-            "no frequency line is left: all are in the noise, or none was chosen. Give lines=."
+            "no frequency line remains: all are below the noise, or none was chosen. Give lines=."
         )
     return chosen.astype(np.int64)

@@ -29,18 +29,18 @@ from ..family import CLUSTER, Family, Point
 from ..parameters import named_place
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 
-#: relative deviations of frequency and of damping of a good model of a structure: two of them are
-#: the 0.5 % and 30 % that an updated model is seldom better than where nothing was measured
+#: relative standard deviations of frequency and damping of a good model: twice these, 0.5 % and 30
+#: %, are typical errors of an updated model where nothing was measured
 USUAL = (2.5e-3, 0.15)
-#: least 1 - zeta^2 of a pole that swings
+#: least 1 - zeta^2 of an oscillating pole
 ZETA = 1e-6
 
 
 def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
-    """Return by how much more than the usual the frequencies (m,) of a model are off."""
-    # what it leaves out (shear, rotary inertia, what lies between nodes) costs a share that grows
-    # with omega, of plates and beams; what is wrong everywhere (material, thickness) a constant
-    # one. Both are alike at the middle of the measured frequencies
+    """Return the ratio of the errors of frequencies (m,) of a model to the usual error."""
+    # neglected effects (shear, rotary inertia, motion between nodes) cause a relative error that
+    # grows with omega, for plates and beams; errors of material or thickness cause a constant one.
+    # Both are equal at the middle of the measured frequencies
     return np.asarray(0.5 * (1.0 + omega / np.mean(measured)))
 
 
@@ -54,8 +54,8 @@ class _ModalResidual(Residual):
         instance(self.measured, MeasuredModes, "measured", hint)
         if self.measured.modes is None:
             raise LabelError(
-                f"{type(self).__name__} needs mode numbers, which {self.measured!r} has not: "
-                "which mode of the model each pole belongs to is not known. Give modes=[...], "
+                f"{type(self).__name__} needs mode numbers, but {self.measured!r} has none, so "
+                "that the mode of each pole is not known. Give modes=[...], "
                 "counted from 1 with the rigid-body modes."
             )
         return self.measured.modes
@@ -65,7 +65,7 @@ class _ModalResidual(Residual):
         known = self.measured.modes or ()
         if not isinstance(modes, Iterable) or isinstance(modes, str):
             raise LabelError(
-                f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say."
+                f"modes must be a list of numbers, got {short(modes)}. Pass for example [6, 7]."
             )
         wanted = [whole(n, "a mode") for n in modes]
         missing = [n for n in wanted if n not in known]
@@ -89,11 +89,12 @@ class Eigenvalues(_ModalResidual):
     measured : MeasuredModes
         Poles with their mode numbers.
     weights : (m,) array [(s/rad)^2], optional
-        Diagonal of W. When not given: one over the variance of each pole where `measured` has a
-        covariance, else ones.
+        Diagonal of W. Default: one over the variance of each pole if `measured` has a covariance,
+        else ones.
     clusters : float
-        Modes whose measured poles are closer than this, relatively (0.02, say), are compared by
-        their mean, which does not care how they turn into each other. Zero: each by itself.
+        Relative distance (such as 0.02) below which modes are compared by the mean of their
+        measured poles, which does not depend on how they mix. Zero: each mode is compared
+        separately.
 
     Raises
     ------
@@ -179,8 +180,8 @@ class BoundEigenvalues(Bound):
 
     def kinds(self) -> list[Kind]:
         """Return relative errors of frequency (at constant zeta) and of damping."""
-        # of each mode, and one as large of all modes together (the material's, say), which no mode
-        # shows by itself
+        # of each mode, and an equal one common to all modes (such as that of the material), which
+        # no single mode shows
         grown = growth(np.abs(self.target), np.abs(self.target))
         pole = self.target
         zeta = -pole.real / np.abs(pole)
@@ -212,7 +213,7 @@ class BoundEigenvalues(Bound):
         """Return their derivatives."""
         S = point.sensitivity(self.numbers)
         for group in self.clusters:
-            # the trace does not depend on the vectors chosen in the subspace
+            # the trace does not depend on the basis of the subspace
             _, change = point.subspace([self.numbers[i] for i in group])
             S[group] = np.trace(change, axis1=1, axis2=2) / len(group)
         return -self.whitened(S)
@@ -222,30 +223,30 @@ class BoundEigenvalues(Bound):
 class ModeShapes(_ModalResidual):
     """Residuals of measured mode shapes psi at some places, scale and phase removed.
 
-    ``r = (I - P) psi``, P the projector on the model's shape there: what no complex factor of the
-    model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
-    ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared
-    with the subspace of their cluster, which does not turn. While fitting, the model's modes are
-    assigned to the measured ones by MAC and frequency: the nearest of those that look alike at
-    few places.
+    ``r = (I - P) psi``, P the projector on the model's shape there: the part that no complex factor
+    of the model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
+    ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared with
+    the subspace of their cluster, which does not change when they mix. While fitting, the model's
+    modes are assigned to the measured ones by MAC and frequency: the closest among those with
+    similar shapes at few places.
 
     Parameters
     ----------
     measured : MeasuredModes
         Poles with their mode numbers.
     shapes : (m, modes) real or complex array, optional
-        In the order of the poles; any scale. None: those of `measured`.
+        Shapes in the order of the poles, with any scale. None: those of `measured`.
     at : sequence of m places, optional
         DOF labels, points or mappings. None: the labels of `measured`'s rows; a mapping
         {row's label: place} where these are names of channels.
     direction : str
-        Of the motion at points.
+        Direction of the motion at points.
     std : float or (m, modes) array, optional
-        Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in their own
-        scale. None: all equal, not known.
+        Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in the scale of
+        each shape. None: equal and unknown.
     covariance : (modes, m, m) array, optional
         ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; its scale is not used, and
-        may be singular. That of `measured` (`shape_covariance`), where its shapes are taken.
+        it may be singular. Default: that of `measured` (`shape_covariance`), with its shapes.
     assign : bool
         Whether modes are assigned by MAC with the measured shapes; False: by continuation.
 
@@ -276,7 +277,7 @@ class ModeShapes(_ModalResidual):
         shape = (len(at), len(self.measured))
         shapes: Any = real_or_complex(given, "shapes", shape)
         if len(at) < 2:
-            raise ShapeError("shapes need two places at least: the scale of one is not known.")
+            raise ShapeError("shapes need at least two places, since their scale is not known.")
         empty = np.flatnonzero(np.all(shapes == 0, axis=0))
         if empty.size:
             raise ModelError(f"the shape of mode {numbers[empty[0]]} is zero.")
@@ -288,7 +289,7 @@ class ModeShapes(_ModalResidual):
             covariance = getattr(self.measured, "shape_covariance", None)
         if covariance is not None:
             if std is not None:
-                raise ModelError("std and covariance say the same thing: give one of them.")
+                raise ModelError("std and covariance are alternatives: give one of them.")
             covariance = _hermitian_stack(covariance, (shape[1], shape[0]))
         self._set(shapes=shapes, at=tuple(at), std=std, covariance=covariance)
         self._set(assign=flag(self.assign, "assign"))
@@ -315,7 +316,7 @@ class ModeShapes(_ModalResidual):
 
 
 class _Batch(NamedTuple):
-    """Measured shapes that are compared at once, each with the span of as many modes."""
+    """Measured shapes that are compared together, each with a span of equally many modes."""
 
     sets: list[list[int]]  # their numbers
     white: Any  # (b, m, m)
@@ -378,7 +379,7 @@ class BoundShapes(Bound):
         return changed
 
     def _parts(self, point: Point, batch: _Batch) -> tuple[Any, Any, Any]:
-        """Return the model's shapes (b, m, s), their basis Q, and what it leaves of psi."""
+        """Return the model's shapes (b, m, s), their basis Q, and the remainder of psi."""
         X = point.eigen.X[:, [point.columns(numbers) for numbers in batch.sets]]
         Phi = batch.white @ np.moveaxis(np.tensordot(self.rows, X, axes=1), 0, 1)
         if not np.any(Phi.imag):
@@ -396,7 +397,7 @@ class BoundShapes(Bound):
         return dPhi, (dPhi @ (plus @ batch.psi)[:, None])[..., 0], plus
 
     def values(self, point: Point) -> FloatArray:
-        """Return what of the measured shapes the model's do not explain."""
+        """Return the part of the measured shapes that the model does not explain."""
         left = [one[:, 0] for batch in self.batches for one in self._parts(point, batch)[2]]
         return np.concatenate([self._stacked(one) for one in left])
 
@@ -462,7 +463,7 @@ def _whitening(psi: Any, residual: ModeShapes) -> list[Any]:
         if residual.covariance is not None:
             known = residual.covariance[i]
             size = float(np.trace(known).real) / shape.size
-            # noise along the shape is scale, which is free: any amount of it changes nothing
+            # noise along the shape is an error of scale, which is free and has no effect
             along = np.outer(shape, shape.conj()) / float(np.vdot(shape, shape).real)
             known = known + size * (along + 1e-10 * np.eye(shape.size))  # singular without
             try:
@@ -484,8 +485,8 @@ def _whitening(psi: Any, residual: ModeShapes) -> list[Any]:
 class ShapeCorrelation(ModeShapes):
     """Residuals ``(1 - sqrt(MAC)) / sqrt(MAC)`` of measured mode shapes, one for each mode.
 
-    Without a derivative near a perfect fit: `ModeShapes` says more with the same data. For
-    comparison with published studies.
+    They have no derivative near a perfect fit, and `ModeShapes` uses the same data better. They
+    serve for comparison with published studies.
 
     Parameters
     ----------

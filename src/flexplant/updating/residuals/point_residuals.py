@@ -26,7 +26,7 @@ from ..family import Family, Point
 from ..parameters import named_place
 from .residual import Bound, Residual, place_rows, split_parts
 
-#: generalised eigenvalues beyond this multiple of the largest frequency are infinite
+#: multiple of the largest frequency above which generalised eigenvalues count as infinite
 INFINITE = 1e3
 
 
@@ -59,11 +59,11 @@ class Antiresonances(_PointResidual):
     Parameters
     ----------
     zeros : (m,) complex array [rad/s]
-        Of one half plane each; stored with Im > 0. Any sign of the real part.
+        One zero of each conjugate pair, stored with Im > 0, with any sign of the real part.
     output, input : place
-        Between which the response was measured.
+        Places between which the response was measured.
     direction : str
-        Of the motion and the force at points.
+        Direction of motion and force at points.
     std : float or (m,) array [rad/s], optional
         ``E|noise|^2 = std^2`` of each.
     hold : float, optional [Hz]
@@ -189,15 +189,15 @@ class _BoundZeros(Bound):
 class StaticCompliance(_PointResidual):
     """Residuals of a static compliance, ``g_exp - c K^-1 b``.
 
-    Of a free structure the elastic part (inertia relief): ``u`` of ``[K, M R; R^T M, 0]`` with the
-    rigid-body motions R, which a machine shows between its suspension and its first mode.
+    For a free structure it is the elastic part (inertia relief): ``u`` of ``[K, M R; R^T M, 0]``
+    with the rigid-body motions R. A machine shows it between its suspension and its first mode.
 
     Parameters
     ----------
     value : float [m/N]
-        Measured.
+        Measured compliance.
     output, input, direction
-        Where the motion and the force are, as for `Antiresonances`.
+        Places of motion and force, as for `Antiresonances`.
     std : float [m/N], optional
         Standard deviation. None: not known; the residual is relative to `value`.
 
@@ -276,8 +276,9 @@ class _BoundStatic(Bound):
 class Held:
     """``x[k+1] = A x[k] + Gamma_1 u[k-n] + Gamma_0 u[k-n-1]`` of ``M q'' + D q' + K q = B u``.
 
-    All from one exponential of ``S = [0 s 0; -M^-1 K/s  -M^-1 D  M^-1 B; 0 0 0]``, with the states
-    (s q, q', u) of one size, and its Frechet derivatives: exact with real and repeated poles too.
+    All follow from one exponential of ``S = [0 s 0; -M^-1 K/s -M^-1 D M^-1 B; 0 0 0]``, with the
+    states (s q, q', u) of one size, and its Frechet derivatives: exact with real and repeated poles
+    too.
     """
 
     def __init__(
@@ -350,7 +351,7 @@ class Held:
         unit = np.diag(np.append(np.ones(n), 0.0))
         solve: Any = la.eig
         (alpha, beta), left, right = solve(system, unit, left=True, homogeneous_eigvals=True)
-        # what is infinite has beta of rounding
+        # infinite values have beta of rounding size
         kept = np.flatnonzero(np.abs(beta) > 1e-10 * np.abs(alpha))
         z = alpha[kept] / beta[kept]
         s = np.log(np.where(z == 0, TINY, z)) / self.T

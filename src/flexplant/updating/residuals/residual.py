@@ -1,4 +1,4 @@
-"""What every residual has in common: it is bound to a family of models, then gives r and dr/dp."""
+"""Base classes of residuals: bound to a family of models, they give r and dr/dp."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Residual(Value):
 
     @property
     def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions whose compliance the residual sees: of responses, not of modes."""
+        """Places and directions whose compliance affects the residual (responses, not modes)."""
         return ()
 
     @property
@@ -44,12 +44,12 @@ class Residual(Value):
 
 
 class Kind(NamedTuple):
-    """Errors of the model of one kind: independent, each of which moves the rows by a column."""
+    """Independent model errors of one kind, each of which changes the rows by a column."""
 
     name: str
-    #: (m, k) what a relative error of one moves of the whitened rows
+    #: (m, k) effect of a relative error of one on the whitened rows
     F: FloatArray
-    #: the relative standard deviation that is usual of a good model
+    #: usual relative standard deviation of a good model
     usual: float
 
 
@@ -60,7 +60,7 @@ class Bound(ABC):
     the measurement is known.
     """
 
-    #: numbers of the modes that are followed for it
+    #: numbers of the modes that it follows
     numbers: tuple[int, ...] = ()
     #: whether the covariance of the measurement is known
     noisy: bool = False
@@ -68,10 +68,10 @@ class Bound(ABC):
     noise: Matrix | None = None
     #: directions of the rows in which residuals cannot lie: scale and phase of a shape
     lost: int = 0
-    #: what the whole of a measured value is in each row: a part of it is a relative change
+    #: the measured value in units of each row
     size: FloatArray | float = 1.0
     name: str = ""
-    #: what a model is off by here, and by which share of the measured value it usually is
+    #: kind of model error, and its usual size relative to the measured value
     kind: str = "value"
     usual: float = 0.01
 
@@ -91,7 +91,7 @@ class Bound(ABC):
     def kinds(self) -> list[Kind]:
         """Return the kinds of errors of a model that show in the rows, empty where not described.
 
-        Here of each row, relative to the whole of its measured value.
+        By default one error for each row, relative to its measured value.
         """
         return [Kind(self.kind, np.diag(np.atleast_1d(self.size)), self.usual)]
 
@@ -114,13 +114,13 @@ def place_rows(family: Family, places: Sequence[Place], direction: str = "z") ->
 def channel_places(
     channels: Sequence[str], places: Mapping[str, Place] | None
 ) -> tuple[Place, ...]:
-    """Return the place of each channel: of `places` where named there, else its name."""
+    """Return the place of each channel: from `places`, else its name."""
     hint = "Pass {'y1': '41:z'}, channel and place."
     known = {} if places is None else mapping(places, "places", hint, error=LabelError)
     unknown = sorted(set(known) - set(channels))
     if unknown:
         raise LabelError(
-            f"places names {unknown}, which are no channels. Known are {', '.join(channels[:6])}."
+            f"places names {unknown}, which are not channels. Known are {', '.join(channels[:6])}."
         )
     return tuple(known.get(channel, channel) for channel in channels)
 

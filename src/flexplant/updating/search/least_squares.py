@@ -1,4 +1,4 @@
-"""Least squares: Gauss-Newton, the paper's (13) and (14), and a trust region, alone or in turn."""
+"""Least squares: Gauss-Newton, the paper's (13) and (14), a trust region, or both in turn."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")
 
-#: why a search ends where the matrices become indefinite or a mode is lost, however short the step
+#: reason of a search that ends where every step makes the matrices indefinite or loses a mode
 EDGE = (
-    "no step in the direction of descent is possible: with it the matrices are indefinite or a "
-    "mode is lost (bounds= keep a parameter to what is possible)"
+    "no step in the direction of descent is possible: it makes the matrices indefinite or loses "
+    "a mode (bounds= limit a parameter to physical values)"
 )
 
-#: why a search ends at a jump of the cost, and the part of the cost by which it should fall there
+#: reason of a search that ends at a jump of the cost, and the predicted relative decrease there
 STUCK = (
-    "no step lowers the error as its slopes predict: other modes are paired on the other side, "
-    "say (begin elsewhere, start=)"
+    "no step lowers the error as its slopes predict, probably since other modes are paired "
+    "nearby (use another start=)"
 )
 PREDICTED = 1e-2
 
 
-#: why a search ends that was given a limit
+#: reason of a search with a limit
 STOPPED = "max_iterations reached"
 
 
@@ -53,7 +53,8 @@ class TrustRegion(UpdateMethod):
     Parameters
     ----------
     loss : {"linear", "huber", "soft_l1", "cauchy"}
-        Robust losses take outliers down: rho(r^2) of each whitened residual.
+        Loss function rho(r^2) of each whitened residual; robust losses reduce the effect of
+        outliers.
     scale : float
         Residuals above this many (standard deviations) count as outliers.
 
@@ -88,11 +89,9 @@ class TrustRegion(UpdateMethod):
         tolerance: float = 1e-10,
     ) -> SearchEnd:
         """Return where the search from `start` ends; see `UpdateMethod.search`."""
-        most = whole(
-            most or self.steps, "most"
-        )  # the steps are counted up to it: nothing else ends
+        most = whole(most or self.steps, "most")  # the step counter raises it
         bounded = objective.lower, objective.upper
-        # steps that keep away from bounds cost half as much again where none of them is active
+        # steps that avoid bounds cost 50 % more where no bound is active
         if np.any(np.isfinite(bounded)):
             free = np.full(start.size, np.inf)
             with suppress(ModelError, np.linalg.LinAlgError):
@@ -111,7 +110,7 @@ class TrustRegion(UpdateMethod):
         most: int,
         tolerance: float,
     ) -> SearchEnd:
-        """Minimise by least_squares; points that it moves to are references to pair modes with."""
+        """Minimise by least_squares; its points are references for pairing modes."""
         from scipy.optimize import least_squares
 
         trail = Trail()
@@ -136,7 +135,7 @@ class TrustRegion(UpdateMethod):
                 trail.add(objective, p, 1.0 if trail.p else 0.0)
             return objective.slopes(point)
 
-        # a start on its bound has nowhere to go
+        # a start on a bound cannot move
         room = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0)) * 1e-8
         inside = np.clip(start, low + room, high - room)
         if not np.array_equal(inside, start):
@@ -151,7 +150,8 @@ class TrustRegion(UpdateMethod):
                 bounds=(low, high),
                 method="trf",
                 x_scale=unit,
-                # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
+                # the cost is flat at its minimum: a relative change of 1e-12 means 1e-6 standard
+                # deviations
                 ftol=max(1e-2 * tolerance, 2.3e-16),
                 xtol=max(tolerance, 2.3e-16),
                 gtol=1e-15,
@@ -180,7 +180,7 @@ class TrustRegion(UpdateMethod):
 
 def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
     """Return whether slopes predict a lower cost, though every step was refused."""
-    # at a minimum they predict next to nothing; at a jump of the cost they do
+    # at a minimum they predict almost no decrease, at a jump of the cost they do
     J = answer.jac[:, answer.active_mask == 0]
     Q = la.qr(J / divisor(np.linalg.norm(J, axis=0)), mode="economic")[0]
     change = Q @ (Q.T @ answer.fun)
@@ -191,7 +191,7 @@ def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
 
 def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
     """Return rho, rho', rho'' with the named loss on the first rows and squares on the others."""
-    # a prior is no outlier, however far the data pull
+    # a prior does not count as an outlier
 
     def rho(z: FloatArray) -> FloatArray:
         out = np.vstack([z, np.ones_like(z), np.zeros_like(z)])
@@ -214,23 +214,23 @@ def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
     return rho
 
 
-#: what rounding leaves of an eigenvalue, relatively; the error may rise by as much
+#: relative rounding of an eigenvalue; the error may rise by this amount
 ROUNDING = 1e-11
 EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 
 
 @dataclass(frozen=True, eq=False)
 class GaussNewton(UpdateMethod):
-    """The paper's weighted Gauss-Newton iteration, (13) and (14), steps halved where they harm.
+    """The paper's weighted Gauss-Newton iteration, (13) and (14), with step halving.
 
-    Eigenvalues alone are weighted by W of (12). It ends where a full step would change nothing
-    that is fitted by more than the tolerance, relatively.
+    Eigenvalues alone are weighted by W of (12). It ends when a full step changes the fitted values
+    by less than the relative tolerance.
 
     Parameters
     ----------
     truncate : float
-        Singular values of the (column-scaled) sensitivities below this part of the largest are
-        left out of a step: truncated SVD. Zero: all are used, and a singular S raises.
+        Truncated SVD: singular values of the (column-scaled) sensitivities below this fraction of
+        the largest are left out of a step. Zero: all are used, and a singular S raises an error.
 
     References
     ----------
@@ -248,10 +248,10 @@ class GaussNewton(UpdateMethod):
     truncate: float = field(
         default=0.0,
         kw_only=True,
-        metadata=checked(between, low=0.0, high=1.0, hint="Choose 1e-3, say.", ends="["),
+        metadata=checked(between, low=0.0, high=1.0, hint="Choose for example 1e-3.", ends="["),
     )
 
-    #: how often a step that harms is halved
+    #: largest number of halvings of a step
     halvings: ClassVar[int] = 30
     steps = 20
     keeps_bounds = False
@@ -259,7 +259,7 @@ class GaussNewton(UpdateMethod):
 
     @property
     def penalised(self) -> bool:
-        """Whether directions are left out, in which the answer stays at the start."""
+        """Whether directions are left out, in which the result stays at the start."""
         return self.truncate > 0
 
     def search(
@@ -305,29 +305,29 @@ def _gauss_newton_step(
     objective: Objective, point: Point, r: FloatArray, truncate: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step of (13) and the change of the residuals to first order."""
-    # as the real least-squares problem that (13) comes from
+    # as the real least-squares problem behind (13)
     J = objective.slopes(point)
     length = np.linalg.norm(J, axis=0)
     names = [parameter.name for parameter in objective.parameters]
     reach = objective.family.strength(objective.omega(point)) / objective.omega(point)
-    # what holds there alone is no matter of the measurement
+    # the reason may hold only at this point
     first = np.array_equal(point.p, objective.default_start)
     there = "" if first else f"with {objective.family.text(point.p)}, "
     unseen = length <= UNSEEN * reach * float(np.max(objective.size(point)))
     if unseen.any():
         missed = [name for name, none in zip(names, unseen, strict=True) if none]
         why = (
-            "(it sits on the nodal lines of these modes, say). Measure a mode that moves there, or "
+            "(it may lie on the nodal lines of these modes). Measure a mode that moves there, or "
             "drop the parameter."
         )
         if there:
             why = (
-                "(a mass or spring so large that its place stands still, say). Begin nearer to the "
-                "answer (start=), or keep the parameters to what is possible (bounds=)."
+                "(a mass or spring may be so large that its place does not move). Begin closer "
+                "to the solution (start=), or limit the parameters to physical values (bounds=)."
             )
         raise ModelError(
-            f"{', '.join(missed)} cannot be found from {objective.text}: {there}what is fitted "
-            f"does not depend on it {why}"
+            f"{', '.join(missed)} cannot be found from {objective.text}: {there}the fitted "
+            f"values do not depend on it {why}"
         )
     U, s, Vt = np.linalg.svd(J / length, full_matrices=False)
     keep = s > max(truncate, SINGULAR) * s[0]
@@ -336,9 +336,9 @@ def _gauss_newton_step(
         together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
         raise ModelError(
             f"{', '.join(together)} cannot be distinguished by {objective.text} ({r.size} real "
-            f"equations, {counted(len(names), 'unknown')}, S is singular): {there}some combination "
-            "of them changes nothing. Measure more modes, drop one of them, give priors, begin "
-            "elsewhere (start=) or cut it off, updating.GaussNewton(truncate=1e-3). "
+            f"equations, {counted(len(names), 'unknown')}, S is singular): {there}some "
+            "combination of them has no effect. Measure more modes, drop one of them, give "
+            "priors, use another start= or truncate, updating.GaussNewton(truncate=1e-3). "
             "fx.updating.identifiability(...) "
             "shows which."
         )
@@ -354,7 +354,7 @@ def _advanced(
     size: FloatArray,
     halvings: int,
 ) -> tuple[float, FloatArray] | None:
-    """Return the part of a step taken and the residuals there, None when no part lowers (12)."""
+    """Return the fraction of a step and the residuals there, None if no fraction lowers (12)."""
     rounding = ROUNDING * float(np.linalg.norm(size))
     limit = float(np.linalg.norm(r)) * (1 + ROUNDING) + rounding
     fraction, trouble = 1.0, ""
@@ -369,21 +369,23 @@ def _advanced(
                 return fraction, found
         fraction /= 2
     if trouble:
-        raise SolverError(f"no part of a Gauss-Newton step keeps the model physical: {trouble}")
+        raise SolverError(
+            f"every fraction of a Gauss-Newton step makes the model unphysical: {trouble}"
+        )
     return None
 
 
 class Quick(GaussNewton):
-    """Gauss-Newton that gives up where its steps reach too far: a trust region goes on."""
+    """Gauss-Newton that gives up where its steps are too long; a trust region continues."""
 
     halvings = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Auto(UpdateMethod):
-    """The paper's (13) and (14); from a start where they lead nowhere, a trust region.
+    """The paper's (13) and (14); where they fail, a trust region.
 
-    Its end is settled by the paper's steps, which say so where their S is singular.
+    The paper's steps refine its end, and report a singular S.
     """
 
     keeps_bounds = False
@@ -405,7 +407,7 @@ class Auto(UpdateMethod):
         except (ModelError, SolverError) as error:
             trouble, reason = error, str(error)
         else:
-            # a limit that was given is kept to
+            # a given limit is respected
             if found.converged or (most is not None and most <= GaussNewton.steps):
                 return found
             before, way, reason = found.trail, found.trail.p, found.reason
@@ -414,7 +416,7 @@ class Auto(UpdateMethod):
             found = TrustRegion().search(objective, way[-1], most=most, tolerance=tolerance)
         except (ModelError, SolverError) as error:
             raise trouble or error from None
-        # a search that was cut short may still lead somewhere
+        # a search that was cut short may still find a minimum
         if trouble is not None and not found.converged and found.reason != STOPPED:
             raise trouble
         found.tried = (f"Gauss-Newton: {reason}", f"trust region: {found.reason}")
@@ -427,7 +429,7 @@ class Auto(UpdateMethod):
         except SolverError:
             settled = found
         except ModelError as error:
-            # where S was singular before, that is the reason
+            # where S was singular before, this is the reason
             raise trouble if isinstance(trouble, ModelError) else error from None
         if settled is found or not settled.converged:
             objective.begin(found.p)

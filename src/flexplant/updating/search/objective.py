@@ -1,4 +1,4 @@
-"""All residuals and priors as one least-squares problem, and what searches of its least share."""
+"""All residuals and priors as one least-squares problem, and the base class of searches."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from ..residuals.modal_residuals import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
 from ..sensitivities import PoleRows, mode_columns, split_point
 
-#: number of entries of the shapes of all remembered points: complex ones of 160 MB
+#: largest number of entries of the stored shapes of all points: 160 MB of complex numbers
 REMEMBERED = 10_000_000
 
 
 class Defect(NamedTuple):
-    """What a better model's residuals, and their derivatives, are more than those of the model."""
+    """Difference of the residuals of a better model, and of their derivatives."""
 
-    #: parameters where both models were compared
+    #: parameters at which both models were compared
     p: FloatArray
     values: FloatArray
     slopes: FloatArray
 
 
 class PriorRows(NamedTuple):
-    """Residuals ``weight (p - middle)`` beside those of the data: a prior, or a penalty."""
+    """Residuals ``weight (p - middle)`` in addition to those of the data: a prior, or a penalty."""
 
     middle: FloatArray
     weight: FloatArray  # (m, q)
@@ -44,9 +44,10 @@ class PriorRows(NamedTuple):
 class Objective:
     """``1/2 |r(p)|^2`` with r the whitened residuals and ``(p - mean) / std`` of the priors.
 
-    Two finite bounds without a prior make one: the model itself (zero, or the bound nearest to it)
-    the most probable, the farther bound three standard deviations away. Priors take part where the
-    noise of every residual is known: else their weight against the data would not be.
+    Two finite bounds without a prior imply one: the model itself (zero, or the bound closest to it)
+    is most probable, and the farther bound is three standard deviations away. Priors are used if
+    the noise of every residual is known; otherwise their weight relative to the data is not
+    defined.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Objective:
         self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
         self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
-        #: to what the answer is drawn: the priors, and what a search may add
+        #: terms that attract the result: the priors, and terms that a search adds
         self.drawn: list[PriorRows] = []
         if self.uses_prior:
             pull = -np.diag(1 / self.prior_std)[self.has_prior]
@@ -85,18 +86,18 @@ class Objective:
         self.reference: Point | None = None
         self._point: Point | None = None
         self._first: Point | None = None
-        #: points through which modes are followed to where a search begins, numbered at the first
+        #: points through which modes are followed to the start of a search, numbered at the first
         self.path: list[FloatArray] = []
-        #: what is added to the residuals, to first order about the parameters it was found at
+        #: correction of the residuals, to first order about its parameters
         self.defect: Defect | None = None
-        #: the points that searches moved to, by the one they came from and the parameters there:
-        #: a path that is followed once more is not solved once more
+        #: points of searches, by the previous point and the parameters: a repeated path is not
+        #: solved again
         self._moves: dict[tuple[Point, bytes], Point] = {}
         self._last: tuple[Point, bytes] | None = None
 
     @property
     def default_start(self) -> FloatArray:
-        """Prior means, zeros without, moved between the bounds."""
+        """Prior means or zeros, moved between the bounds."""
         middle = np.clip(self.prior_mean, self.lower, self.upper)
         return np.asarray(middle, dtype=np.float64)
 
@@ -152,7 +153,7 @@ class Objective:
             self._moves.clear()
 
     def place(self, point: Point) -> Point:
-        """Return a point whose modes are numbered already, as the reference."""
+        """Return a point with numbered modes as the reference."""
         return self._set(self._numbered(point), refer=True)
 
     def _set(self, point: Point, *, refer: bool) -> Point:
@@ -162,7 +163,7 @@ class Objective:
         return point
 
     def _numbered(self, point: Point) -> Point:
-        """Return the point as residuals number it, repeated modes turned to the next split."""
+        """Return the point as numbered by the residuals, with repeated modes split."""
         if self.poles_measured is not None:
             point = split_point(point, self.poles_measured)
         for bound in self.bounds:
@@ -190,7 +191,7 @@ class Objective:
         return np.vstack(rows)
 
     def size(self, point: Point) -> FloatArray:
-        """Return what the whole of a measured value is in each row of `values`."""
+        """Return the measured value in units of each row of `values`."""
         rows = [np.broadcast_to(b.size, b.values(point).shape) for b in self.bounds]
         if self.uses_prior:
             rows.append(np.ones(int(self.has_prior.sum())))
@@ -212,11 +213,11 @@ class Objective:
 
     @property
     def text(self) -> str:
-        """What is fitted, in words."""
+        """Text on the fitted data."""
         return " and ".join(bound.name for bound in self.bounds)
 
     def omega(self, point: Point) -> float:
-        """Return a typical |lambda| of the modes that are followed, of all where none is."""
+        """Return a typical |lambda| of the followed modes, or of all modes."""
         poles = self.poles(point) if self.numbers else point.eigen.poles
         return float(np.median(np.abs(poles))) if poles.size else 1.0
 
@@ -232,7 +233,7 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     for residual in listed:
         instance(residual, Residual, "a residual", hint)
     if not listed:
-        raise ModelError("residuals is empty: nothing was measured to update from.")
+        raise ModelError("residuals is empty: give at least one measurement.")
     return listed
 
 
@@ -250,7 +251,7 @@ def compared_modes(residual: Residual) -> tuple[int, ...]:
     return tuple(getattr(measured, "modes", None) or ())
 
 
-#: what a bar calls the steps of all searches
+#: label of the progress bar
 ITERATIONS = "update, iterations"
 #: steps that the searches from all starts of an update take together, on average
 _STEPS = 40.0
@@ -282,21 +283,21 @@ class Trail:
 
 @dataclass
 class SearchEnd:
-    """What a search ended with."""
+    """Result of a search."""
 
     p: FloatArray
     cost: float
     trail: Trail
     converged: bool
     reason: str
-    #: methods that were tried and how each of them ended, where there were several
+    #: methods that were tried and their ends, if there were several
     tried: tuple[str, ...] = ()
 
 
 class UpdateMethod(Value):
     """The base class of methods that minimise the residuals.
 
-    A new method is a subclass with a `search`, in a module of its own.
+    A new method is a subclass with a `search`, in a separate module.
 
     Examples
     --------
@@ -305,7 +306,7 @@ class UpdateMethod(Value):
     True
     """
 
-    #: most steps when nothing else is said
+    #: default largest number of steps
     steps: ClassVar[int] = 200
     #: whether it keeps to the bounds of parameters
     keeps_bounds: ClassVar[bool] = True
@@ -314,12 +315,12 @@ class UpdateMethod(Value):
 
     @property
     def least_squares(self) -> bool:
-        """Whether the answer is that of least squares: no penalty, no robust loss, all data."""
+        """Whether the result is that of least squares: no penalty, no robust loss, all data."""
         return not self.penalised
 
     @property
     def penalised(self) -> bool:
-        """Whether the answer is drawn towards the start, so that its covariance is not known."""
+        """Whether the result depends on the start, so that its covariance is not known."""
         return False
 
     @abstractmethod
@@ -336,13 +337,13 @@ class UpdateMethod(Value):
         Parameters
         ----------
         objective : Objective
-            What to minimise.
+            Objective to minimise.
         start : (q,) array
-            Parameters to begin with.
+            Start values of the parameters.
         most : int, optional
-            Most steps; `steps` when not given.
+            Largest number of steps; `steps` by default.
         tolerance : float
-            Relative change of what is fitted that counts as none.
+            Relative change of the fitted values that counts as zero.
 
         Raises
         ------
@@ -352,7 +353,7 @@ class UpdateMethod(Value):
 
 
 class SearchPlan(NamedTuple):
-    """A method, and how far it goes: most steps (None: its own) and relative tolerance."""
+    """A method with its largest number of steps (None: its default) and relative tolerance."""
 
     method: UpdateMethod
     most: int | None
