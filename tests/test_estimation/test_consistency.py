@@ -367,5 +367,5 @@ def test_the_report_of_a_loop_names_the_mode_that_moved(tmp_path):
     assert found.moved.modes == (6,)
     assert abs(found.moved.frequency[6][0] - 0.0247) < 2e-3
     text = report(tmp_path / "loop", promised, run).read_text()
-    said = text.partition("Beside the model of the loop")[2]
+    said = text.partition("Compared with the model of the loop")[2]
     assert "near mode 6 " in said and "Calibrate the model" in said

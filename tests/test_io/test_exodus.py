@@ -114,7 +114,7 @@ def test_names_of_variables(tmp_path):
     strange.write_bytes(strange.read_bytes().replace(b"coord", b"place"))
     with pytest.raises(FlexplantError, match="no coordinates of nodes"):
         read_exodus_modes(strange)
-    with pytest.raises(FlexplantError, match="not clear"):
+    with pytest.raises(FlexplantError, match="not clear which"):
         read_exodus_modes(write(tmp_path / "c.exo", names=("ux", "DispX", "uy", "uz")))
 
 

@@ -92,7 +92,7 @@ def test_any_numbers_and_names(tmp_path_factory, numbers, names):
         ("frequency [Hz],y real,y imag\n1,2,3\n", r"'y real' is not like 'y1 <- u1 real"),
         ("frequency [Hz],y <- u real,y <- u real\n1,2,3\n", r"lacks or doubles.*y <- u imag"),
         ("# x\nfrequency [Hz],y <- u real,y <- u imag\n1,2,3\n4,5\n", r"2 numbers in line 4"),
-        ("frequency [Hz],y <- u real,y <- u imag\n1,2,x\n", r"line 2: 'x' is no decimal number"),
+        ("frequency [Hz],y <- u real,y <- u imag\n1,2,x\n", r"line 2: 'x' is not a decimal number"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, words):
@@ -107,7 +107,7 @@ def test_bad_numbers_and_arguments(tmp_path):
     with pytest.raises(ModelError, match="increase strictly"):
         read_frf_csv(path)
     path.write_text("frequency [Hz],y <- u real,y <- u imag\n2,nan,1\n")
-    with pytest.raises(FlexplantError, match="line 2: 'nan' is no decimal number"):
+    with pytest.raises(FlexplantError, match="line 2: 'nan' is not a decimal number"):
         read_frf_csv(path)
     with pytest.raises(ModelError, match="frf must be of type Frf, got list"):
         write_frf_csv(path, [1])

@@ -255,7 +255,7 @@ def test_what_is_no_record_is_said(tmp_path):
     assert read_records(table("b,a\n1,2\n3,4\n"), rate=8.0).rate == pytest.approx(8.0)
     with pytest.raises(ModelError, match=r"holds its sampling rate, 100 Hz.*Leave rate= out"):
         read_records(table(f"t,a\n{rows}"), rate=8.0)
-    with pytest.raises(FlexplantError, match=r"line 7: 2 numbers are due, got '0\.05,over'"):
+    with pytest.raises(FlexplantError, match=r"line 7: 2 numbers are expected, got '0\.05,over'"):
         read_records(table(f"t,a\n{rows}".replace("0.05,5", "0.05,over")))
     with pytest.raises(FlexplantError, match="no names above"):
         read_records(table(rows))

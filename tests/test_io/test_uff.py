@@ -220,14 +220,14 @@ def test_coherence(tmp_path):
     assert frf.coherence[0, 0] == pytest.approx(gamma, rel=1e-4)
     assert frf.coherence[2, 1] == pytest.approx(0.9 * gamma, rel=1e-4)
     path = written(tmp_path, sets + coherent[:-1])
-    with pytest.raises(FlexplantError, match=r"lacks 1 of 6 coherences: 41:rx <- u 7:x"):
+    with pytest.raises(FlexplantError, match=r"does not contain 1 of 6 coherences: 41:rx <- u 7:x"):
         read_frf_uff(path)
     assert read_frf_uff(path, coherence=False).coherence is None
 
 
 def test_missing_doubled_and_uneven_pairs_are_listed(tmp_path):
     sets = [record(*pair, data) for pair, data in DATA.items()]
-    with pytest.raises(FlexplantError, match=r"lacks 1 of 6 .*2:z <- u 7:x"):
+    with pytest.raises(FlexplantError, match=r"does not contain 1 of 6 .*2:z <- u 7:x"):
         read_frf_uff(written(tmp_path, [sets[0], *sets[2:]]))
     with pytest.raises(FlexplantError, match="2:z <- u 2:z more than once"):
         read_frf_uff(written(tmp_path, [*sets, sets[0]]))

@@ -59,10 +59,10 @@ def test_integrators_return_as_by_back_calculation(n_u):
 def test_what_the_commands_do_not_show_is_refused():
     for A, dt in ((np.zeros((2, 2)), 0.0), (np.eye(2), 1e-3)):
         with pytest.raises(
-            ModelError, match=r"2 slow states .* cannot all be found from the 1 com"
+            ModelError, match=r"2 slow states .* cannot all be determined from the 1 com"
         ):
             recovery_gain(A, np.array([[1.0, 2.0]]), 0.1, dt)
-        with pytest.raises(ModelError, match="cannot all be found"):
+        with pytest.raises(ModelError, match="cannot all be determined"):
             recovery_gain(A, np.array([[0.0, 0.0]]), 0.1, dt)
 
 

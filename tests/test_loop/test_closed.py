@@ -228,7 +228,7 @@ def test_repr_is_short(loop):
         (
             lambda: [servo().renamed(inputs={"die:hat": "die:z"})],
             LabelError,
-            "no controller can read",
+            "which is not measured",
         ),
         (lambda: [observer()], LabelError, "nothing drives actuator 'u1'"),
         (
@@ -239,7 +239,7 @@ def test_repr_is_short(loop):
         (
             lambda: [observer().renamed(outputs={"die:hat": "y1"}), servo()],
             LabelError,
-            "'y1', which the plant has in y",
+            "'y1', which is already in the plant's y",
         ),
         (lambda: [observer(), servo(), servo()], ModelError, "blocks 2 and 3 are the same system"),
         (lambda: [observer(dt=1e-3), servo()], ModelError, "block 1 .* dt 0.001 s"),

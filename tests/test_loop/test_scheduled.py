@@ -122,5 +122,5 @@ def test_refusals(plant):
         notches = [300.0] * (there.assembled.ports.values["x"] > 0)
         return fx.design_kalman(there), fx.design_servo(there, bandwidth=25.0, notches=notches)
 
-    with pytest.raises(ModelError, match="nothing lies between them"):
+    with pytest.raises(ModelError, match="they cannot be interpolated"):
         schedule_loops(plant, growing, places=[-0.01, 0.01])

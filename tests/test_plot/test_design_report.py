@@ -97,8 +97,8 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
         np.__version__,
         *seeds,
         "u4:effort",
-        "Beside the model of the loop",
-        "no choice is below",
+        "Compared with the model of the loop",
+        "lower bound of all",
     ):
         assert part in said
     drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
@@ -171,7 +171,7 @@ def test_an_unstable_loop_is_reported_as_such(tmp_path):
 
 
 def test_what_is_no_report(tmp_path):
-    with pytest.raises(ModelError, match="nothing to report"):
+    with pytest.raises(ModelError, match="report is empty"):
         fx.plot.report(tmp_path / "x")
     with pytest.raises(ModelError, match="holds values of flexplant, got 3"):
         fx.plot.report(tmp_path / "x", 3)

@@ -56,7 +56,7 @@ def test_a_grid_of_channels_and_its_refusals():
         fx.plot.bode(g, ax=plt.subplots(2)[1])
     with pytest.raises(ModelError, match="need a system"):
         fx.plot.bode("servo")
-    with pytest.raises(ModelError, match="nothing to draw"):
+    with pytest.raises(ModelError, match="list is empty"):
         fx.plot.bode({})
 
 
@@ -125,7 +125,7 @@ def test_systems_may_stand_in_a_list():
         legends = [ax.get_legend() for ax in draw([g, 2.0 * g]).figure.axes]
         words = [text.get_text() for one in legends if one for text in one.get_texts()]
         assert [w.startswith("system 1") for w in words].count(True) == 1, draw.__name__
-        with pytest.raises(ModelError, match="nothing to draw"):
+        with pytest.raises(ModelError, match="list is empty"):
             draw([])
 
 

@@ -114,7 +114,7 @@ def test_a_sensitivity_of_a_pair_an_frf_or_a_line():
         line = fx.plot.sensitivity(given).get_lines()[0]
         np.testing.assert_allclose(line.get_ydata(), size_of(S), rtol=1e-9, atol=1e-9)
     for wrong in ("servo", {}, 3.0):
-        with pytest.raises(ModelError, match=r"need a ClosedLoop|nothing to draw"):
+        with pytest.raises(ModelError, match=r"need a ClosedLoop|is empty"):
             fx.plot.sensitivity(wrong)
 
 

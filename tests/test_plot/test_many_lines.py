@@ -114,7 +114,7 @@ def test_phase_coherence_and_deviation_beside_a_magnitude():
         fx.plot.frf({"model": clean}, "out", "in", also="coherence")
     with pytest.raises(LabelError, match="'colour'"):
         fx.plot.frf(shown, "out", "in", also="colour")
-    with pytest.raises(ModelError, match="panels of their own"):
+    with pytest.raises(ModelError, match="need separate panels"):
         fx.plot.frf(shown, "out", "in", also="phase", ax=top)
 
 

@@ -144,7 +144,7 @@ def test_refusals(plate, modes):
         ModalBalanced(9, [])
     with pytest.raises(ModelError, match="from 3"):
         reduce(modes, ModalBalanced(2, INTO))
-    with pytest.raises(ModelError, match="for an FEModel"):
+    with pytest.raises(ModelError, match="need an FEModel"):
         reduce(modes, ModalBalanced(9, INTO, among=20))
     with pytest.raises(ModelError, match="undamped"):
         reduce(plate, ModalBalanced(9, INTO))

@@ -185,7 +185,7 @@ def test_what_cannot_be_known_in_time_is_refused():
         np.eye(2), 1e-3 * np.eye(2)[:, :1], [[1.0, 1.0]], [[-1.0]], 1e-3,
         inputs=["y"], outputs=["u"],
     )  # fmt: skip
-    with pytest.warns(), pytest.raises(ModelError, match="cannot all be found"):
+    with pytest.warns(), pytest.raises(ModelError, match="cannot all be determined"):
         simulate(
             close_loop(loop.plant, twice), duration=0.1, elements={"u": Saturation(1.0)},
             anti_windup=0.1,

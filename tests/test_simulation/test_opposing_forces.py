@@ -60,7 +60,7 @@ def test_two_laws_whose_encoders_disagree_push_against_each_other(seed):
     force = spring * stroke * (1.0 / scale - 1.0)  # with which `right` pulls
     loop = carriage(mass, spring, 15.0, (1.0, scale))
     assert loop.is_stable
-    with pytest.warns(FlexplantWarning, match="pushing against each other") as said:
+    with pytest.warns(FlexplantWarning, match="push against each other") as said:
         run = moved(loop, stroke)
     assert run["right"][-1] == pytest.approx(force, rel=0.02)
     text = str(said[0].message)
@@ -86,7 +86,7 @@ def test_machines_that_move_freely_are_not_accused():
         loop = fx.close_loop(plant, observer, servo)
         move = fx.setpoint(1e-3, velocity=0.05, acceleration=0.5, jerk=50.0)
         with warnings.catch_warnings():
-            warnings.filterwarnings("error", message=".*pushing against")
+            warnings.filterwarnings("error", message=".*push against")
             fx.simulate(loop, reference={reference: move}, duration=1.0, rng=1)
 
 
@@ -97,6 +97,6 @@ def test_a_weight_that_actuators_share_is_carried_and_not_opposed():
     servo = fx.design_servo(plate, bandwidth=20.0, observer=observer)
     loop = fx.close_loop(plate, observer, servo)
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*pushing against")
+        warnings.filterwarnings("error", message=".*push against")
         run = fx.simulate(loop, disturbance={"amp1": 10.0}, duration=1.0, rng=1)
     assert abs(sum(run[name][-1] for name in loop.driven)) > 5.0

@@ -110,7 +110,7 @@ def test_exposure_is_the_worst_window_after_a_time():
     found = run.exposure("e", window=0.02, start=0.1)
     assert found == (np.abs(average[:, late]).max(), deviation[:, late].max())
     assert run.exposure("e", window=0.02)[0] > 10 * found[0]
-    with pytest.raises(ModelError, match="leaves nothing"):
+    with pytest.raises(ModelError, match="is too late"):
         run.exposure("e", start=1.0)
 
 
@@ -141,7 +141,7 @@ def test_bad_input():
         run.moving_std("e", window=1e-4)
     with pytest.raises(ModelError, match="window must be positive"):
         run.moving_std("e", window=0.0)
-    with pytest.raises(ModelError, match="leaves nothing"):
+    with pytest.raises(ModelError, match="is too late"):
         run.rms("e", start=1.0)
     with pytest.raises(ModelError, match="equal steps"):
         Response([0.0, 1.0, 3.0], np.zeros((1, 3)), ["e"])

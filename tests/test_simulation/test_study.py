@@ -329,7 +329,7 @@ def test_memory_does_not_grow_with_the_machines():
 
 
 def test_wrong_calls():
-    with pytest.raises(ModelError, match="needs machines, got none"):
+    with pytest.raises(ModelError, match="needs machines, got an empty"):
         study([], drawn)
     with pytest.raises(ModelError, match="pipeline must be callable"):
         study([1], "update")

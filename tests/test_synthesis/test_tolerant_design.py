@@ -153,7 +153,7 @@ def test_what_is_promised_holds_where_shapes_are_mixed_by_hand():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the loop hangs on")
+@pytest.mark.filterwarnings("ignore:the loop depends on")
 def test_an_uncertain_plant_is_designed_for_by_default():
     """Weights and blocks keep what is uncertain: the same controller as with uncertain=."""
     uncertain = plant().uncertain(frequency=SHARE)

@@ -149,7 +149,7 @@ def test_a_negative_mass_is_remarked_on(chain):
     K[1, 1] += 30.0
     poles = oracle.poles(chain.M, chain.D, K)
     data = MeasuredModes(poles, modes=[1, 2, 3, 4], covariance=(1e-4 * np.abs(poles)) ** 2)
-    with pytest.warns(FlexplantWarning, match="mass at 2:z came out negative"):
+    with pytest.warns(FlexplantWarning, match="mass at 2:z became negative"):
         update(chain, [AddedMass("2:z")], [Eigenvalues(data)])
 
 

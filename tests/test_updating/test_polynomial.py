@@ -124,12 +124,12 @@ def test_matrices_that_are_no_polynomials_are_followed():
     slope = objective.slopes(objective.begin(np.array([0.1])))
     up, down = (solve_modes(stretched(1.1 + h), count=3).omega for h in (1e-5, -1e-5))
     np.testing.assert_allclose(slope[3:, 0], -(up - down) / 2e-5, rtol=1e-5)
-    with pytest.raises(ModelError, match=r"K of length is no polynomial of degree 12"):
+    with pytest.raises(ModelError, match=r"K of length is not a polynomial of degree 12"):
         PolynomialParameter.from_build("length", stretched, value=1.0, width=0.99)
 
 
 def test_what_is_no_polynomial_is_refused():
-    with pytest.raises(ModelError, match=r"K of t is no polynomial of degree 2.*Raise degree="):
+    with pytest.raises(ModelError, match=r"K of t is not a polynomial of degree 2.*Raise degree="):
         PolynomialParameter.from_build("t", build, value=H, degree=2)
     with pytest.raises(ModelError, match="changes nothing"):
         PolynomialParameter("t", dK=[None])

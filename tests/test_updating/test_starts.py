@@ -153,7 +153,7 @@ def test_a_negative_damper_is_refused_with_what_was_found():
     model, unknowns, data, truth = problem(583)
     with pytest.raises(ModelError, match=r"damping at 3:z = -2e\+01 \+- 30 N s/m") as caught:
         update(model, unknowns, [data])
-    assert "does not keep damping at 3:z to what is possible: give bounds=" in str(caught.value)
+    assert "does not keep damping at 3:z physical: give bounds=" in str(caught.value)
     assert "swapped" not in str(caught.value)
     bounded = [
         q.replace(bounds=(0.0, None)) if isinstance(q, AddedDamping) else q for q in unknowns

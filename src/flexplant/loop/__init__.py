@@ -1,4 +1,4 @@
-"""Closing the loop by names, its sensitivities and margins.
+"""Closed loops, connected by channel names; their sensitivities and margins.
 
 - `close_loop(plant, *blocks)`: blocks are connected by the names of their channels.
 - `ClosedLoop`: ``is_stable``, ``modulus_margin``, ``rms("die:error")``, ``psd``,
@@ -7,7 +7,7 @@
 - `report_loops`: crossovers, gain, phase and modulus margins of each loop, broken at u or y.
 - `compare_loops`: several designs, or one on model and machine, in one table.
 
-Every quantity takes a measured `fx.Frf` as plant too; `in_axes` brings it into decoupled axes.
+Every quantity also accepts a measured `fx.Frf` as plant; `in_axes` transforms it to decoupled axes.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -20,9 +20,9 @@ Every quantity takes a measured `fx.Frf` as plant too; `in_axes` brings it into 
 >>> round(report["u1"].phase_margin), round(loop.rms("die:error") * 1e9)
 (41, 248)
 
-Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, of a loop
-gain L (a system or a measured `fx.Frf`), of ``(plant, controller)`` or of a closed loop;
-``loopsens``: `sensitivity` and its like.
+Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, for a loop
+gain L (a system or a measured `fx.Frf`), for ``(plant, controller)`` or a closed loop;
+``loopsens``: `sensitivity` and similar functions.
 """
 
 from ..certificates import Certificate as Certificate

@@ -1,4 +1,4 @@
-"""Anti-windup: the gain with which slow states of a controller return to what is applied."""
+"""Anti-windup: the gain with which slow states of a controller follow the applied command."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from ..errors import ModelError, counted
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..tolerances import ROUNDING, TINY, divisor
 
-#: relative to 1 / recovery: a pole whose decay falls short by less counts as fast enough
+#: tolerance of the decay of a pole relative to 1 / recovery
 _SHORT = 1e-3
-#: fraction of the wanted decay that is reached where several poles meet: rounding splits them
+#: reached fraction of the wanted decay where several poles coincide, which rounding splits
 _REACHED = 0.5
-#: smallest fraction of the largest observability of slow states by the commands that counts
+#: least observability of slow states by the commands, relative to the largest
 _SEEN = 1e-12
 
 
 def recovery_gain(A: FloatArray, C: FloatArray, recovery: float, dt: float) -> FloatArray:
     """Return L (n, nu): every pole of ``A - L C`` decays with the recovery time [s] or faster.
 
-    Poles that are slower move to that decay and keep their frequency; the others stay.
+    Slower poles move to that decay and keep their frequency; the others do not change.
     """
     wanted = -1.0 / recovery
     limit = wanted * (1.0 - _SHORT)
@@ -41,10 +41,10 @@ def recovery_gain(A: FloatArray, C: FloatArray, recovery: float, dt: float) -> F
         rest = A - L @ C
     if not _slowest(rest, dt) <= _REACHED * wanted:
         raise ModelError(
-            f"{counted(slow, 'slow state')} of the blocks that drive actuators cannot all be "
-            f"found from the {counted(len(C), 'command')}, so that anti-windup cannot return them. "
-            "Let fewer integrators drive each actuator, or leave the recovery time out and give "
-            "the blocks an anti-windup of their own."
+            f"{counted(slow, 'slow state')} of the blocks that drive actuators cannot be "
+            f"determined from the {counted(len(C), 'command')}, so that anti-windup cannot "
+            "correct them. Use fewer integrators for each actuator, or leave the recovery time "
+            "out and use blocks with separate anti-windup."
         )
     return np.asarray(L / unit)
 

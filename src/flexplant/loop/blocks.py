@@ -1,4 +1,4 @@
-"""The blocks of a controller: joined by name, each signal driven once; the law that they are."""
+"""The blocks of a controller, connected by name, with each signal driven once."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def driving_blocks(
     *,
     applied: bool = False,
 ) -> StateSpace:
-    """Return the blocks as one system from y to the driven actuators and what is watched."""
-    # with `applied`, what the driven actuators apply are inputs too, after y: blocks that read an
-    # actuator's name read these, not the commands
+    """Return the blocks as one system from y to the driven actuators and monitored outputs."""
+    # with `applied`, the applied commands of driven actuators are inputs too, after y: blocks with
+    # an input named like an actuator read these, not the commands
     read = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     silent = [name for name in read if name not in driven]
     used = [name for sys in systems for name in (*sys.inputs, *sys.outputs)]
@@ -55,7 +55,7 @@ def commands(
 ) -> Responder:
     """Return the response of the blocks from y to the driven actuators, each by its own structure.
 
-    With G of all blocks beside each other: outputs ``v = G (route v + enter y)``, ``u = leave v``.
+    With G block-diagonal from all blocks: outputs ``v = G (route v + enter y)``, ``u = leave v``.
     """
     needed = {name for sys in systems for name in sys.inputs}
     used = [[n for n in sys.outputs if n in driven or n in needed] for sys in systems]
@@ -129,8 +129,9 @@ def drives(
     for name in produced:
         if name in taken:
             raise LabelError(
-                f"a block drives {name!r}, which the plant has in {taken[name]}: the name would be "
-                "driven twice. Rename the block's output: system.renamed(outputs={...})."
+                f"a block drives {name!r}, which is already in the plant's {taken[name]}: the "
+                "name would be driven twice. Rename the block's output: "
+                f"system.renamed(outputs={...})."
             )
         if name in idle:
             raise LabelError(f"actuator {name!r} is driven by a block, so it cannot be idle.")
@@ -145,15 +146,16 @@ def drives(
             one, other
         ):
             raise ModelError(
-                f"blocks {i + 1} and {j + 1} are the same system: what they drive adds, so that it "
-                "acts twice. Pass it once; for twice the gain, scale its matrices C and D."
+                f"blocks {i + 1} and {j + 1} are the same system: their outputs add, so that the "
+                "system acts twice. Pass it once; for twice the gain, scale its matrices C and "
+                "D."
             )
     for name in plant.u:
         if name not in produced and name not in idle:
             error = unknown_label("block output", name, produced)
             raise LabelError(
                 f"nothing drives actuator {name!r}: {error} Rename the block's output, or pass "
-                f"idle=[{name!r}] if it rests on purpose."
+                f"idle=[{name!r}] if it is not used on purpose."
             )
     watched = [name for name in produced if name not in plant.u]
     return [name for name in plant.u if name in produced], watched
@@ -174,7 +176,7 @@ def check_inputs(plant: AnyPlant, systems: Sequence[StateSpace]) -> None:
             error = unknown_label("signal", name, known, owner)
             hidden = next((side for side in "zw" if name in getattr(plant, side)), None)
             why = (
-                f" It is in the plant's {hidden}, which no controller can read: estimate it."
+                f" It is in the plant's {hidden}, which is not measured: estimate it."
                 if hidden
                 else ""
             )
@@ -190,7 +192,7 @@ def force_name(actuator: str) -> str:
 
 
 def references(plant: AnyPlant) -> list[str]:
-    """Return the channels that are both in w and in y, what is derived from them left out."""
+    """Return the channels that are both in w and in y, without derived channels."""
     both = [name for name in plant.w if name in plant.y]
     return [name for name in both if not is_known(name, both, plant.u)]
 
@@ -239,8 +241,8 @@ def tapped(
 
 def applied_law(loop: Any, recovery: float | None) -> tuple[StateSpace, FloatArray]:
     """Return the law [y; applied u] -> [u; watched], and L (n, nu) of its anti-windup."""
-    # its states move by `L (applied - commanded)` in addition: slow ones of blocks that drive
-    # actuators return with the time constant `recovery` [samples]; without it L is zero
+    # `L (applied - commanded)` is added to its states: slow states of blocks that drive actuators
+    # follow with the time constant `recovery` [samples]; without it L is zero
     plant, driven = loop.plant, list(loop.driven)
     law = driving_blocks(plant, loop.blocks, driven, list(loop.watched), applied=True)
     ny, nu = len(plant.y), len(driven)
@@ -248,7 +250,7 @@ def applied_law(loop: Any, recovery: float | None) -> tuple[StateSpace, FloatArr
         i, j = np.argwhere(law.D[:nu, ny:])[0]
         raise AssumptionError(
             f"the command {driven[i]!r} depends on the applied {driven[j]!r} of the same sample, "
-            "which is known after the command only. Let the block read it one sample late, or "
+            "which is only known after the command. Let the block read it one sample later, or "
             "design the observer on a plant with a delay: plant.discretized(rate, delay=1)."
         )
     L = np.zeros((law.n_states, nu))

@@ -21,15 +21,15 @@ from ..words import instance
 from .blocks import references
 
 Side = Literal["u", "y"]
-#: loop gain below which |S| is at most 1 / (1 - 0.5), which is seldom the largest
+#: loop gain below which |S| is at most 1 / (1 - 0.5), usually below its maximum
 _SMALL = 0.5
-#: part of the largest |S| from which on it is computed, not bounded
+#: fraction of the largest |S| above which it is computed instead of bounded
 _NEAR = 0.8
-#: logarithmic part of a grid that is refined at the peaks of |S|
+#: logarithmic step of a grid that is refined at the peaks of |S|
 _POINTS = 100
-#: plants whose path is kept: loops of other controllers on them begin with it
+#: cache of prepared plants, which loops with other controllers use again
 _KEPT = 8
-#: change of a loop gain of 1, relative to it, that makes I - L regular
+#: relative change of a loop gain of 1 that makes I - L regular
 _BESIDE = 1e-15
 
 
@@ -61,14 +61,14 @@ class BrokenLoop:
 
     @cached_property
     def grid(self) -> FloatArray:
-        """Frequencies [Hz] through the resonances of the closed loop, or those measured."""
+        """Frequencies [Hz] through the resonances of the closed loop, or the measured lines."""
         if self.measured is not None:
             return self.measured
         return resonance_grid(self.poles(), self.dt)
 
     @cached_property
     def hidden(self) -> HiddenModes:
-        """What lies between the lines of a measured plant."""
+        """Modes between the lines of a measured plant."""
         lines = self.grid
         return hidden_modes(lines, self.plant(lines), self.controller(lines))
 
@@ -81,7 +81,7 @@ class BrokenLoop:
 
     @property
     def is_unstable(self) -> bool:
-        """Whether a pole is not strictly inside the stability region; a measured plant has none."""
+        """Whether a pole is not strictly inside the stability region; None for a measured plant."""
         if self.measured is not None:
             return False
         poles = self.poles()
@@ -90,7 +90,7 @@ class BrokenLoop:
 
     def mixed(self, at: Side = "u") -> tuple[str, ...]:
         """Return the units of the channels where it is broken if they have several, else none."""
-        # a largest singular value then adds what cannot be added
+        # a largest singular value would mix different units
         names = self.u if at == "u" else self.y
         known = tuple(dict.fromkeys(self.units.get(name, "unknown") for name in names))
         return known if len(known) > 1 else ()
@@ -111,14 +111,14 @@ class BrokenLoop:
 
     def margin(self, at: Side = "u", scaled: bool | None = None) -> float:
         """Return ``1 / max_f |S|``; 0 when unstable."""
-        # with scaled axes where channels have several units, unless it is chosen
+        # with scaled axes where channels have several units, unless chosen otherwise
         if self.is_unstable:
             return 0.0
         return 1.0 / self.worst(at, bool(self.mixed(at)) if scaled is None else scaled)[0]
 
 
 def inverted(L: ComplexArray) -> ComplexArray:
-    """Return (I - L)^-1, frequency first; on the critical point that of a gain next to it."""
+    """Return (I - L)^-1, frequency first; at the critical point for a slightly different gain."""
     eye = np.eye(L.shape[-1])
     try:
         return np.asarray(np.linalg.inv(eye - L))
@@ -127,7 +127,7 @@ def inverted(L: ComplexArray) -> ComplexArray:
 
 
 def largest_sensitivity(L: ComplexArray, scaled: bool) -> FloatArray:
-    """Return the size of ``S = (I - L)^-1``, axes scaled or not; a bound where it is not high."""
+    """Return the size of ``S = (I - L)^-1``, axes scaled or not; a bound where it is small."""
     return scaled_size(inverted(L)) if scaled else sensitivity_size(L)
 
 
@@ -148,7 +148,7 @@ def sensitivity_size(L: ComplexArray) -> FloatArray:
 
 
 def _norm_or_bound(L: ComplexArray) -> FloatArray:
-    """Return sigma_max of S where it may come near the largest, else its lower bound."""
+    """Return sigma_max of S where it may be near its maximum, else its lower bound."""
     S, n = inverted(L), L.shape[-1]
     square = S.conj().swapaxes(1, 2) @ S
     mean = np.einsum("fii->f", square).real / n
@@ -163,7 +163,7 @@ def _norm_or_bound(L: ComplexArray) -> FloatArray:
 class Path(NamedTuple):
     """A plant between the driven u and y, prepared for all its loops."""
 
-    #: to all of y, the y that u can move, and the response to these
+    #: response to all of y, the y that u can move, and the response to these
     system: StateSpace
     fed_back: tuple[str, ...]
     respond: Responder
@@ -171,7 +171,7 @@ class Path(NamedTuple):
 
 @lru_cache(maxsize=_KEPT)
 def plant_path(plant: AnyPlant, driven: tuple[str, ...]) -> Path:
-    """Return what lies between some actuators and y."""
+    """Return the path between some actuators and y."""
     system = plant.system.select(plant.y, driven)
     fed_back = movable_outputs(system)
     return Path(system, fed_back, responder(system.select(fed_back)))
@@ -183,22 +183,22 @@ def movable_outputs(g: StateSpace) -> tuple[str, ...]:
     return tuple(name for name, one in zip(g.outputs, moves, strict=True) if one)
 
 
-#: sweeps that balance rows against columns; a sweep gains the coupling squared, units at once
+#: number of sweeps that balance rows against columns
 _SWEEPS = 30
-#: powers of singular values whose sum is made small, one after the other, and steps for each: the
-#: largest is within n^(1/p) of the power mean, 2 % for 4 axes at 64
+#: powers of singular values whose sum is minimised in turn, and steps for each: the largest value
+#: is within n^(1/p) of the power mean, 2 % for 4 axes at 64
 _POWERS, _STEPS = (1, 2, 4, 8, 16, 32, 64), 12
-#: largest step of a logarithm, where a loop acts on others and none acts on it
+#: largest step of a logarithm, where a loop acts on others but no loop acts on it
 _LARGEST = 1.0
-#: frequencies that are optimised at once
+#: number of frequencies optimised together
 _CHUNK = 32
 
 
 def scaled_size(S: ComplexArray) -> FloatArray:
     """Return ``min_D sigma_max(D S D^-1)``, D diagonal, of S (k, n, n)."""
     # it is the upper bound of the structured singular value of one perturbation for each axis
-    # [Skogestad2005]_, section 8.8, whatever the units of the axes. Where it cannot be the largest
-    # it is a bound from above
+    # [Skogestad2005]_, section 8.8, independent of the units of the axes. Where it cannot be the
+    # maximum, an upper bound is returned
     log = _log_scaling(S)
     size = np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
@@ -218,7 +218,7 @@ def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
 
 
 def _log_scaling(S: ComplexArray) -> FloatArray:
-    """Return log D (k, n) of the least Frobenius norm: each row as large as its column."""
+    """Return log D (k, n) of the least Frobenius norm: rows and columns have equal size."""
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
     power[:, range(n), range(n)] = 0.0
@@ -227,7 +227,8 @@ def _log_scaling(S: ComplexArray) -> FloatArray:
     for _ in range(_SWEEPS if n > 1 else 0):
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
-            one_way = np.minimum(row, column) <= least * 1e-6  # acts, and nothing acts on it
+            # it acts on others, and no loop acts on it
+            one_way = np.minimum(row, column) <= least * 1e-6
             step = 0.25 * np.log((column + TINY) / (row + TINY))
             step = np.where(one_way, np.clip(step, -_LARGEST, _LARGEST), step)
             # no loop at all: sums of squares
@@ -260,8 +261,8 @@ def reference_pair(loop: Any, reference: str | None, error: str | None) -> tuple
         known = [name for name in loop.plant.w if name.endswith(":ref")]
         if len(known) > 1:
             raise LabelError(
-                f"the loop has {len(known)} references {known}, each with an S of its own: say "
-                f"which, reference={known[0]!r}; fx.plot.sensitivity(loop) draws all."
+                f"the loop has {len(known)} references {known}, each with its own S: choose one, "
+                f"reference={known[0]!r}; fx.plot.sensitivity(loop) draws all."
             )
         if not known:
             return ()

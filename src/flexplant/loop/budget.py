@@ -1,4 +1,4 @@
-"""Error budgets: the variance of a closed loop's signal, source by source, in closed form."""
+"""Error budgets: the variance of a signal in a closed loop by source, in closed form."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ from ..store import Value
 from ..tolerances import divisor
 from ..words import in_unit, instance
 
-#: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
+#: relative tolerances of the variance: by two Lyapunov equations, and by the integral of the
+#: spectrum
 AGREEMENT = 1e-6
-#: what the part of a set-point is called
+#: name of the contribution of a set-point
 RESIDUE = "set-point residue"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorBudget(Value):
-    """Where the rms of one signal of a closed loop comes from; prints as a table.
+    """Contributions to the rms of one signal of a closed loop; prints as a table.
 
     Independent sources: their variances add. Made by `ClosedLoop.budget`.
 
@@ -50,14 +51,14 @@ class ErrorBudget(Value):
     names : sequence of str
         The sources: white disturbances, sensor noises, the residue of a set-point.
     variances : (n_source,) array [unit^2]
-        Of each.
+        Variance of each source.
     freq : (n_freq,) array [Hz]
-        From 0 to half the rate; to infinity for a continuous loop.
+        Frequencies from 0 to half the rate; to infinity for a continuous loop.
     cumulative : (n_source, n_freq) array [unit^2]
-        The variance that each source has below a frequency.
+        Variance of each source below a frequency.
     left_out : float [unit]
-        The rms on the plant with the modes left out; NaN where these are not known, infinite where
-        the loop is unstable with them.
+        RMS on the plant with the truncated modes; NaN where these are not known, infinite where the
+        loop is unstable with them.
     certificate : Certificate
         Relative differences of the variance computed in other ways.
 
@@ -93,7 +94,7 @@ class ErrorBudget(Value):
 
     @cached_property
     def shares(self) -> FloatArray:
-        """The part (n_source,) of each source in the variance."""
+        """Fraction (n_source,) of each source in the variance."""
         total = float(self.variances.sum())
         return self.variances / total if total else self.variances
 
@@ -214,14 +215,14 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
     return late
 
 
-#: densities (n_source, n_freq) at frequencies [Hz]
+#: function that gives densities (n_source, n_freq) at frequencies [Hz]
 Densities = Callable[[FloatArray], FloatArray]
-#: intervals are halved until the error of each source's integral is below this part of it
+#: relative error of the integral of each source at which halving of intervals ends
 TOLERANCE = 1e-8
-ROUNDS = 40  # an interval of 1e-12 of the first has no error left
-#: edges over all frequencies, as a picture of the stairs needs them; half-widths beside resonances
+ROUNDS = 40  # an interval of 1e-12 of the first has no error
+#: number of edges over all frequencies for a picture; distances from resonances in half-widths
 _STAIRS, _BESIDE = 150, (0.0, 3.0, 20.0)
-#: frequencies at a time
+#: number of frequencies computed together
 STEP = 2048
 
 
@@ -250,7 +251,7 @@ class Spectrum(NamedTuple):
 
 def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Densities:
     """Return the function of frequency that gives each source's one-sided density in an output."""
-    # 2 h |C (z I - A)^-1 G + D|^2, what folds back in it; continuous 2 |C (s I - A)^-1 G + D|^2
+    # 2 h |C (z I - A)^-1 G + D|^2, which includes aliasing; continuous 2 |C (s I - A)^-1 G + D|^2
     n = monitored.n_states
     none = np.zeros((n, 1))
     # from the output back to the states: one column for any number of noises
@@ -294,7 +295,7 @@ def integrated(
         fine = density @ kronrod
         return fine, np.abs(fine - density @ gauss)
 
-    known = np.vstack([edges[:-1], edges[1:]])  # of each interval its ends
+    known = np.vstack([edges[:-1], edges[1:]])  # the ends of each interval
     fine, error = values(*known)
     size = divisor(variances)[:, None]
     for _ in range(ROUNDS):
@@ -346,7 +347,7 @@ def periodogram(signal: FloatArray, dt: float) -> Spectrum:
     return Spectrum(np.fft.rfftfreq(n, dt).astype(np.float64), size)
 
 
-#: relative: the noise factors of single disturbances add up to the one that the plant has
+#: relative tolerance: noise factors of single disturbances must add up to that of the plant
 _ADDS_UP = 1e-6
 
 
@@ -385,7 +386,7 @@ def white_names(plant: AnyPlant) -> tuple[list[str], list[str]]:
 
 def white_noise(plant: AnyPlant) -> WhiteNoise:
     """Return the noises of a sampled plant, all disturbances together."""
-    # exact over a sample, what folds back included; a sensor's variance is asd^2 rate / 2
+    # exact over a sample, including aliasing; the variance of a sensor is asd^2 rate / 2
     white, sensors = white_names(plant)
     factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
     columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
@@ -400,7 +401,7 @@ def continuous_factor(plant: AnyPlant) -> FloatArray:
 
 
 def sources(plant: AnyPlant, monitored: StateSpace) -> list[Source]:
-    """Return the white noises of a plant as they enter its closed loop, each by itself."""
+    """Return the separate white noises of a plant as they enter its closed loop."""
     white, sensors = white_names(plant)
     found = []
     for name, factor in _disturbance_factors(plant, white).items() if plant.dt else ():
@@ -416,7 +417,7 @@ def sources(plant: AnyPlant, monitored: StateSpace) -> list[Source]:
 
 
 def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatArray]:
-    """Return G of each white disturbance; of all together where they cannot be separated."""
+    """Return G of each white disturbance; a common G where they cannot be separated."""
     if not white:
         return {}
     total = continuous_factor(plant)
@@ -428,7 +429,7 @@ def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatAr
             asd = {n: level for n, level in plant.asd.items() if n == name or n in plant.held}
             alone = plant.machine.continuous.replace(asd=asd)
             found[name] = continuous_factor(alone.discretized(1.0 / plant.dt, delay=plant.delay))
-        # a plant whose noise was changed since it was assembled keeps its own
+        # a plant whose noise was changed after assembly keeps this noise
         if all(factor.shape[0] == total.shape[0] for factor in found.values()):
             own = np.sum(total**2, axis=1)
             added = np.sum([np.sum(factor**2, axis=1) for factor in found.values()], axis=0)
@@ -439,7 +440,7 @@ def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatAr
 
 def stationary_row(plant: AnyPlant, monitored: StateSpace, problem: object, channel: str) -> int:
     """Return the row of an output of a closed loop that has a stationary state."""
-    standard_plant(plant)  # the z and w of a generalized plant are no physical signals
+    standard_plant(plant)  # the z and w of a generalized plant are not physical signals
     given: object = channel
     instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
     row = int(monitored.output_index([channel])[0])

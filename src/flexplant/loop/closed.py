@@ -1,4 +1,4 @@
-"""The closed loop: a plant with its controller, and what is known of it in closed form."""
+"""The closed loop: a plant with its controller, and results in closed form."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from .other_machines import (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoop(Value):
-    """A plant with its controller: ``u = K y``, everything known by name.
+    """A plant with its controller, ``u = K y``, with named signals.
 
     Made by `close_loop`.
 
@@ -59,11 +59,11 @@ class ClosedLoop(Value):
     plant : StandardPlant
         The plant, open.
     blocks : sequence of StateSpace
-        What was connected; `close_loop(other_plant, *loop.blocks)` closes the same controller
-        around another machine.
+        Connected blocks; `close_loop(other_plant, *loop.blocks)` closes the same controller around
+        another machine.
     controller : StateSpace
         All blocks as one system: plant.y -> the driven actuators, then the other outputs of the
-        blocks (an observer's estimates, say), which are monitored.
+        blocks (such as estimates of an observer), which are monitored.
     idle : sequence of str
         Actuators that nothing drives.
 
@@ -170,10 +170,10 @@ class ClosedLoop(Value):
         return self.monitored.select(outputs=self.plant.z)
 
     def frequency_response(self, freq: npt.ArrayLike) -> Frf:
-        """Return the response from w to z, plant and controller each by their own structure.
+        """Return the response from w to z, using the structure of plant and controller.
 
         ``P11 + P12 K (I - P22 K)^-1 P21`` at each frequency: a plant in modal blocks costs O(n),
-        where the closed loop as one system has lost its blocks.
+        while the closed loop as one system has no blocks.
 
         `freq` (n_freq,) [Hz] is not above half the rate. ModelError when a frequency is not
         allowed, or the loop is singular at one.
@@ -185,7 +185,8 @@ class ClosedLoop(Value):
     def gain(self, reference: str, error: str) -> Responder:
         """Return the function of frequency [Hz] that gives the response from a w to a z.
 
-        Prepared once for many calls: the frequencies are not checked, (1, 1, n_freq) comes back.
+        It is prepared once for many calls: frequencies are not checked, and it returns (1, 1,
+        n_freq).
         """
         return self._responses([reference], [error])
 
@@ -202,7 +203,7 @@ class ClosedLoop(Value):
                 command = np.linalg.solve(back, K @ P[:, p:, :m])
             except np.linalg.LinAlgError as error:
                 raise ModelError(
-                    "the loop has a pole at one of the frequencies: move it."
+                    "the loop has a pole at one of the frequencies: choose another frequency."
                 ) from error
             return np.moveaxis(P[:, :p, :m] + P[:, :p, m:] @ command, 0, 2)
 
@@ -210,7 +211,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def _controller_response(self) -> Responder:
-        """From y to the driven actuators; the first grid, that of all poles, is needed again."""
+        """Response from y to the driven actuators; its first grid, of all poles, is stored."""
         return remembered(commands(self.blocks, self.controller.inputs, self.driven))
 
     @cached_property
@@ -253,7 +254,7 @@ class ClosedLoop(Value):
 
     @property
     def decay(self) -> str:
-        """How fast it decays, in words: the spectral radius, or the abscissa in rad/s."""
+        """Text of the decay: the spectral radius, or the abscissa in rad/s."""
         if self.plant.dt:
             return f"spectral radius {self.spectral_radius:.9g}"
         return f"spectral abscissa {self.spectral_abscissa:.6g} rad/s"
@@ -270,13 +271,13 @@ class ClosedLoop(Value):
 
     @cached_property
     def completed(self) -> ClosedLoop | None:
-        """The same controller closed around the plant with the modes left out; None: not known."""
+        """The same controller around the plant with truncated modes; None if not known."""
         whole = self.plant.evaluation_plant
         return None if whole is None else self.around(whole)
 
     @cached_property
     def left_out(self) -> SpillOver | None:
-        """Stability and margin with the modes left out; None: not known."""
+        """Stability and margin with the truncated modes; None if these are not known."""
         whole = self.completed
         if whole is None:
             return None
@@ -297,40 +298,40 @@ class ClosedLoop(Value):
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
         loop's resonances; with scaled axes where actuators have several units, as
-        `LoopReport.scaled_margin`. An unstable loop has none: 0.
+        `LoopReport.scaled_margin`. It is 0 for an unstable loop.
         """
         return self.broken.margin()
 
     @cached_property
     def on_machines(self) -> MachineLoops:
-        """The same controller around the machines that the measurement allows.
+        """The same controller around machines that agree with the measurement.
 
         ModelError when none are known of the plant.
         """
         known = self.plant.machine.machines
         if known is None:
             raise ModelError(
-                "nothing is known of other machines. Make the plant of fit.calibrated(measured) "
+                "other machines are not known. Make the plant from fit.calibrated(measured) "
                 "with evaluation=, or of plant.uncertain(machines)."
             )
         return MachineLoops(self, known)
 
     def interval(self, figure: str, level: float = LEVEL) -> FigureInterval:
-        """Return where a figure of the loop lies on a share of the machines measured as this one.
+        """Return the interval of a figure of the loop over machines with the same measurement.
 
         Parameters
         ----------
         figure : str
-            "modulus margin", "bandwidth" (the least of |S| < 1 of all axes with a reference, Hz),
-            "spectral radius", or a signal whose `rms` is meant.
+            "modulus margin", "bandwidth" (the smallest of |S| < 1 of all axes with a reference,
+            Hz), "spectral radius", or a signal for its `rms`.
         level : float
-            Share of the machines, between 0 and 1.
+            Fraction of the machines, between 0 and 1.
 
         Returns
         -------
         FigureInterval
-            ``(low, high, sentence)``; low and high are None where something is missing for an
-            interval, or the loop is unstable on a machine: the sentence says what.
+            ``(low, high, sentence)``; low and high are None if the interval does not exist or the
+            loop is unstable on a machine; the sentence gives the reason.
 
         Raises
         ------
@@ -341,7 +342,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:
-        """What modes hold to; None where these are not each its own, or the loop is unstable.
+        """Tolerances of modes; None for coupled modes or an unstable loop.
 
         Where frequencies are stated as uncertain with the modes left out, where they are known;
         `interval` says what happens when all is off at once. Frequencies are followed to 1 %, or to
@@ -354,32 +355,32 @@ class ClosedLoop(Value):
         return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
 
     def mode_tolerances(self, *, margin: float = MARGIN, known: Any = None) -> ModeTolerances:
-        """Return by how much each mode's frequency and damping may be off before the loop fails.
+        """Return the tolerance of the loop to errors of frequency and damping of each mode.
 
-        One mode at a time, the others as they are, exactly: the change at which a pole crosses the
-        stability boundary, and that at which the modulus margin falls to a stated one. A model of
-        a structure is seldom within 0.2 % where it was not measured; a loop with a gain above 1 at
-        a mode of 0.1 % damping may tolerate less.
+        One mode changes at a time, exactly: the result is the change at which a pole crosses the
+        stability boundary, and that at which the modulus margin falls to a stated value. A model of
+        a structure is seldom accurate to 0.2 % for unmeasured modes, while a loop with a gain above
+        1 at a mode of 0.1 % damping may tolerate less.
 
         Parameters
         ----------
         margin : float
-            Modulus margin, broken at u, that shall be kept.
+            Required modulus margin, broken at u.
         known : UncertainPlant, float, (m,) array or {mode: float}, optional
-            By what share each elastic mode's frequency may be off; what the plant says itself when
-            not given.
+            Relative uncertainty of the frequency of each elastic mode; by default that of the
+            plant.
 
         Raises
         ------
         AssumptionError, ModelError
-            When the loop is unstable as it is; when the plant's modes are coupled by damping, it
-            was not assembled from a structure, a sensor sees accelerations, or a number is out of
+            When the loop is unstable; when the plant's modes are coupled by damping, the plant was
+            not assembled from a structure, a sensor measures accelerations, or a number is out of
             range.
 
         Warns
         -----
         FlexplantWarning
-            When a mode holds to less than twice what is known of it.
+            When the tolerance of a mode is less than twice its uncertainty.
         """
         known = self.plant.uncertainty if known is None else known
         found = mode_tolerances(self.plant, self.broken, margin=margin, known=known)
@@ -389,10 +390,10 @@ class ClosedLoop(Value):
     def rms(self, channel: str) -> float:
         """Return the stationary rms of a signal under all white noises, in closed form.
 
-        Of a sampled loop at the sample instants: disturbances act with their exact covariance over
-        a sample, so nothing that folds back from above half the rate is missing; a sensor's noise
-        has the variance ``asd^2 rate / 2`` of a sample. Modes left out of the plant are not in it:
-        `completed.rms(channel)` is the rms with them, where they are known.
+        For a sampled loop it holds at the sample instants: disturbances act with their exact
+        covariance over a sample, which includes aliasing from above half the rate; the noise of a
+        sensor has the variance ``asd^2 rate / 2`` per sample. Truncated modes are not included:
+        `completed.rms(channel)` is the rms with them, if they are known.
 
         Parameters
         ----------
@@ -414,28 +415,28 @@ class ClosedLoop(Value):
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a signal under all white noises.
 
-        Of a sampled loop it is that of the samples, up to half the rate: all that disturbances
-        excite above folds back into it, so that its integral is the variance ``rms(channel)^2``.
+        For a sampled loop it is that of the samples, up to half the rate: motion above half the
+        rate is included by aliasing, so that its integral is the variance ``rms(channel)^2``.
 
         Parameters
         ----------
         channel : as for `rms`
         freq : (n_freq,) array [Hz], optional
-            Not above half the rate, else ModelError; through all resonances when not given.
+            Frequencies up to half the rate, else ModelError; by default through all resonances.
         """
         row, noises = self._noises(channel)
         grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)
         return Spectrum(grid, densities(self.monitored, row, noises)(grid).sum(axis=0))
 
     def budget(self, channel: str, *, residue: Any = None, start: float = 0.0) -> ErrorBudget:
-        """Return where the rms of a signal comes from: each source with its variance and stairs.
+        """Return the error budget of a signal: variance and cumulative spectrum of each source.
 
         Parameters
         ----------
         channel : as for `rms`
         residue : Response, mapping {channel: samples} or (n_time,) array, optional
             A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``:
-            what is left of the set-point is a source of its own, with its mean square.
+            the remaining error of the set-point is a separate source, with its mean square.
         start : float [s]
             Samples of the residue before this time are left out.
 
@@ -447,7 +448,7 @@ class ClosedLoop(Value):
         Raises
         ------
         LabelError, AssumptionError, ModelError, CertificateError
-            As for `rms`; or when the residue does not go with the loop, or the integral of the
+            As for `rms`; or when the residue does not match the loop, or the integral of the
             spectrum gives another variance.
         """
         row, noises = self._noises(channel)
@@ -460,7 +461,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def _white(self) -> list[Source]:
-        """The white noises, each by itself."""
+        """The separate white noises."""
         return sources(self.plant, self.monitored)
 
     def _noises(self, channel: str) -> tuple[int, list[Source]]:
@@ -479,33 +480,34 @@ def close_loop(
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
     applied command of an actuator (plant.u), or an output of another block. An output of a block
     that has an actuator's name drives it, and several such outputs add; every other output is
-    monitored. A block may also read what is known in advance: the derivatives of a reference
-    (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`, `die:ref:snap`), which `simulate`
-    takes from the SetPoint, and forces (`u1:feedforward`), which it is given as a reference.
+    monitored. A block may also read signals that are known in advance: the derivatives of a
+    reference (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`, `die:ref:snap`), which
+    `simulate` takes from the SetPoint, and forces (`u1:feedforward`), which are given as
+    references.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
-        The plant; the loop is checked on its evaluation model too (`ClosedLoop.left_out`). For an
-        uncertain one it is the nominal plant, and the repr says what its modes hold to
-        (`ClosedLoop.tolerances`). A system whose channels are named like those of an assembled
-        plant (see `StandardPlant.from_statespace`) is one.
+        Plant; the loop is also checked on its evaluation model (`ClosedLoop.left_out`). For an
+        uncertain plant the nominal one is used, and the repr shows the tolerances of its modes
+        (`ClosedLoop.tolerances`). A system with channels named like those of an assembled plant
+        (see `StandardPlant.from_statespace`) is accepted too.
     *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
-        The controller in any number of parts. Sampled at the plant's rate, or static gains.
+        Parts of the controller, in any number, sampled at the plant's rate, or static gains.
     idle : iterable of str
-        Actuators that stay without a drive on purpose.
+        Actuators that are not driven on purpose.
 
     Returns
     -------
     ClosedLoop
-        Its repr says whether it is stable, with spectral radius and modulus margin.
+        Closed loop; its repr states stability, spectral radius and modulus margin.
 
     Warns
     -----
     FlexplantWarning
-        When the closed loop is unstable, or is with the modes that the plant left out, or a mode of
-        an uncertain plant holds to less than twice what is known of it; it is returned all the
-        same. Marginal poles (a rigid-body mode that nothing holds) are named by its repr alone.
+        When the closed loop is unstable, or is unstable with the truncated modes, or the tolerance
+        of a mode of an uncertain plant is less than twice its uncertainty; the loop is returned
+        anyway. Marginal poles (a free rigid-body mode) are only named in its repr.
 
     Raises
     ------
@@ -514,8 +516,8 @@ def close_loop(
         connected to nothing, an actuator is driven by nothing (and not idle), or a name other than
         an actuator's is driven twice.
     ModelError
-        When there is no block, a block is no system or stands twice, sampling times differ, or the
-        algebraic loop is ill-posed.
+        When no block is given, a block is not a system or appears twice, sampling times differ, or
+        the algebraic loop is ill-posed.
 
     Examples
     --------
@@ -547,15 +549,16 @@ def close_loop(
     found = loop.left_out
     if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):
         warn(
-            f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, and it "
-            "has no margin, bandwidth or norm. Check the sign (u = K y), lower the bandwidth, or "
+            f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, so "
+            "that margin, bandwidth and norms do not exist. Check the sign (u = K y), lower the "
+            "bandwidth, or "
             "notch the mode at that frequency."
         )
     elif loop.is_stable and found is not None and not found.is_stable:
         warn(
-            f"the loop is stable on its plant, but with the modes left out it is {found.summary}. "
-            "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
-            "controller roll off (or notch) before them."
+            "the loop is stable on its plant, but with the modes left out it is "
+            f"{found.summary}. The machine has these modes: lower the bandwidth, keep them in "
+            "the plant, or let the controller roll off (or notch) below them."
         )
     if plant.uncertainty is not None and loop.tolerances is not None:
         loop.tolerances.warn_of_critical()

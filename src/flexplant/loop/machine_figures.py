@@ -1,4 +1,4 @@
-"""Figures of a loop on the machines that the measurement allows, and their intervals."""
+"""Figures of a loop on machines that agree with the measurement, and their intervals."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ..plant.machine_plants import LEVEL, FigureInterval, PlantMachines, interva
 from ..words import one_of
 from .broken import axis_sensitivities
 
-#: what a loop's print has an interval of
+#: figures that have an interval in the repr of a loop
 MARGIN, BANDWIDTH, RADIUS = FIGURES = ("modulus margin", "bandwidth", "spectral radius")
 
 
 class MachineLoops:
-    """One controller around every machine that the measurement allows; each figure found once."""
+    """One controller around machines that agree with the measurement; figures are cached."""
 
     def __init__(self, loop: Any, machines: PlantMachines) -> None:
         self.machines = machines
@@ -28,7 +28,7 @@ class MachineLoops:
 
     @property
     def unstable(self) -> int:
-        """On how many machines the loop is not stable."""
+        """Number of machines on which the loop is not stable."""
         return sum(not loop.is_stable for loop in self.loops)
 
     def values(self, figure: str) -> FloatArray:
@@ -41,8 +41,8 @@ class MachineLoops:
 def first_crossing(
     freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
 ) -> float:
-    """Return where a size first rises to 1 from below [Hz], infinite where it stays below."""
-    # between two points where it can be found there
+    """Return the frequency [Hz] at which a size first rises to 1, infinite if it stays below."""
+    # by interpolation between two points where possible
     beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
     if not beyond.size:
         return float("inf")
@@ -54,7 +54,7 @@ def first_crossing(
 
 
 def crossing(loop: Any, reference: str, error: str, curve: tuple[FloatArray, FloatArray]) -> float:
-    """Return where |S| first crosses 1 from below [Hz]; 0 where it is nowhere below."""
+    """Return the frequency [Hz] at which |S| first crosses 1 from below; 0 if never below."""
     gain = loop.gain(reference, error)
     below = np.any(curve[1] < 1.0)
     return first_crossing(*curve, lambda freq: np.abs(gain(freq)[0, 0])) if below else 0.0
@@ -101,7 +101,7 @@ def loop_interval(loop: Any, figure: str, level: float) -> FigureInterval:
 
 
 def interval_line(loop: Any) -> str:
-    """Return the line of a loop's print: intervals of all figures, or what is missing for them."""
+    """Return the line of a loop's repr: intervals of all figures, or the reason without them."""
     known = loop.plant.machine.machines
     if known is None:
         return ""

@@ -1,4 +1,4 @@
-"""A measured plant in a loop: in decoupled axes, as samples show it, and the Nyquist count."""
+"""A measured plant in a loop: decoupled axes, effect of sampling, and the Nyquist count."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..tolerances import TINY
 from ..words import flag, instance
 from .broken import BrokenLoop
 
-#: degrees of freedom above which a variance is taken as it is
+#: degrees of freedom above which a variance is not averaged
 _FREEDOM = 20.0
 
 
@@ -34,32 +34,33 @@ def in_axes(
 
     ``after G before``; where a rate is given, times the delay of a sampled controller and its
     zero-order hold, ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. Lines above half
-    the rate are seen at lower frequencies: ``sum_k (G H)(f + k rate)``, as far as they go.
+    the rate appear at lower frequencies: ``sum_k (G H)(f + k rate)``, as far as they exist.
 
     Parameters
     ----------
     frf : Frf
-        Measured, from actuators to sensors.
+        Measured response from actuators to sensors.
     before, after : StateSpace or array, optional
-        Static transformations: of a `decouple` the `accelerations` (or `to_actuators`) and
-        `to_motions`. Names of a StateSpace pick the channels of the Frf.
+        Static transformations: `accelerations` (or `to_actuators`) and `to_motions` of a
+        `decouple`. Names of a StateSpace select the channels of the Frf.
     rate : float [Hz], optional
-        Of the controller; the result ends below half of it.
+        Rate of the controller; the result ends below half of it.
     delay : float
-        Samples between a measurement and its command, of which the Frf shows nothing.
+        Delay between a measurement and its command, which the Frf does not contain.
     hold : bool
-        False for an Frf that was measured from sample to sample: it has the hold in it.
+        Whether to add the hold; False for an Frf that was measured between samples and contains it.
 
     Returns
     -------
     Frf
-        With the variance of the measurement, where variance or coherence is known: see
-        `line_variance`; without its other statistics.
+        Response with the variance of the measurement, where variance or coherence is known (see
+        `line_variance`), without other statistics.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When frf is none, a transformation is not static or does not fit, or a number is wrong.
+        When frf is not an Frf, a transformation is not static or does not match, or a number is
+        wrong.
 
     Examples
     --------
@@ -101,11 +102,11 @@ def in_axes(
 
 
 def line_variance(frf: Frf) -> FloatArray | None:
-    """Return E|error|^2 of the entries of a measured Frf, None where nothing says how large it is.
+    """Return E|error|^2 of the entries of a measured Frf, None if not known.
 
-    Its variance; of few runs, which differ by chance, the mean over neighbouring lines. Else by
-    coherence, ``|G|^2 (1 - c) / (c n)`` (Bendat and Piersol, Random Data, 4th ed., 9.1), n the
-    averages, `freedom` + 1; 2 where that is not known, the fewest that have a coherence.
+    It is the variance, or for few runs its mean over neighbouring lines. Otherwise it follows from
+    the coherence, ``|G|^2 (1 - c) / (c n)`` (Bendat and Piersol, Random Data, 4th ed., 9.1), with
+    the number of averages n = `freedom` + 1, or 2 if not known.
     """
     if frf.variance is not None:
         few = 0 if frf.freedom is None else int(np.ceil(_FREEDOM / frf.freedom))
@@ -113,13 +114,13 @@ def line_variance(frf: Frf) -> FloatArray | None:
     if frf.coherence is None:
         return None
     averages = 2.0 if frf.freedom is None else frf.freedom + 1.0
-    # lower ones are zero: such lines count for nothing
+    # lower ones are zero: such lines have no weight
     sure = np.maximum(frf.coherence, 1e-6)
     return np.asarray(np.abs(frf.data) ** 2 * (1.0 - np.minimum(sure, 1.0)) / (sure * averages))
 
 
 def _near_mean(values: FloatArray, reach: int) -> FloatArray:
-    """Return the mean over so many lines to either side."""
+    """Return the mean over a number of lines to either side."""
     if not reach or values.shape[-1] <= 2 * reach:
         return values
     total = np.cumsum(values, axis=-1, dtype=np.float64)
@@ -155,7 +156,7 @@ def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: fl
 def _sampled_response(
     lines: FloatArray, data: ComplexArray, freq: FloatArray, rate: float, late: float, held: bool
 ) -> ComplexArray:
-    """Return a measured plant as its samples show it, with delay and aliases (held=True)."""
+    """Return the response of a sampled measured plant, with delay and aliases (held=True)."""
     if not held:
         turned = np.exp(-2j * np.pi * freq * late / rate)
         return np.asarray(data[:, :, : freq.size] * turned)
@@ -171,7 +172,7 @@ def _sampled_response(
 
 
 def _alias_frequencies(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray]:
-    """Return the frequencies, negative ones too, that a sampler shows at some frequencies."""
+    """Return the frequencies, including negative ones, that alias to some frequencies."""
     reach = int(np.ceil(lines[-1] / rate))
     return [freq + k * rate for k in range(-reach, reach + 1)]
 
@@ -195,13 +196,14 @@ def static_map(given: System | FloatArray | None, names: Sequence[str], side: st
     return T
 
 
-#: how far the phase of det(I - L) may be from where its ends have to be
+#: largest deviation of the phase of det(I - L) at its ends
 _END = 0.25 * np.pi
-#: what the slope of |det(I - L)| at the lowest lines may differ from the number of integrators
+#: largest difference of the slope of |det(I - L)| at the lowest lines from the number of
+#: integrators
 _SLOPE = 0.75
-#: how far, beside the lowest line, a measured plant is continued to lower frequencies
+#: range below the lowest line, relative to it, to which a measured plant is extrapolated
 _BELOW = 1e-3
-#: a pole of the controller this near to zero frequency, relative to its fastest, integrates
+#: size of a pole of the controller, relative to its fastest pole, below which it is an integrator
 _INTEGRATES = 1e-9
 
 
@@ -224,7 +226,7 @@ def nyquist_count(
     at_zero: int,
     unstable: int,
 ) -> NyquistCount:
-    """Return the unstable poles of ``u = K P u``, counted on the lines and what lies between them.
+    """Return the unstable poles of ``u = K P u``, counted on the lines and between them.
 
     From 0+ to the highest frequency the argument of ``F = det(I - K P)`` changes by
     ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
@@ -239,7 +241,7 @@ def nyquist_count(
     steps = np.concatenate([below, hidden.step])
     for open_, what in (
         (hidden.unknown, "the phase turns too far for its path to be known"),
-        (hidden.undecided, "lies a mode that is unstable in the loop if it is a little narrower"),
+        (hidden.undecided, "may be a mode that is unstable in the loop if it is slightly narrower"),
     ):
         if open_.any():
             low, high = lines[int(np.argmax(open_)) :][:2]
@@ -252,9 +254,9 @@ def nyquist_count(
     if abs(grows - at_zero) > _SLOPE:
         return NyquistCount(
             None,
-            f"towards zero frequency det(I - L) grows with slope {grows:.2g}, where plant and "
-            f"controller were stated to integrate {at_zero} times: state the rigid-body modes that "
-            "these channels show",
+            f"towards zero frequency det(I - L) grows with slope {grows:.2g}, but plant and "
+            f"controller were stated to have {at_zero} integrators: state the rigid-body modes "
+            "of these channels",
         )
     last = float(np.angle(F[-1]))
     start = float(np.angle(F[0])) + 0.5 * np.pi * at_zero  # the argument of c: a multiple of pi
@@ -280,7 +282,7 @@ def nyquist_count(
 
 
 def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> NyquistCount:
-    """Return the unstable poles of a loop that is taken apart; numbers as for `report_loops`.
+    """Return the unstable poles of a broken loop; numbers as for `report_loops`.
 
     Without `rigid` it is the number of free motions that the lowest lines show.
     """
@@ -291,7 +293,8 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
     if grid.size < FEWEST:
         return NyquistCount(
-            None, f"{grid.size} lines show no stability, {FEWEST} are the fewest: measure more"
+            None,
+            f"{grid.size} lines are too few to judge stability, {FEWEST} are needed: measure more",
         )
     zero = np.abs(distance) <= _INTEGRATES * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
@@ -302,9 +305,9 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
     if abs(slope - (2 if rigid else 0)) > 1.0:
         return NyquistCount(
             None,
-            f"at the lowest lines, from {grid[0]:.4g} Hz, the plant falls with slope {slope:.2g}, "
-            f"but rigid={rigid} was stated: a free body falls with slope 2, a held one "
-            "does not. State rigid=, or measure at lower frequencies",
+            f"at the lowest lines, from {grid[0]:.4g} Hz, the plant has the slope {slope:.2g}, "
+            f"but rigid={rigid} was stated: a free body has slope 2, a held one slope 0. State "
+            "rigid=, or measure at lower frequencies",
         )
     return nyquist_count(
         grid, plant, parts.controller, parts.hidden,
@@ -316,8 +319,8 @@ def _continued(
     freq: FloatArray, plant: ComplexArray, controller: Responder, rigid: int
 ) -> tuple[FloatArray, ComplexArray]:
     """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines."""
-    # below the lines: the largest directions, those of the rigid-body modes, over f^2, the others
-    # level; the imaginary part (delay) falls by f more
+    # below the lines: the largest directions, those of the rigid-body modes, fall with f^2, the
+    # others are constant; the imaginary part (delay) falls with another factor f
     low = np.geomspace(_BELOW, 1.0, 150)[:-1]
     first = plant[:, :, 0]
     left, sizes, right = np.linalg.svd(first.real)

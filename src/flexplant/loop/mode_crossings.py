@@ -1,18 +1,19 @@
-r"""Where a pole of a loop crosses the stability boundary when one of its modes changes.
+r"""Changes of a single mode at which a pole of a loop crosses the stability boundary.
 
 With all of the plant's other modes closed, ``S = (I - K P)^-1`` and X_i the response from u to the
-two states of mode i, which are fed by ``F_i u`` (through other states too) and seen in y as
-``c_i e_i``, the changed mode is the nominal one and ``T_i(z, delta) Y_i``, what is fed to it more:
+two states of mode i, which are driven by ``F_i u`` (also through other states) and appear in y as
+``c_i e_i``, the changed mode is the nominal one plus ``T_i(z, delta) Y_i``, its additional input:
 
 .. math:: \det H_i = 0, \quad H_i = z I - A_i(\delta) - T_i(\delta) Y_i q_i e_i, \quad
     q_i = S K c_i
 
-has a pole at z, and ``S(delta) = S + q_i (I - g Y_i q_i)^-1 g Y_i S`` with ``g = e_i (z I -
-A_i(delta))^-1 T_i(delta)``. Everything is a row of numbers at each z: all modes at once.
+has a pole at z, and ``S(delta) = S + q_i (I - g Y_i q_i)^-1 g Y_i S`` with
+``g = e_i (z I - A_i(delta))^-1 T_i(delta)``. Everything is a row of numbers at each z, so that all
+modes are computed together.
 
-Filters and latencies of sensors are states R that modes drive: ``c_i(z) = C_i + C_R (z I -
-A_RR)^-1 A_Ri``. What the change alters in A_Ri within a sample, of order omega dt delta relative to
-it, is left out.
+Filters and latencies of sensors are states R that modes drive:
+``c_i(z) = C_i + C_R (z I - A_RR)^-1 A_Ri``. The effect of the change on A_Ri within a sample, of
+relative order omega dt delta, is neglected.
 """
 
 from __future__ import annotations
@@ -37,31 +38,31 @@ from .broken import BrokenLoop, inverted
 #: largest relative change of a frequency whose polynomials are exact
 LIMIT = 0.05
 #: relative changes at which the sampled plant is computed; between them its matrices are
-#: polynomials of degree 4, whose error is (omega dt)^5 LIMIT^5: rounding
+#: polynomials of degree 4 with an error of (omega dt)^5 LIMIT^5, which is rounding
 _NODES: Mapping[str, tuple[float, ...]] = {
     "freq": (-LIMIT, -0.5 * LIMIT, 0.5 * LIMIT, LIMIT),
     "damping": (-0.9, -0.45, 1.0, 2.0),
 }
-#: times the range looked for that the first step of Newton's method may lead out of it
+#: multiple of the search range that the first step of Newton's method may leave it
 _FIRST_STEP = 3.0
-#: points within an interval in which a pole crosses, and how often it is divided by them
+#: number of points within an interval in which a pole crosses, and number of divisions
 _WITHIN, _DIVISIONS = 6, 3
-#: of 1, at which |S| reaches the size looked for: a point further below it with the mode at both
-#: ends of its range, which the resonance does not pass, is not examined in between
+#: fraction of the wanted |S|: a point below it with the mode at both ends of its range, and without
+#: a resonance between, is not examined
 _NEAR = 0.25
-#: least relative change of a frequency that is of interest: poles are not measured better
+#: least relative change of a frequency that matters: poles are not measured more accurately
 _LEAST = 1e-6
-#: changes tried for a margin before the first that fails is halved in, and halvings
+#: number of changes tried for a margin, and number of bisections before the first that fails
 _TRIED, _HALVINGS = 16, 8
-#: points between the lines beside the highest one, where the top of a peak is
+#: number of points between the lines next to the highest one, for the maximum of a peak
 _WITHIN_PEAK = 9
 
 
 class ModeChanges(NamedTuple):
-    """Some modes of a sampled plant as polynomials in a relative change: coefficients first.
+    """Some modes of a sampled plant as polynomials in a relative change, coefficients first.
 
-    A (k, modes, 2, 2), and what is fed more to each mode, T (k, modes, 2, 2 + r), of no power zero,
-    by its two states and by r sums of other states and of the loop's u.
+    A (k, modes, 2, 2), and the additional input of each mode T (k, modes, 2, 2 + r), without power
+    zero, from its two states and from r sums of other states and of the loop's u.
     """
 
     A: FloatArray
@@ -77,9 +78,9 @@ class ModeChanges(NamedTuple):
 class ModeLoops:
     """A loop and the modes of its plant, at any frequencies.
 
-    `changes` of each kind, `own` states (modes, 2) of each mode, `fed` states that feed any,
-    `sums` (modes, r, states fed and u), `seen` c_i (modes, p, k) and e_i (modes, k, 2), `behind`
-    what y shows of the modes' states through other states, (p, 2 modes).
+    `changes` of each kind, `own` states (modes, 2) of each mode, `fed` states that feed any, `sums`
+    (modes, r, states fed and u), `seen` c_i (modes, p, k) and e_i (modes, k, 2), `behind` the
+    effect of the modes' states on y through other states, (p, 2 modes).
     """
 
     plant: AnyPlant
@@ -94,11 +95,11 @@ class ModeLoops:
 
     @classmethod
     def of(cls, plant: AnyPlant, broken: BrokenLoop, modes: IntArray) -> ModeLoops:
-        """Return a loop with modes (numbers from 1); all are changed at once, being uncoupled."""
+        """Return a loop with modes (numbers from 1), which are uncoupled and computed together."""
         if any(sensor.order == 2 for sensor in plant.assembled.ports.y if sensor.name in broken.y):
             raise ModelError(
-                "a sensor of y sees accelerations, in which frequency and damping of a mode "
-                "appear: its tolerance is not computed. Leave accelerometers out of y."
+                "a sensor of y measures accelerations, which contain frequency and damping of a "
+                "mode directly: tolerances are not computed. Leave accelerometers out of y."
             )
         g = plant.system
         n, columns = g.n_states, g.input_index(broken.u)
@@ -164,7 +165,7 @@ class SweptLoop(NamedTuple):
     shown: ComplexArray | None = None
 
     def swept_modes(self, at: IntArray, mode: IntArray) -> SweptModes:
-        """Return what a mode's equation is made of, for pairs of a point and a mode."""
+        """Return the terms of a mode's equation, for pairs of a point and a mode."""
         loops = self.loops
         m = self.S.shape[1]
         others = np.concatenate(
@@ -175,7 +176,7 @@ class SweptLoop(NamedTuple):
             axis=1,
         )
         c, e = loops.seen
-        # complex all of it: products of both kinds are slow
+        # all complex, since mixed products are slow
         q = self.SK[at] @ (c[mode].astype(complex) if self.shown is None else self.shown[at, mode])
         return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
 
@@ -195,8 +196,8 @@ class SweptModes(NamedTuple):
     def changes(self, kind: str, limits: FloatArray | float) -> ComplexArray:
         """Return the complex change (n,) at which there is a pole at each point, infinite far off.
 
-        By Newton's method from none: det H is a polynomial of twice the degree of H. The first
-        step is all that is done where it leads far beyond `limits` (n,).
+        Newton's method from zero: det H is a polynomial of twice the degree of H. Where the first
+        step leads far beyond `limits` (n,), it stops.
         """
         A, T = self.loops.changes[kind]
         Yqe = self.Yq @ self.e
@@ -279,7 +280,7 @@ class SizeBound(NamedTuple):
         return np.asarray(np.linalg.eigvals(product).real.max(axis=1))
 
     def highest(self, delta: FloatArray, count: int) -> FloatArray:
-        """Return the largest share (modes,) over the points of each mode."""
+        """Return the largest fraction (modes,) over the points of each mode."""
         found = np.full(count, -np.inf)
         np.maximum.at(found, self.modes.mode, self.share(delta))
         return found
@@ -325,7 +326,7 @@ def _determinant(H: ComplexArray) -> ComplexArray:
 
 
 def _least_root(H: ComplexArray) -> ComplexArray:
-    """Return the change (n,) nearest to none at which det H, of H (k, n, 2, 2) by powers, is 0."""
+    """Return the smallest change (n,) at which det H is 0, with H (k, n, 2, 2) by powers."""
     powers = np.arange(2 * len(H) - 1)
     det = np.zeros((powers.size, H.shape[1]), dtype=np.complex128)
     for i, a in enumerate(H):
@@ -340,7 +341,7 @@ def _least_root(H: ComplexArray) -> ComplexArray:
         delta = delta - moved
         if np.all(np.abs(moved) <= SETTLED * np.abs(delta)):
             break
-        # far away the polynomials say nothing: it is not followed there
+        # far away the polynomials are not valid, and the search stops
         delta = np.where(np.abs(delta) < 3.0, delta, 3.0 * delta / np.maximum(abs(delta), TINY))
     return delta
 
@@ -356,7 +357,7 @@ def _horner(polynomial: Any, at: Any) -> Any:
 def axis_crossings(
     swept: SweptLoop, modes: SweptModes, freq: FloatArray, kind: str, ends: FloatArray
 ) -> FloatArray:
-    """Return the real changes (modes, 2) next to none, down and up, at which a pole crosses."""
+    """Return the smallest real changes (modes, 2), down and up, at which a pole crosses."""
     # `freq` [Hz] of each pair, rising within a mode; `ends` (modes, 2) of the changes looked for
     found = np.tile([-np.inf, np.inf], (len(ends), 1))
     limits = np.abs(ends).max(axis=1)[modes.mode]

@@ -1,4 +1,4 @@
-"""A loop on other machines than its plant: modes off, modes left out, machines drawn at random."""
+"""A loop on other machines: modal errors, truncated modes, randomly drawn machines."""
 
 from __future__ import annotations
 
@@ -23,38 +23,40 @@ from ..tolerances import TINY
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
 
-#: a mode with less than this part of the one that takes part most is not named
+#: participation relative to the largest below which a mode is not named
 _TAKES_PART = 0.3
-#: |S| at u above which modes left out are warned of (8 dB), and how much larger than without them
+#: |S| at u with truncated modes above which a warning is given (8 dB), and ratio to |S| without
+#: them
 _HIGH, _LARGER = 2.5, 1.1
-#: so many modes are named in a message
+#: number of modes named in a message
 _NAMED = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SpillOver(Value):
-    """The check of a loop on the plant with the modes left out, sampled and delayed alike.
+    """The check of a loop on the plant with truncated modes, with the same sampling and delay.
 
     Parameters
     ----------
     stability : float
-        Spectral radius of the sampled closed loop there, below 1 when stable; of a continuous one
+        Spectral radius of the sampled closed loop there, below 1 when stable; for a continuous loop
         the largest real part [rad/s], below 0.
     sampled : bool
-        Which of both it is.
+        Whether the loop is sampled.
     modulus_margin : float
-        There, broken at u; 0 when unstable.
+        Modulus margin there, broken at u; 0 when unstable.
     without : float
         Modulus margin on the plant itself, without these modes; 0 when unstable there.
     peak_freq : float [Hz]
-        Where |S| at u is largest with them; NaN when unstable.
+        Frequency at which |S| at u is largest with these modes; NaN when unstable.
     states : int
-        Of the plant with the modes left out.
+        Number of states of the plant with the truncated modes.
     modes : sequence of int
-        Numbers (from 1, rigid-body modes included) of the modes of that plant which take part most
-        in what grows, or in the peak of |S| at u where this is `high`; empty otherwise.
+        Numbers (from 1, rigid-body modes included) of the modes of that plant with the largest
+        participation in the instability, or in the peak of |S| at u where this is `high`; empty
+        otherwise.
     freq : sequence of float [Hz]
-        Of that, one for each of these modes.
+        Frequencies of the instability or peak, one for each of these modes.
 
     Examples
     --------
@@ -80,17 +82,17 @@ class SpillOver(Value):
 
     @property
     def is_high(self) -> bool:
-        """Whether the loop is stable, but the modes left out bring |S| at u above 8 dB."""
+        """Whether the loop is stable, but truncated modes raise |S| at u above 8 dB."""
         return self.is_stable and high(self.modulus_margin, self.without)
 
     @property
     def is_fine(self) -> bool:
-        """Whether the modes left out change nothing that a design should be warned of."""
+        """Whether the truncated modes need no warning."""
         return self.is_stable and not self.is_high
 
     @property
     def spectral_radius(self) -> float:
-        """Largest magnitude of the closed loop's eigenvalues there; of a sampled loop.
+        """Largest magnitude of the closed loop's eigenvalues there, for a sampled loop.
 
         ModelError in continuous time, where `stability` is the largest real part.
         """
@@ -100,7 +102,7 @@ class SpillOver(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """What was verified on the plant with the modes left out."""
+        """Checks on the plant with the truncated modes."""
         beyond = " with modes left out"
         margin = Verified(f"modulus margin{beyond}", self.modulus_margin, "a sweep of |1 + L|")
         return Certificate((stability_check(self.stability, self.sampled, of=beyond), margin))
@@ -111,7 +113,7 @@ class SpillOver(Value):
 
     @property
     def named_modes(self) -> str:
-        """The modes that take part in what grows or peaks, in words."""
+        """Text of the modes that cause the instability or the peak."""
         return modes_in_words(self.modes, self.freq)
 
     def __repr__(self) -> str:
@@ -137,7 +139,7 @@ def _db(margin: float) -> str:
 
 
 def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
-    """Return modes in words, the first few of many."""
+    """Return a text of modes, the first few of many."""
     listed = [f"mode {n} (at {f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
     more = len(listed) - _NAMED
     first = ", ".join(listed[:_NAMED]) or "no mode named"
@@ -152,9 +154,10 @@ def high(margin: float, without: float) -> bool:
 def growing_modes(
     loop: StateSpace, states: Sequence[str], near: float | None = None
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Return the numbers of the modes that take part in what grows, and its frequencies [Hz]."""
-    # by participation factors |left_k right_k| [PerezArriaga1982]_, whatever the units of states
-    numbers = np.zeros(loop.n_states, dtype=np.int64)  # 0 of states of no mode
+    """Return the numbers of the modes that cause the instability, and its frequencies [Hz]."""
+    # by participation factors |left_k right_k| [PerezArriaga1982]_, independent of the units of
+    # states
+    numbers = np.zeros(loop.n_states, dtype=np.int64)  # 0 for states outside of modes
     for i, name in enumerate(states):
         if owner := re.fullmatch(r"mode(\d+):[qv]", name):
             numbers[i] = int(owner[1])
@@ -180,39 +183,40 @@ def growing_modes(
     return tuple(found), tuple(found.values())
 
 
-#: points of the grid around a mode to a half-width of its resonance, and how many at most aside
+#: number of grid points per half-width around a mode, and largest number on either side
 _TO_A_WIDTH, _ASIDE = 2, 400
-#: times the largest change about a mode where its resonance passes, with its skirts
+#: range of the grid around a mode relative to the largest change, including the flanks of the
+#: resonance
 _PASSED = 1.2
-#: range of relative changes of damping that is searched: without any, a mode that the loop does
-#: not see is marginal
+#: searched range of relative changes of damping: without damping, a mode that the loop does not
+#: affect is marginal
 _DAMPINGS = (-0.999, 2.0)
-#: the tolerance is to be so many times what is known of a mode
+#: required ratio of the tolerance of a mode to its uncertainty
 _SAFE = 2.0
-#: modulus margin to which tolerances are stated: |S| at u of 2.9, 9 dB
+#: modulus margin for which tolerances are stated: |S| at u of 2.9, 9 dB
 MARGIN = 0.35
 #: relative change of a frequency to which a report follows a mode: a model that was updated is
 #: seldom further off
 _FOLLOWED = 0.01
-#: times the change that is asked for, up to which one is looked for: a crossing lies within
+#: ratio of the search range to the requested change, so that a crossing lies inside
 BEYOND = 1.25
-#: rows of the table
+#: number of rows of the table
 _SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeTolerances(Value):
-    """The smallest change of each mode, the others as they are, at which a loop fails.
+    """The smallest change of each mode, with the others unchanged, at which a loop fails.
 
     Two columns: the change downwards (negative) and upwards; infinite where none is found up to
-    `limit`. A frequency changes by its stiffness, the damping force stays as it is.
+    `limit`. A frequency changes by its stiffness, with an unchanged damping force.
 
     Parameters
     ----------
     modes : (m,) array
         Numbers from 1, rigid-body modes included.
     freq : (m,) array [Hz]
-        Of the modes in the plant.
+        Frequencies of the modes in the plant.
     stable : (m, 2) array
         Relative changes of frequency at which the loop becomes unstable.
     within : (m, 2) array
@@ -220,7 +224,7 @@ class ModeTolerances(Value):
     damping : (m, 2) array
         Relative changes of damping at which it becomes unstable, from -1 to 2.
     margin : float
-        Of `within`, broken at u.
+        Modulus margin of `within`, broken at u.
     limit : (m,) array
         Largest relative change of frequency examined.
     known : (m,) array, optional
@@ -255,19 +259,21 @@ class ModeTolerances(Value):
 
     @property
     def critical(self) -> tuple[int, ...]:
-        """Modes that hold to less than twice what is known of them; empty when nothing is known."""
+        """Modes with a tolerance below twice their uncertainty; empty if this is not known."""
         if self.known is None:
             return ()
         return tuple(self.modes[self.least < _SAFE * self.known].tolist())
 
     @property
     def summary(self) -> str:
-        """The mode that may change least, in words."""
+        """Text of the mode with the smallest tolerance."""
         if not self.modes.size:
             return "no elastic mode"
         worst = int(np.argmin(self.least))
         if not np.isfinite(self.least[worst]):
-            return f"no frequency of a mode off by {100 * self.limit.min():.2g} % does harm"
+            return (
+                f"stays stable if any one modal frequency shifts by {100 * self.limit.min():.2g} %"
+            )
         to = f"a modulus margin of {self.margin:.3g}"
         side = int(np.argmin(np.abs(self.within[worst])))
         change = self.within[worst, side]
@@ -275,7 +281,8 @@ class ModeTolerances(Value):
             change = self.stable[worst, int(np.argmin(np.abs(self.stable[worst])))]
             to = "instability"
         return (
-            f"mode {self.modes[worst]} ({self.freq[worst]:.4g} Hz) off by {100 * change:+.2g} % "
+            f"mode {self.modes[worst]} ({self.freq[worst]:.4g} Hz) shifted by "
+            f"{100 * change:+.2g} % "
             f"leads to {to}"
         )
 
@@ -288,18 +295,18 @@ class ModeTolerances(Value):
             with np.errstate(divide="ignore"):
                 worst = int(np.argmin(self.least / known))
             name = f"mode {self.modes[worst]}"
-            if np.isfinite(self.least[worst]):  # else no change of a mode alone matters
+            if np.isfinite(self.least[worst]):  # else no change of a single mode matters
                 found[f"{name} holds to"] = float(self.least[worst])
                 if self.known is not None:
                     found[f"{name} known to"] = float(self.known[worst])
-        return Certificate.of(found, route="the loop closed on changed machines")
+        return Certificate.of(found, route="the loop closed around changed machines")
 
     def warn_of_critical(self) -> None:
-        """Warn of modes that hold to less than twice what is known of them."""
+        """Warn of modes with a tolerance below twice their uncertainty."""
         if self.known is None or not self.critical:
             return
         said = [
-            f"mode {mode} ({freq:.4g} Hz) holds to {100 * least:.2g} %, is known to "
+            f"mode {mode} ({freq:.4g} Hz) tolerates {100 * least:.2g} %, is known to "
             f"{100 * known:.2g} %"
             for mode, freq, least, known in zip(
                 self.modes, self.freq, self.least, self.known, strict=True
@@ -308,7 +315,7 @@ class ModeTolerances(Value):
         ]
         more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN else ""
         warn(
-            "the loop hangs on frequencies that are not known well enough: "
+            "the loop depends on frequencies that are not known accurately enough: "
             f"{'; '.join(said[:_SHOWN])}{more}. Measure these modes, or design for their "
             "uncertainty: design_stage(plant.uncertain(...))."
         )
@@ -345,11 +352,11 @@ def mode_tolerances(
     known: Any = None,
     limit: float | Mapping[int, float] = LIMIT,
 ) -> ModeTolerances:
-    """Return the smallest changes of each mode that harm a stable loop, up to `limit`."""
-    # a mapping names the modes that are examined, each with a limit of its own
-    # at each point of the stability boundary that a pole lies there is an equation for a complex
-    # change of one mode (`mode_crossings`); where its imaginary part changes its sign along the
-    # boundary, a pole crosses it at a real change. The sampled plant's matrices are exact
+    """Return the smallest changes of each mode at which a stable loop fails, up to `limit`."""
+    # a mapping names the examined modes, each with a separate limit at each point of the stability
+    # boundary, the condition that a pole lies there is an equation for a complex change of one mode
+    # (`mode_crossings`); where its imaginary part changes its sign along the boundary, a pole
+    # crosses it at a real change. The sampled plant's matrices are exact
     modal_realisation(standard_plant(plant))
     margin = positive(margin, "margin")
     if margin >= 1.0:
@@ -357,7 +364,7 @@ def mode_tolerances(
     modes, freq, zeta = _swinging_modes(plant)
     if broken.is_unstable:
         raise AssumptionError(
-            "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
+            "the loop is unstable, so that modes have no tolerance. Stabilise it first."
         )
     if isinstance(limit, Mapping):
         some = np.isin(modes, list(limit))
@@ -388,9 +395,9 @@ def mode_tolerances(
 
 
 def reported_tolerances(loop: Any) -> ModeTolerances | None:
-    """Return what the modes of a closed loop hold to, beside what its plant says of them."""
-    # with the modes left out, where these are known and frequencies are uncertain; of a sure plant
-    # without: its models are large, and what they add to the answer is little
+    """Return the tolerances of the modes of a closed loop, with the uncertainty of its plant."""
+    # with the truncated modes, if these are known and frequencies are uncertain; without them for a
+    # certain plant, since evaluation models are large and change the result little
     uncertain = loop.plant.uncertainty
     if uncertain is None:
         sure = loop.plant.has_own_modes and loop.is_stable and _swinging_modes(loop.plant)[0].size
@@ -410,12 +417,12 @@ def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
         )
     except ModelError as error:
         if known:
-            warn(f"what the modes of the loop hold to is not computed: {error}")
+            warn(f"the tolerances of modes are not computed: {error}")
         return None
 
 
 def _swinging_modes(plant: AnyPlant) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
+    """Return numbers, frequencies [Hz] and damping ratios of oscillating modes below Nyquist."""
     realisation = plant.assembled.realisation
     omega, zeta = natural(realisation.pairs)
     top = np.pi / plant.dt if plant.dt else np.inf
@@ -425,7 +432,7 @@ def _swinging_modes(plant: AnyPlant) -> tuple[IntArray, FloatArray, FloatArray]:
 
 
 def _around(freq: float, zeta: float, limit: float, grid: FloatArray, dt: float) -> FloatArray:
-    """Return frequencies [Hz] through the places that a mode may take, and about it."""
+    """Return frequencies [Hz] over the possible range of a mode, and around it."""
     count = int(np.ceil(limit * _TO_A_WIDTH / max(zeta, TINY)))
     count = min(max(count, 2 * _TO_A_WIDTH), _ASIDE)
     fine = freq * (1.0 + _PASSED * limit * np.linspace(-1.0, 1.0, 2 * count + 1))
@@ -434,7 +441,7 @@ def _around(freq: float, zeta: float, limit: float, grid: FloatArray, dt: float)
 
 
 def _uncertainties(given: Any, modes: IntArray) -> FloatArray | None:
-    """Return the relative uncertainty of each frequency, zero where nothing is said of it."""
+    """Return the relative uncertainty of each frequency, zero where it is not stated."""
     if given is None:
         return None
     if isinstance(given, UncertainPlant):

@@ -1,4 +1,4 @@
-"""Figures of loops: crossovers, margins, stability; of one by loops, of several side by side."""
+"""Figures of loops: crossovers, margins, stability; comparison of several loops."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .machine_figures import crossing
 from .measured_loop import broken_count
 from .sensitivity_functions import Loop, taken_apart
 
-#: a loop gain at the first or last line that counts as real
+#: relative imaginary part of a loop gain at the first or last line that counts as zero
 _REAL = 0.05
-#: slope of its size over frequency at the first line below which it is taken to be level
+#: slope of its size over frequency at the first line below which it counts as constant
 _LEVEL = 0.5
-#: divisions of the lines beside the largest |S|
+#: number of divisions of the lines next to the largest |S|
 _ROUNDS = 6
 
 
@@ -38,25 +38,25 @@ class LoopMargins(Value):
     name : str
         The channel where it is broken.
     crossovers : tuple of float [Hz]
-        Where the loop gain crosses 1; the bandwidth is the first, resonances may add more.
+        Frequencies at which the loop gain crosses 1; the first is the bandwidth, resonances may add
+        more.
     gain_margin, gain_reduction : float
         Factors on the gain, above and below 1, at which the loop reaches the critical point;
-        infinite and 0 where none does.
+        infinite and 0 if there is no such factor.
     phase_margin : float [deg]
-        The least at the crossovers, lead or lag; 180 without one. Of an unstable loop this and the
-        others are distances to the critical point, no margins.
+        Smallest phase margin at the crossovers, lead or lag; 180 without a crossover. For an
+        unstable loop this and the others are distances to the critical point, not margins.
     modulus_margin : float
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
-        Where it is.
+        Frequency of the modulus margin.
     gain_freq, phase_freq : float [Hz]
-        Where the nearer of both gain margins and the phase margin are; NaN where there are none.
+        Frequencies of the smaller gain margin and of the phase margin; NaN without them.
     phases : tuple of float [deg]
-        At each crossover, what reaches the critical point: a lag where positive, a lead where
+        Phase that reaches the critical point at each crossover: a lag where positive, a lead where
         negative.
     gains : tuple of (float [Hz], float)
-        Each frequency at which a factor on the gain alone reaches the critical point, and the
-        factor.
+        Frequencies at which a factor on the gain reaches the critical point, with the factors.
 
     Examples
     --------
@@ -102,29 +102,30 @@ class LoopMargins(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopReport(Value, Mapping[str, LoopMargins]):
-    """What `report_loops` found: `report["u1"]` is one loop.
+    """Result of `report_loops`: `report["u1"]` is one loop.
 
     Parameters
     ----------
     loops : tuple of LoopMargins
-        Of each channel where the loops are broken.
+        Margins of each channel where the loops are broken.
     modulus_margin : float
-        Of all together, ``1 / max sigma_max(S)`` with S where they are broken; 0 when unstable.
-        Where the channels have several `units` a singular value mixes them, and it is the scaled
-        margin.
+        Modulus margin of all loops together, ``1 / max sigma_max(S)`` with S where they are broken;
+        0 when unstable. Where the channels have several `units`, which a singular value would mix,
+        it is the scaled margin.
     unstable : int, optional
-        Poles of the closed loop outside the stability region; None where that is not known.
+        Number of poles of the closed loop outside the stability region; None if not known.
     reason : str
-        Why it is not known.
+        Reason why it is not known.
     narrowest, near : float [Hz]
-        Of a measured plant: it is stable if it has no mode of a half-power width below it that its
-        lines do not show, and where that mode would be. 0 where the lines show all, and of a model.
+        For a measured plant: the loop is stable if the plant has no hidden mode with a half-power
+        width below `narrowest`; `near` is the frequency of such a mode. 0 where the lines show all
+        modes, and for a model.
     scaled_margin : float
-        Of all together, ``1 / max min_D sigma_max(D S D^-1)``: each frequency with its axes scaled
-        for the least size (the upper bound of mu, an uncertainty for each axis), to 2 %. No unit
-        changes it.
+        Modulus margin of all loops together with scaled axes, ``1 / max min_D sigma_max(D S D^-1)``
+        (from the upper bound of mu with an uncertainty for each axis), to 2 %. It does not depend
+        on units.
     units : tuple of str
-        Of the channels, where they have several.
+        Units of the channels, if they differ.
     """
 
     loops: tuple[LoopMargins, ...]
@@ -140,13 +141,13 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     def is_stable(self) -> bool | None:
         """Whether the closed loop is stable; None where it cannot be judged.
 
-        Of a measured plant, if it has no hidden mode narrower than `narrowest`.
+        For a measured plant, if it has no hidden mode narrower than `narrowest`.
         """
         return None if self.unstable is None else self.unstable == 0
 
     @property
     def poles(self) -> str:
-        """The number of unstable poles, in words."""
+        """Text of the number of unstable poles."""
         return counted(self.unstable or 0, "pole")
 
     def __getitem__(self, name: str) -> LoopMargins:
@@ -190,8 +191,8 @@ def report_loops(
     Each loop is broken while the others stay closed: ``L_i = 1 - 1 / S_ii`` with
     ``S = (I - L)^-1``. Stability of a model follows from the poles; that of a measured plant from
     the Nyquist count, with the poles at zero and outside the stability region that are stated for
-    the plant and known of the controller. Modes between the lines are followed as far as the lines
-    show them; what they do not show is said, "stable if no mode is narrower than 0.02 Hz", or
+    the plant and known of the controller. Modes between the lines are included as far as the lines
+    show them; otherwise the result is conditional, "stable if no mode is narrower than 0.02 Hz", or
     stability is not judged.
 
     Parameters
@@ -201,10 +202,10 @@ def report_loops(
     at : {"u", "y"}
         Where the loops are broken.
     rigid : int
-        Of a measured plant: its rigid-body modes (two poles at zero each); those on springs too
-        when the suspension lies below the lines.
+        Number of rigid-body modes of a measured plant (two poles at zero each), including those on
+        springs when the suspension frequency lies below the lines.
     unstable : int
-        Of a measured plant: poles outside the stability region (negative stiffness).
+        Number of poles of a measured plant outside the stability region (negative stiffness).
 
     Returns
     -------
@@ -213,8 +214,8 @@ def report_loops(
     Raises
     ------
     LabelError, ModelError
-        When channels of plant and controller do not match; when `loop` is of another type, or a
-        number of poles is none.
+        When channels of plant and controller do not match; when `loop` has another type, or a
+        number of poles is not valid.
 
     Examples
     --------
@@ -298,7 +299,7 @@ def _gain_crossings(
 ) -> tuple[tuple[float, float], ...]:
     """Return frequencies [Hz] at which L is real and positive, and the factors that make it 1."""
     # L is real where the imaginary part changes sign; positive: towards the critical point. At an
-    # undamped pole or zero it changes sign through infinity or zero, where L turns round
+    # undamped pole or zero it changes sign through infinity or zero, where L reverses
     turns = crossings(lambda f: find(f).imag, freq, L.imag)
     before, after = (find(np.clip(turns * by, freq[0], freq[-1])) for by in (1 - SPLIT, 1 + SPLIT))
     turns = turns[(before * after.conj()).real > 0]
@@ -317,13 +318,13 @@ def _gain_crossings(
     return tuple(sorted(found))
 
 
-#: share of the bandwidth at which low-frequency suppression is compared
+#: fraction of the bandwidth at which low-frequency suppression is compared
 LOW = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class LoopFigures(Value):
-    """What one closed loop reaches; S is the response from the reference to the error at the POI.
+    """Figures of one closed loop; S is the response from the reference to the error at the POI.
 
     Parameters
     ----------
@@ -332,13 +333,13 @@ class LoopFigures(Value):
     decay : float
         The spectral radius of a sampled loop, the spectral abscissa [rad/s] of a continuous one.
     bandwidth : float [Hz]
-        Where |S| first crosses 1 from below; NaN without a reference or when unstable.
+        Frequency at which |S| first crosses 1 from below; NaN without a reference or when unstable.
     peak, peak_freq : float [1], [Hz]
-        The largest |S| and where it is.
+        The largest |S| and its frequency.
     low : float [1]
         |S| at `low_freq`.
     low_freq : float [Hz]
-        The same for all loops of a comparison.
+        Frequency of `low`, equal for all loops of a comparison.
     margin : float
         Modulus margin, broken at u: ``1 / max_f sigma_max(S_u)``; 0 when unstable.
 
@@ -369,13 +370,13 @@ class LoopComparison(Value):
     Parameters
     ----------
     rows : mapping {name: LoopFigures}
-        One for each loop.
+        Figures of each loop.
     channel : str
-        What S is: ``die:ref to die:error``; empty when the loops have no reference.
+        Channels of S: ``die:ref to die:error``; empty when the loops have no reference.
     sampled : bool
         Whether `decay` of the rows is a spectral radius.
     unjudged : sequence of str
-        The loops whose plants have no evaluation model.
+        Loops whose plants have no evaluation model.
     """
 
     rows: Mapping[str, LoopFigures]
@@ -409,12 +410,12 @@ def compare_loops(
     Parameters
     ----------
     loops : mapping {name: ClosedLoop}
-        What to compare: designs on one machine, or one design on a model and the machine. Each is
-        judged on the evaluation model of its plant, where it has one.
+        Loops to compare: designs on one machine, or one design on a model and the machine. Each is
+        judged on the evaluation model of its plant, if it has one.
     reference : str, optional
-        The channel of w that S starts from, where there are several; `axis_sensitivities` has all.
+        Channel of w for S, if there are several; `axis_sensitivities` has all.
     error : str, optional
-        The channel of z that S ends at; that of the reference when not given.
+        Channel of z for S; by default that of the reference.
 
     Returns
     -------
@@ -424,7 +425,7 @@ def compare_loops(
     Raises
     ------
     ModelError
-        When there is no mapping of closed loops, or some are sampled and some continuous.
+        When `loops` is not a mapping of closed loops, or some are sampled and some continuous.
     LabelError
         When a loop lacks the channels, or has several references and none is named.
 

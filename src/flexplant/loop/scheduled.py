@@ -1,4 +1,4 @@
-"""A controller that follows the position of its machine: designs by position, linear between."""
+"""A position-dependent controller: designs at several positions, interpolated linearly."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class ScheduledLoop(Value):
     position : str
         The scheduling variable.
     places : (k,) array [m or rad]
-        Its values, increasing.
+        Values of the variable, increasing.
     loops : sequence of k ClosedLoop
-        The loop at each.
+        Loop at each place.
 
     Raises
     ------
@@ -63,8 +63,8 @@ class ScheduledLoop(Value):
             if own.n_states != first.n_states:
                 raise ModelError(
                     f"the controller at {x:g} has {counted(own.n_states, 'state')}, that at "
-                    f"{places[0]:g} {first.n_states}: nothing lies between them. Design all alike, "
-                    "with the same notches."
+                    f"{places[0]:g} {first.n_states}: they cannot be interpolated. Use the same "
+                    "design for all, with the same notches."
                 )
         self._set(loops=loops, places=places)
 
@@ -81,12 +81,12 @@ class ScheduledLoop(Value):
 
     @property
     def plant(self) -> AnyPlant:
-        """The plant, where it stands."""
+        """The plant at its present position."""
         return self.loops[0].plant
 
     @cached_property
     def standing(self) -> ClosedLoop:
-        """The loop where its plant stands."""
+        """The loop at the present position of its plant."""
         return self.at(self.plant.assembled.ports.values[self.position])
 
     @cached_property
@@ -103,9 +103,9 @@ class ScheduledLoop(Value):
         return tuple((1.0 - share) * part[i] + share * part[i + 1] for part in self.stacked)
 
     def at(self, x: float) -> ClosedLoop:
-        """Return the loop of the machine that stands at a position."""
+        """Return the loop of the machine at rest at a position."""
         loop = self.loops[0]
-        # the references that its blocks know derivatives of are read there too
+        # references with derivatives in its blocks are read there too
         plant = with_known(loop.plant.at(None, **{self.position: x}), loop.blocks)
         own = loop.controller
         A, B, C, D = self.matrices(float(x))
@@ -138,24 +138,24 @@ def schedule_loops(
     plant : StandardPlant
         With positions (`Ports(positions=[...])`).
     design : callable
-        Of the plant at a position, to the block or blocks that run there: a Kalman filter, a servo
-        and a feedforward, say. All must have the same channels and states: fix what a design would
-        choose by itself, such as notches.
+        Function from the plant at a position to the blocks that run there, such as a Kalman filter,
+        a servo and a feedforward. All must have the same channels and states: fix choices that a
+        design makes automatically, such as notches.
     position : str, optional
-        The scheduling variable; the only one when not given.
+        The scheduling variable; by default the only position.
     places : (k,) array [m or rad]
-        Where designs are made, two or more.
+        Positions of the designs, two or more.
 
     Returns
     -------
     ScheduledLoop
-        For `simulate(..., moving=)` and `rms_along`.
+        Loop for `simulate(..., moving=)` and `rms_along`.
 
     Raises
     ------
     AssumptionError
-        When the machine that stands half way between two places is not stable with the controller
-        between the two designs.
+        When the machine at rest half way between two places is not stable with the interpolated
+        controller.
     LabelError
         When the position is unknown, or not named among several; when channels differ.
     ModelError

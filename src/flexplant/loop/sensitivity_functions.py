@@ -33,7 +33,8 @@ from .closed import ClosedLoop
 from .machine_figures import first_crossing
 from .measured_loop import broken_count
 
-#: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
+#: types of loops: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a
+#: controller; a loop gain
 Loop: TypeAlias = "ClosedLoop | tuple[Any, Any] | StateSpace | Frf"
 
 
@@ -43,13 +44,13 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     Parameters
     ----------
     loop : ClosedLoop, (plant, controller), or StateSpace or Frf
-        The plant a StandardPlant, a StateSpace or a measured Frf (with the delay that the loop
-        will have), those of python-control too; the controller y -> u with the sign of the
-        feedback in it, or a ClosedLoop, whose controller is then closed on this plant. A system
-        or an Frf alone is a loop gain closed by negative feedback, ``S = (I + L)^-1``.
+        The plant is a StandardPlant, a StateSpace (also of python-control) or a measured Frf with
+        the delay of the loop. The controller is y -> u and contains the sign of the feedback, or it
+        is a ClosedLoop, whose controller is then used with this plant. A single system or Frf is a
+        loop gain with negative feedback, ``S = (I + L)^-1``.
     freq : (n_freq,) array, optional [Hz]
-        A grid refined at resonances when not given; for a measured plant its lines above 0 Hz (at
-        0 Hz free bodies and integrators are infinite).
+        Frequencies; by default a grid refined at resonances, or the lines of a measured plant above
+        0 Hz (at 0 Hz free bodies and integrators are infinite).
     at : {"u", "y"}
         Where the loop is broken.
 
@@ -81,7 +82,7 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
 def sensitivity(
     loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u"
 ) -> Frf:
-    """Return the sensitivity S = (I - L)^-1: what feedback leaves of a disturbance at u or y.
+    """Return the sensitivity S = (I - L)^-1 of the loop to a disturbance at u or y.
 
     Parameters
     ----------
@@ -200,7 +201,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
         raise unknown_label("actuator", controller.outputs[0], plant.inputs, "the plant")
     controller = controller.select(driven)
     plant = plant.select(controller.inputs, driven)
-    # the peaks of S are at the poles of the closed loop, not at those of its parts
+    # the peaks of S lie at the poles of the closed loop, not at those of its parts
     return _modelled(plant, controller, lambda: loop_poles(plant, controller))
 
 
@@ -246,7 +247,7 @@ def _law_system(law: Any) -> StateSpace:
         return law.controller.select(law.driven, law.fed_back)
     if isinstance(law, Frf) or hasattr(law, "frdata"):
         raise ModelError(
-            "the controller is a frequency response, whose stability and own poles are not known. "
+            "the controller is a frequency response, whose stability and poles are not known. "
             "Pass its StateSpace; a measured plant may be an Frf."
         )
     law = getattr(law, "system", law)
@@ -254,7 +255,7 @@ def _law_system(law: Any) -> StateSpace:
 
 
 def _quantities(law: Any) -> dict[str, str]:
-    """Return what the sensors measure that a controller was designed for, where that is known."""
+    """Return the quantities of the sensors of a controller, if these are known."""
     plant = getattr(law, "plant", None)
     ports = plant.ports.y if isinstance(plant, AnyPlant) else ()
     return {port.name: port.quantity for port in ports if isinstance(port, SensorPort)}
@@ -266,7 +267,7 @@ def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str
             error = unknown_label("measured output", name, plant.outputs, "the Frf")
             raise LabelError(
                 f"{error} Select what was measured: controller.select(inputs=[...]); references "
-                "are no part of the loop."
+                "do not belong to the loop."
             )
         wanted = quantities.get(name, plant.quantity)
         if plant.quantity is not None and wanted != plant.quantity:
@@ -282,7 +283,9 @@ def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str
     lines, P = np.array(plant.freq), plant.select(controller.inputs, driven).data
     lines, P = lines[lines > 0], P[:, :, lines > 0]
     if not lines.size:
-        raise ModelError("the Frf has no line above 0 Hz, which a loop needs: measure more lines.")
+        raise ModelError(
+            "the Frf has no line above 0 Hz, but a loop needs one: measure more lines."
+        )
     return BrokenLoop(
         tuple(driven), tuple(controller.inputs),
         lambda freq: frequency_response(controller, freq).data,
@@ -324,22 +327,23 @@ def modulus_margin(loop: Loop) -> float:
     ----------
     loop : ClosedLoop, or (plant, controller)
         As for `loop_gain`. Stability is judged first. A model has poles. For a measured plant
-        unstable poles are counted as by `report_loops`, with a free motion for each direction that
-        falls with slope 2 at its lowest lines and no unstable pole of the plant; the peak is that
-        over its lines and through the modes that these show between them. Where the actuators have
-        several units (N and N m) it is the margin with scaled axes, `LoopReport.scaled_margin`.
+        unstable poles are counted as by `report_loops`, with a free motion for each direction with
+        slope 2 at its lowest lines and without unstable poles of the plant; the peak includes its
+        lines and the visible modes between them. Where the actuators have several units (N and N m)
+        it is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------
     float
-        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5. An unstable loop has no
-        margin: 0, with a FlexplantWarning that says so.
+        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5. For an unstable loop the
+        result is 0, with a FlexplantWarning.
 
     Raises
     ------
     AssumptionError
-        When the lines of a measured plant do not show whether the loop is stable: the distance to
-        the critical point is then no margin. `report_loops` takes what is known of the plant.
+        When the lines of a measured plant do not show whether the loop is stable, so that the
+        distance to the critical point is not a margin. `report_loops` accepts further knowledge of
+        the plant.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
 
@@ -404,21 +408,22 @@ def bandwidth(loop: Loop) -> float:
 
 
 def broken_bandwidth(parts: BrokenLoop) -> float:
-    """Return the bandwidth of a loop that is taken apart."""
+    """Return the bandwidth of a broken loop."""
     if parts.is_unstable:
         raise AssumptionError(
-            "the closed loop is not stable, so |S| is the size of no response of it and gives no "
-            "bandwidth. Stabilise it first: see loop.spectral_radius and loop.modulus_margin."
+            "the closed loop is not stable, so that |S| has no meaning and no bandwidth. "
+            "Stabilise it first: see loop.spectral_radius and loop.modulus_margin."
         )
     grid = parts.grid
     vectors, gains, _ = np.linalg.svd(parts.gain(grid[:1])[0])
-    # axes without an actuator: their gain is rounding of the others
+    # axes without an actuator have a gain of rounding size
     acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
     values = _sensitivity_along(acting, parts, grid)
     if not np.any(values < 1.0):
         raise AssumptionError(
-            f"|S| is nowhere below 0 dB (least {values.min():.4g}): this feedback suppresses "
-            "nothing, so it has no bandwidth. Check the sign of the controller, u = K y."
+            f"|S| is nowhere below 0 dB (least {values.min():.4g}): this feedback does not "
+            "suppress errors, so that it has no bandwidth. Check the sign of the controller, u "
+            "= K y."
         )
     find = None if parts.measured is not None else partial(_sensitivity_along, acting, parts)
     return first_crossing(grid, values, find)

@@ -1,11 +1,11 @@
-"""All pictures: functions that take values and `ax=`, and return the axes they drew on.
+"""All pictures: functions that draw values on `ax=` or new axes, and return the axes.
 
 - `bode`, `frf`, `singular_values`, `nyquist`, `sensitivity`: responses and loops.
 - `response`, `exposures`, `budget`, `spectra`: runs and errors by source.
 - `update`, `parameters`, `residual`, `stabilisation`, `identified`: measurements and updates.
 - `layout`, `mode_shape`, `sensor_map`, `placed`: the machine and its devices.
-- `report(path, ...)`: a whole design as one HTML file, with pictures to zoom, modes that move,
-  certificates, seeds and versions.
+- `report(path, ...)`: a whole design as one HTML file, with zoomable pictures, moving mode shapes,
+certificates, seeds and versions.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -16,7 +16,7 @@
 >>> axes.get_xlabel()
 'frequency [Hz]'
 
-**Legend.** Labels that name a thing give it the look of `STYLES`; other lines follow `CYCLE`.
+**Legend.** The labels below select a style of `STYLES`; other lines follow `CYCLE`.
 
 | drawn | label | look |
 |---|---|---|
@@ -28,10 +28,11 @@
 | bounds | "bound" | red dots |
 | differences | | purple |
 
-Seen from above, sensors are black crosses, actuators triangles, POIs circles. Axes carry SI units
-with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g); what is drawn into them
-later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is. Of more than four lines that
-would hide each other each has a panel; more than six in one are named at their ends.
+Seen from above, sensors are black crosses, actuators triangles, POIs circles. Axes have SI units
+with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g); later lines on the same
+axes keep it. Frequencies are in Hz, gains in dB with the unit of 0 dB. More than four lines that
+would hide each other get one panel each; more than six lines in one panel are labelled at their
+ends.
 
 Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB: `bode`,
 `singular_values`, `nyquist`, `pole_map`, `root_locus`, `step`.

@@ -1,4 +1,4 @@
-"""What all pictures share: axes, units, legends that cover nothing, and responses to draw."""
+"""Common functions of all pictures: axes, units, legends, and responses to draw."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..lti.statespace import as_statespace
 from ..tolerances import TINY
 from ..words import in_unit
 
-#: points along a line, of which none shall lie under a legend
+#: number of points along a line that a legend must not cover
 _DENSE = 500
 #: of ten, of the sizes that prefixes are for
 _POWERS = range(-36, 19)
@@ -50,7 +50,7 @@ def axes(ax: Axes | None, **figure: Any) -> Axes:
     return drawn
 
 
-#: lines of one axes that can be told apart where they lie on each other, and by their look
+#: largest number of lines on one axes that overlap, and that styles distinguish
 TOGETHER, _LEGEND = 4, 6
 
 
@@ -58,7 +58,7 @@ def panel_axes(
     ax: Axes | None, count: int, *, columns: int | None = None, **options: Any
 ) -> list[Axes]:
     """Return the given axes, or `count` new ones with the same abscissa."""
-    # few are one above the other; more than fit there are small multiples in two columns
+    # few panels are one above the other; more are small multiples in two columns
     if ax is not None:
         return [ax] * count
     wide = columns or (1 if count <= TOGETHER else 2)
@@ -81,7 +81,7 @@ def three_axes(
     if ax is None:
         return list(plt.subplots(rows, columns, layout="constrained", **options)[1].ravel())
     if np.size(np.asarray(ax, dtype=object)) != 3:
-        raise ModelError("ax= takes three axes. Leave it out for a new figure.")
+        raise ModelError("ax= needs three axes. Leave it out for a new figure.")
     return ax
 
 
@@ -101,13 +101,13 @@ def bottom_only(panels: Sequence[Axes]) -> None:
 
 
 def quantity_of(unit: str | None) -> str:
-    """Return what a unit measures; "signal" where that is not known."""
+    """Return the quantity of a unit; "signal" if not known."""
     return _QUANTITY.get(unit or "", "signal")
 
 
 def shown_in(axis: Axis, size: float, unit: str | None) -> tuple[float, str]:
     """Return the factor and the unit in which an axis shows values up to a size."""
-    # an axis that has a label with a unit keeps it, so that what is drawn later lies right
+    # an axis with a unit in its label keeps it, so that later lines use the same scale
     label = re.search(r"\[(.+)\]$", axis.get_label_text())
     if label is None:
         return in_unit(size, unit)
@@ -116,7 +116,7 @@ def shown_in(axis: Axis, size: float, unit: str | None) -> tuple[float, str]:
             return prefixed
     raise ModelError(
         f"one axes holds one unit: it shows {axis.get_label_text()!r}, and this is in "
-        f"{unit or 'no known unit'}. Draw it on axes of its own."
+        f"{unit or 'no known unit'}. Draw it on separate axes."
     )
 
 
@@ -162,9 +162,9 @@ def legend_below(ax: Axes) -> None:
 def legend(ax: Axes, *, given: bool) -> None:
     """Draw the legend where it covers nothing: next to new axes, in a given one's emptiest corner.
 
-    Beside is empty whatever part of the lines is shown later. Where no corner is empty, the
-    ordinate of a given one reaches further up. More lines than a legend tells apart are named at
-    their ends.
+    The space next to the axes stays empty for any limits. Where no corner is empty, the ordinate of
+    given axes is extended. If there are too many lines for a legend, they are labelled at their
+    ends.
     """
     handles = ax.get_legend_handles_labels()[0]
     if not handles:
@@ -193,7 +193,7 @@ def legend(ax: Axes, *, given: bool) -> None:
 
 
 def _name_ends(ax: Axes) -> None:
-    """Name each line at its right end, names in the order of the ends and none upon another."""
+    """Label each line at its right end, in the order of the ends and without overlap."""
     to_axes = ax.transAxes.inverted()
     found, labels = ax.get_legend_handles_labels()
     handles = [one for one in found if isinstance(one, Line2D)]
@@ -207,7 +207,7 @@ def _name_ends(ax: Axes) -> None:
     order = np.argsort(np.nan_to_num(height, nan=0.0), kind="stable")
     step = 1.25 * 10.0 / max(ax.get_window_extent().height * 72.0 / ax.figure.dpi, 1.0)
     place = np.clip(np.nan_to_num(height[order]), 0.0, 1.0)
-    for _ in range(4 * len(place)):  # neighbours that are too near move apart, both alike
+    for _ in range(4 * len(place)):  # neighbours that are too close move apart by equal amounts
         near = np.maximum(step - np.diff(place), 0.0)
         place[1:] += 0.5 * near
         place[:-1] -= 0.5 * near
@@ -221,7 +221,7 @@ def _name_ends(ax: Axes) -> None:
 
 
 def _raise_top(ax: Axes, top: float) -> None:
-    """Show more above: what is now at `top`, in units of the axes, is then its upper end."""
+    """Extend the axes upwards: the present `top`, in units of the axes, becomes the upper end."""
     scale = ax.yaxis.get_transform()
     low, high = scale.transform(np.array(ax.get_ylim()))
     further = scale.inverted().transform(np.array([low + max(top, 1.0) * (high - low)]))
@@ -230,7 +230,7 @@ def _raise_top(ax: Axes, top: float) -> None:
 
 def _drawn_points(ax: Axes) -> FloatArray:
     """Return points (k, 2) along all lines and at the edges of areas, in units of the axes."""
-    _ = ax.get_xlim(), ax.get_ylim()  # which brings the limits up to date, as transforms do not
+    _ = ax.get_xlim(), ax.get_ylim()  # updates the limits, which transforms do not
     to_axes = ax.transData + ax.transAxes.inverted()
     parts = [_resample_line(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
     for area in ax.collections:
@@ -248,7 +248,7 @@ def _resample_line(points: FloatArray) -> FloatArray:
 
 
 class _Decades(LogFormatter):
-    """Numbers of a logarithmic axis as they are read: 20 30 50 100; in powers they overlap."""
+    """Plain numbers on a logarithmic axis, 20 30 50 100, since powers overlap."""
 
     def __call__(self, x: float, pos: Any = None) -> str:
         """Return the label of a tick, or nothing where there are too many."""
@@ -279,7 +279,7 @@ Style = dict[str, Any]
 #: width of a line [points]
 _WIDTH = 1.4
 
-#: what is drawn in every picture, and how. What lies below others is wide
+#: styles of the roles in every picture. Lines below others are wide
 STYLES: Mapping[str, Style] = {
     "measured": {"color": BLACK, "linestyle": "-", "linewidth": 0.9, "zorder": 1.8},
     "truth": {"color": GREEN, "linestyle": "-", "linewidth": 4.0, "alpha": 0.35, "zorder": 1.5},
@@ -289,7 +289,7 @@ STYLES: Mapping[str, Style] = {
     "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": _WIDTH},
     "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": _WIDTH},
 }
-#: other words for the same things
+#: other labels for the same roles
 _WORDS = {
     "measurement": "measured",
     "drawing": "nominal", "before": "nominal", "initial": "nominal",
@@ -306,13 +306,13 @@ CYCLE: Sequence[Style] = (
     {"color": PURPLE, "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": _WIDTH},
     {"color": SKY, "linestyle": ":", "linewidth": _WIDTH},
 )
-#: where ports are, in views of a structure
+#: markers of ports in views of a structure
 PORTS: Mapping[str, Style] = {
     "sensors": {"marker": "P", "color": BLACK, "markeredgecolor": "white", "markersize": 11},
     "actuators": {"marker": "^", "color": RED, "markeredgecolor": "white", "markersize": 11},
     "POI": {"marker": "o", "color": RED, "fillstyle": "none", "markersize": 12},
 }
-#: how far an arrow of a direction reaches, of the size of a view from above
+#: length of an arrow of a direction, relative to the size of a view from above
 _ARROW = 0.07
 
 
@@ -346,7 +346,7 @@ def mark_devices(
     ax: Axes, factor: float, kinds: Mapping[str, Sequence[Device]], *, various: bool | None = None
 ) -> None:
     """Mark and name devices by kind in a view from above, in x and y with arrows."""
-    # directions that no arrow shows stand next to the names where they are various
+    # directions without an arrow are written next to the names if they differ
     various = differ(kinds) if various is None else various
     extent = np.ptp(ax.dataLim.get_points(), axis=0).max() or 1.0
     names: dict[tuple[float, ...], list[str]] = {}
@@ -382,30 +382,30 @@ def mark_devices(
         shown.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
-#: a measurement drawn with models over frequency: points, none of which hides a line
+#: style of a measurement drawn with models over frequency: points behind the lines
 POINTS: Style = {
     "color": BLACK, "linestyle": "none", "marker": ".", "markersize": 3.0, "zorder": 1.8,
 }  # fmt: skip
 
 
 def role_of(label: str) -> str | None:
-    """Return which of `STYLES` a label names, or None: "drawing" is "nominal"."""
+    """Return the style of `STYLES` that a label names, or None: "drawing" is "nominal"."""
     word = label.lower()
     role = _WORDS.get(word, word)
     return role if role in STYLES else None
 
 
 def apart(ax: Axes | None, labels: Iterable[str]) -> bool:
-    """Return whether lines need separate panels: many that name no role of `STYLES`."""
+    """Return whether lines need separate panels: many lines without a role of `STYLES`."""
     return ax is None and sum(role_of(label) is None for label in labels) > TOGETHER
 
 
 def styles(
     labels: Iterable[str], colors: Mapping[str, str] | None = None, *, taken: int = 0
 ) -> list[Style]:
-    """Return the styles of lines by their labels; those that name nothing follow the cycle."""
-    # this number of lines is there already. More than the cycle holds are solid, in other colours;
-    # what is named keeps its colour for itself, where the cycle has enough others
+    """Return the styles of lines by their labels; those without a role follow the cycle."""
+    # this number of lines exists already. Lines beyond the cycle are solid, in other colours; the
+    # colours of roles are not used for other lines, if the cycle has enough others
     found, others = [], taken
     labels = list(labels)
     used = {STYLES[role]["color"] for role in map(role_of, labels) if role}
@@ -426,9 +426,9 @@ def styles(
     return found
 
 
-#: of a magnitude below the largest one that is drawn, nothing can be read: zeros at half the rate
+#: range below the largest magnitude that is drawn; zeros at half the rate would extend it
 _DEPTH = 160.0
-#: share of the decades that may lie below the axis, and by how much it reaches below the others
+#: fraction of the decades that may lie below the axis, and margin below the others
 _SHARE, _MORE = 0.03, 15.0
 
 
@@ -442,7 +442,7 @@ class Curve(NamedTuple):
 
 def labelled(found: Any) -> dict[str, Any]:
     """Return what to draw by label: of a mapping, a list of systems (numbered from 1), or one."""
-    numbers = (int, float, list, tuple)  # of a static gain
+    numbers = (int, float, list, tuple)  # types of a static gain
     if isinstance(found, list | tuple) and not any(isinstance(one, numbers) for one in found):
         found = {f"system {k}": one for k, one in enumerate(found, 1)}
     return by_label(found)
@@ -453,7 +453,7 @@ def by_label(found: Any, one: type = Frf) -> dict[str, Any]:
     several = isinstance(found, Mapping) and not isinstance(found, one)
     named = {str(label): part for label, part in found.items()} if several else {"": found}
     if not named:
-        raise ModelError("there is nothing to draw: the mapping or list is empty.")
+        raise ModelError("the mapping or list is empty: give at least one value to draw.")
     return named
 
 
@@ -495,18 +495,18 @@ def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
         ) from error
 
 
-#: channels for which a grid of panels can still be read
+#: largest number of channels in a readable grid of panels
 _MOST = 36
 
 
 def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float) -> Any:
     """Return the axes of channels, one below the other, one for each height."""
-    # they are those given for one channel, or new ones
+    # given axes for one channel, or new ones
     channels, each = rows * columns, len(ratios)
     if not channels:
         raise ModelError(
-            f"{rows} outputs and {columns} inputs are no channel to draw. Choose some: outputs=, "
-            "inputs=; all without."
+            f"{rows} outputs and {columns} inputs give no channel to draw. Choose some with "
+            "outputs=, inputs=, or leave both out for all."
         )
     given = np.ravel(np.asarray(ax, dtype=object))
     if ax is not None and (given.size != each or channels != 1):
@@ -538,7 +538,7 @@ def singular(response: Frf) -> FloatArray:
 
 
 def readable(ax: Axes) -> None:
-    """End a decibel axis where magnitudes can be read: zeros at half the rate would draw it down.
+    """Limit a decibel axis to readable magnitudes: zeros at half the rate would extend it.
 
     Over a small share of the decades, lines may lie below the axis.
     """
@@ -567,7 +567,7 @@ def _depth(line: FloatArray) -> float:
 
 
 def gain_label(output: str, input: str, unit: str | None) -> str:
-    """Return the label of a decibel axis, with what 0 dB is."""
+    """Return the label of a decibel axis, with the unit of 0 dB."""
     return f"|{output} / {input}| [dB, 0 dB = {reference_of(unit)}]"
 
 
@@ -578,11 +578,11 @@ def shared_unit(response: Frf) -> str | None:
 
 
 def shared_reference(response: Frf) -> str:
-    """Return what 0 dB is for all gains together: of unlike units, 1 in SI units."""
+    """Return the unit of 0 dB for all gains together: 1 in SI units if units differ."""
     alike = len({response.unit(*channel) for channel in response}) == 1
     return reference_of(shared_unit(response)) if alike else "1 in SI units"
 
 
 def reference_of(unit: str | None) -> str:
-    """Return what 0 dB is: one of the unit of a gain."""
+    """Return the text of 0 dB: one of the unit of a gain."""
     return "1" if unit in (None, "1") else f"1 {unit}"

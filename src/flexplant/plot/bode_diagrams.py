@@ -51,25 +51,25 @@ def bode(
     Parameters
     ----------
     systems : StateSpace, Frf, or mapping {label: one of these} or list of them
-        What to draw; several share their axes. Systems of python-control and SciPy too.
+        Systems to draw, also of python-control and SciPy; several share their axes.
     outputs, inputs : str or sequence of str, optional
-        Channels of the first one; all when not given. Others are drawn by the same names.
+        Channels of the first system; all by default. Others use the same names.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     wrap : bool
-        Whether phases are drawn within half a turn of 0.
+        Whether phases are drawn between -180 and 180 degrees.
     ax : pair of Axes, optional
-        For magnitude and phase, where one channel is drawn.
+        Axes of magnitude and phase, for a single channel.
 
     Returns
     -------
     Axes
-        The magnitude of the first channel; `.figure.axes` are all, row by row.
+        Axes of the magnitude of the first channel; `.figure.axes` are all, row by row.
 
     Raises
     ------
     ModelError
-        When there is nothing to draw, or more channels than can be read.
+        When nothing is given to draw, or there are too many channels.
 
     Examples
     --------
@@ -141,8 +141,8 @@ def singular_values(
 
     The largest one is the gain of the worst direction of the inputs at each frequency; its peak is
     the H-infinity norm of a stable system. Channels should have one unit, or be weighted. Singular
-    values that are zero at all frequencies are left out: a controller of fewer motions than
-    channels has such.
+    values that are zero at all frequencies are left out, as for a controller of fewer motions than
+    channels.
 
     Parameters
     ----------
@@ -193,8 +193,8 @@ def frf(
 ) -> Axes:
     """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
 
-    Measurements are black points under the lines. The first of lines whose labels name nothing is
-    thick, so that those that cover it do not hide it.
+    Measurements are black points under the lines. The first line without a role in the legend is
+    thick, so that others do not hide it.
 
     Parameters
     ----------
@@ -204,19 +204,19 @@ def frf(
     colors : mapping {label: color}, optional
         Colours of some lines.
     unit : str, optional
-        Unit of the gain, where the responses have none; 0 dB is one of it.
+        Unit of the gain (of 0 dB), if the responses have none.
     reference : str, optional
         A label: the differences of the other responses from this one are drawn as well, where
         they share its frequencies.
     band : (low, high) [Hz], optional
-        The frequencies to draw; all when not given.
+        Frequency range to draw; all by default.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     also : sequence of str, optional
         "phase" [deg, within half a turn of 0] and "coherence", each in a panel below;
         "deviation", the standard deviation of measurements, as a line below them.
     ax : Axes, optional
-        Where to draw, without phase and coherence.
+        Axes for the magnitude, without phase and coherence.
 
     Returns
     -------
@@ -228,8 +228,8 @@ def frf(
     LabelError
         When the reference or channel is unknown, or `also` names something else.
     ModelError
-        When a mapping is not given, the responses are of different units, nothing of one is in
-        the band, or none has the coherence or variance that is asked for.
+        When a mapping is not given, the responses are of different units, one has no line in the
+        band, or none has the requested coherence or variance.
 
     Examples
     --------
@@ -249,8 +249,8 @@ def frf(
     known = {own for own in found.values() if own is not None}
     if len(known) > 1:
         raise ModelError(
-            f"{output} / {input} is in different units, which share no axis: {found}. Convert one "
-            "(frf.converted), or draw them apart."
+            f"{output} / {input} is in different units, which cannot share an axis: {found}. "
+            "Convert one (frf.converted), or draw them separately."
         )
     if reference is not None and reference not in found:
         raise unknown_label("response", reference, found)
@@ -258,7 +258,7 @@ def frf(
     require_known("part of the picture", more, _ALSO)
     below = [part for part in _ALSO if part in more and part != "deviation"]
     if ax is not None and below:
-        raise ModelError(f"{' and '.join(below)} take panels of their own: leave ax out.")
+        raise ModelError(f"{' and '.join(below)} need separate panels: leave ax out.")
     given, panels = ax is not None, _magnitude_axes(ax, len(below))
     ax = panels[0]
     plain = role_of(drawn[0].label) is None and "marker" not in drawn[0].line
@@ -277,7 +277,7 @@ def frf(
             look = dict(STYLES["difference"])
             if len(drawn) > 2:
                 look["color"] = curve.line["color"]
-            text = f"{curve.label} less {reference}"
+            text = f"{curve.label} minus {reference}"
             ax.semilogx(curve.response.freq, decibel(error), label=text, **look)
     _require_measured(drawn, more)
     readable(ax)

@@ -1,4 +1,4 @@
-"""Pictures of errors: their budgets, and their course over exposures and over a wafer."""
+"""Pictures of errors: budgets, errors during exposures, and maps over a wafer."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from ._axes import (
 )
 from .run_pictures import shade, time_axis
 
-#: of the areas, which differ without colour too
+#: hatching of the areas, which then differ without colour too
 _HATCHES = ("", "//", "", "\\\\", "", "..")
 _BESIDE: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
 
 
 def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes:
-    """Draw the cumulative spectra of an error budget as stairs, one source upon the other.
+    """Draw the cumulative spectra of an error budget, stacked by source.
 
-    Each area is the variance that a source has below a frequency; they end at the shares of the
+    Each area is the variance of a source below a frequency; the areas end at the variances of the
     budget, the top at the square of the rms.
 
     Parameters
@@ -48,7 +48,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     found : ErrorBudget
         From `ClosedLoop.budget`.
     most : int
-        Sources that are drawn separately, the largest first; the others are one area.
+        Number of sources that are drawn separately, the largest first; the others form one area.
     ax : Axes, optional
 
     Raises
@@ -71,7 +71,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     order = [int(i) for i in np.argsort(-found.variances, kind="stable")]
     shown, rest = order[: max(most, 1)], order[max(most, 1) :]
     factor, unit = in_unit(found.rms, found.unit)
-    # from where a thousandth of the variance has come
+    # starts where a thousandth of the variance is reached
     low = found.cumulative.sum(axis=0) < 1e-3 * found.variances.sum()
     inside = np.isfinite(found.freq) & (found.freq > 0) & ~low
     freq, stairs = found.freq[inside], found.cumulative[:, inside] / factor**2
@@ -126,7 +126,7 @@ def spectra(
     Raises
     ------
     ModelError
-        When there is nothing that has a spectrum, or no channel is named.
+        When nothing has a spectrum, or no channel is named.
 
     Examples
     --------
@@ -178,20 +178,20 @@ def exposures(
 ) -> Axes:
     """Draw an error with its moving average (MA) and moving standard deviation (MSD).
 
-    The windows in which the figures of `exposure_errors` are taken are shaded; those figures are
-    in the legend. The picture begins shortly before the first. Of several runs the first is drawn,
-    and the figures are of all.
+    The windows of `exposure_errors` are shaded, and its figures are in the legend. The picture
+    begins shortly before the first window. The first of several runs is drawn, but the figures hold
+    for all runs.
 
     Parameters
     ----------
     run : Response
         From `simulate`.
     channel : str, optional
-        The first error of a POI when not given.
+        Channel of the error; by default the first error of a POI.
     window : float [s]
-        The time for which one point is exposed.
+        Exposure time of one point.
     start : float [s]
-        Without `exposures`: all after this time is exposed.
+        Time after which everything is exposed, without `exposures`.
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPointProfile.exposures`.
     ax : Axes, optional

@@ -1,4 +1,4 @@
-"""Pictures of estimates: what a design predicts, and what a machine has."""
+"""Pictures of estimates: predictions of a design, and errors on a machine."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def predictions(
     unit: str = "m",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw predicted errors next to those that were found, one line for each design.
+    """Draw predicted errors next to measured ones, one line for each design.
 
     Parameters
     ----------
     rows : sequence of EstimatorComparison, or mapping {design: (k, 4) array}
-        Comparisons of the same estimators in k cases; or for each design and case the predicted
-        rms error, the one found, and the ends of its confidence interval.
+        Comparisons of the same estimators in k cases; or for each design and case the predicted rms
+        error, the measured one, and the ends of its confidence interval.
     colors : mapping {design: color}, optional
         Colours of the diamonds.
     cases : sequence of str, optional
@@ -60,7 +60,7 @@ def predictions(
     Returns
     -------
     Axes
-        Logarithmic; a diamond is a prediction, a black bar what was found.
+        Logarithmic axes; a diamond is a prediction, a black bar a measured interval.
 
     Raises
     ------
@@ -259,12 +259,12 @@ def consistency(
     level: float = 0.95,
     ax: Sequence[Axes] | None = None,
 ) -> Axes:
-    """Draw three tests of whether the innovations of a filter are those of its model.
+    """Draw three tests of the innovations of a filter against its model.
 
     The normalised innovation squared (NIS) over time, 1 when the noises have the stated size; its
-    correlation over lags, 0 when the model leaves nothing; and the cumulative periodogram less a
-    straight line, which leaves 0 for white innovations. A right model stays between the dotted
-    bounds at the level: everywhere in the third, for that share of the points in the others.
+    correlation over lags, 0 for a correct model; and the cumulative periodogram minus a straight
+    line, 0 for white innovations. A correct model stays between the dotted bounds at the level:
+    everywhere in the third test, for that fraction of the points in the others.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def _periodogram(ax: Axes, white: FloatArray, rate: float, level: float) -> None
     freq = found.freq * rate / factor
     ax.plot(freq, total - line, color=BLUE)
     _level_bounds(ax, bound)
-    finish(ax, x=named("frequency", unit), y="cumulative periodogram less a straight line [-]")
+    finish(ax, x=named("frequency", unit), y="cumulative periodogram minus a straight line [-]")
 
 
 def _level_bounds(ax: Axes, bound: float) -> None:

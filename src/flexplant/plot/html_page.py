@@ -67,7 +67,7 @@ def page(title: str, subtitle: str, sections: Sequence[Chapter]) -> str:
 """
 
 
-#: what the page may load: only what is in it
+#: content policy: the page loads only its own content
 _ALLOWED = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
@@ -101,7 +101,7 @@ def _aligned(cell: str) -> str:
 
 
 def note(text: str, kind: str = "note") -> str:
-    """Return a paragraph: of kind `note`, or `bad` for what must not be overlooked."""
+    """Return a paragraph of kind `note`, or `bad` for important warnings."""
     return f'<p class="{kind}">{escape(text)}</p>'
 
 
@@ -119,7 +119,8 @@ def tiles(found: Iterable[tuple[str, str, str, str]]) -> str:
     )
 
 
-#: characters of an SVG above which a picture of many points goes in as pixels, [dots per inch]
+#: number of characters of an SVG above which a picture is stored as pixels, and resolution [dots
+#: per inch]
 _LARGEST, _DPI = 1_200_000, 170
 
 
@@ -154,12 +155,12 @@ class Gallery:
 
 #: width [inch] at which text of 10 points can be read in a column of 30 rem, or on 500 pixels
 _COLUMN = 5.6
-#: height that a label next to the axes takes, with a legend below them
+#: height of a label next to the axes, with a legend below them
 _LOWEST = 4.2
 
 
 def _fit_page(figure: Figure) -> None:
-    """Make a wide figure as narrow as a column, its legends below: its text grows as it is fit."""
+    """Make a wide figure as narrow as a column, with its legends below and larger text."""
     width, height = figure.get_size_inches()
     if width <= _COLUMN:
         return
@@ -263,7 +264,7 @@ def _axis_scale(axis: Any, limits: tuple[float, float]) -> list[Any] | None:
     return [low, high, kind == "log", label]
 
 
-#: nodes and modes that are drawn at most
+#: largest number of nodes and modes that are drawn
 _NODES, _MODES = 1200, 24
 #: neighbours of a node among which its lines are searched
 _NEIGHBOURS = 27
@@ -331,7 +332,7 @@ def _translations(modes: Modes) -> tuple[FloatArray, FloatArray]:
 
 
 def _thinned(xyz: FloatArray) -> IntArray:
-    """Return about as many nodes as can be drawn, one for each cell of a grid."""
+    """Return about the largest number of nodes that can be drawn, one per grid cell."""
     cells = 4 * _NODES
     chosen: IntArray = np.arange(len(xyz))
     while chosen.size > _NODES:
@@ -346,7 +347,7 @@ def _thinned(xyz: FloatArray) -> IntArray:
 
 
 def neighbours(xyz: FloatArray) -> IntArray:
-    """Return the pairs (m, 2) of nodes between which no other lies (a Gabriel graph)."""
+    """Return the pairs (m, 2) of nodes without another node between them (a Gabriel graph)."""
     # a pair is joined when the sphere with it as diameter holds no third node: the lines of a
     # regular mesh without its diagonals, whatever its ratio of sides
     from scipy.spatial import cKDTree

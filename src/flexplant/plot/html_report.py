@@ -1,4 +1,4 @@
-"""report: a design as one self-contained page, to be mailed; its parts, each as it shows itself."""
+"""report: a design as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from .placement import pareto_curve, placed, sensor_map
 from .run_pictures import response
 from .updating import localisation, parameters, residual
 
-#: headings in the order of the page, and the rooms whose values stand below them
+#: headings in the order of the page, and the packages of their values
 _HEADINGS = {
     "Runs": ("simulation",),
     "Controller": ("synthesis",),
@@ -53,9 +53,9 @@ _HEADINGS = {
     "Measurement and update": ("identification", "updating"),
     "Machine": ("structure", "modes", "reduction", "labels"),
 }
-#: channels of a Bode diagram that can be read on a page
+#: largest number of channels of a Bode diagram on a page
 _CHANNELS = 9
-#: parameters of an update that are drawn, each separately
+#: largest number of parameters of an update that are drawn separately
 _PARAMETERS = 6
 
 Picture = tuple[str, Callable[[], Any]]
@@ -87,7 +87,7 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
     parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
     loop = next(iter(design.of(ClosedLoop).values()), None)
     if isinstance(value, Response) and value.seed is not None and loop is not None:
-        parts.append("<h4>Beside the model of the loop</h4>")
+        parts.append("<h4>Compared with the model of the loop</h4>")
         parts.append(html_or_why(lambda: consistency(loop, value)._repr_html_()))
     modes = value.modes() if isinstance(value, ReducedModel) else value
     if isinstance(modes, Modes):
@@ -117,7 +117,7 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
             over.append((f"{name}: forces over time", partial(response, value, forces)))
         return over
     if isinstance(value, AnyPlant) and value.machine.model is not None:
-        said = "Sensors, actuators and POIs; arrows: along what they act and measure"
+        said = "Sensors, actuators and POIs; arrows show the directions of action and measurement"
         own = value.machine
         return [
             (said, partial(placed, own)),
@@ -125,7 +125,7 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         ]
     plant = design.plant
     if isinstance(value, Placement) and plant is not None and plant.model is not None:
-        return [("The places that were chosen", lambda: placed(value.on(plant.machine)))]
+        return [("The chosen places", lambda: placed(value.on(plant.machine)))]
     if isinstance(value, Controller | StateSpace | Frf):
         system: Any = value.system if isinstance(value, Controller) else value
         if len(system.inputs) * len(system.outputs) <= _CHANNELS:
@@ -139,10 +139,10 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
     simple: dict[type, tuple[str, Callable[[Any], Any]]] = {
         ErrorBudget: ("Error budget", budget),
         ErrorMap: ("Errors over the surface", error_map),
-        LagReport: ("Error of the estimate by lag", lag_report),
-        Localisation: ("Where the model differs", localisation),
-        ParetoCurve: ("What each further device buys", pareto_curve),
-        SensorMap: ("Where one more sensor helps", sensor_map),
+        LagReport: ("Error of the estimate over its lag", lag_report),
+        Localisation: ("Places where the model differs", localisation),
+        ParetoCurve: ("Benefit of each further device", pareto_curve),
+        SensorMap: ("Benefit of one more sensor by place", sensor_map),
         StabilisationDiagram: ("Stabilisation diagram", stabilisation),
     }
     fit = (picture for kind, picture in simple.items() if isinstance(value, kind))
@@ -151,7 +151,7 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
 
 def _axis_responses(plant: StandardPlant) -> None:
     """Draw the plant from a total force along each axis that the actuators move to the axis."""
-    # where they move none apart, the singular values from u to y
+    # where they do not move axes independently, the singular values from u to y
     try:
         driven = driven_axes(plant)
     except FlexplantError:
@@ -200,7 +200,7 @@ def _ports_table(plant: StandardPlant) -> str:
 
 
 def certificates(design: Design) -> Chapter | None:
-    """Return the section of all that was verified after it was computed."""
+    """Return the section of all checks."""
     rows = [
         [name, *check.row] for name, value in design.named.items() for check in _checks_of(value)
     ]
@@ -225,16 +225,14 @@ def _checks_of(value: Any) -> Iterator[Verified]:
         yield Verified("degrees of freedom", float(value.dof))
     if isinstance(value, Placement):
         what = f"value [{value.unit}]" if value.unit else "value"
-        yield Verified(
-            what, value.value, "no choice is below the limit", value.bound, at_least=True
-        )
+        yield Verified(what, value.value, "lower bound of all choices", value.bound, at_least=True)
 
 
 Tile = tuple[str, str, str, str]
 
 
 def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
-    """Return the section of what matters most, of the first loop; None without a loop."""
+    """Return the section of the main results, for the first loop; None without a loop."""
     loops = design.of(ClosedLoop)
     if not loops:
         return None
@@ -255,12 +253,12 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
     for kind in (Verdict, ExposureErrors):
         parts += [one._repr_html_() for one in design.of(kind).values()]
     if len(loops) > 1:
-        parts += [note(f"These figures are of {name}; all loops:"), compared._repr_html_()]
+        parts += [note(f"These figures belong to {name}; all loops:"), compared._repr_html_()]
     if found is None:
         return Chapter("Result", "".join([*parts, note(why, "bad")]))
-    caption = f"Where the error of {main} comes from, by frequency and source"
+    caption = f"Contributions to the error of {main}, by frequency and source"
     picture = gallery.picture(lambda: budget(found), caption)
-    # without reference an error is as large as the motion
+    # without a reference the error equals the motion
     twice = {poi.channel(axis) for poi, axis in loop.plant.ports.followed}
     shown = [n for n in loop.plant.z if n not in twice]
     rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in shown]
@@ -278,11 +276,11 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
 
 def _other_budget(loop: ClosedLoop, channel: str, gallery: Gallery) -> str:
     found = loop.budget(channel)
-    return gallery.picture(lambda: budget(found, most=3), f"Where {channel} comes from")
+    return gallery.picture(lambda: budget(found, most=3), f"Contributions to {channel}")
 
 
 def _main(loop: ClosedLoop, channel: str | None) -> str:
-    """Return the channel that comes first: the one asked for, else the first error."""
+    """Return the main channel: the requested one, else the first error."""
     return channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
 
 
@@ -322,7 +320,7 @@ def _loop_figures(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparis
 
 
 def html_or_why(make: Callable[[], str]) -> str:
-    """Return HTML, or in its place why it cannot be computed."""
+    """Return HTML, or the reason why it cannot be computed."""
     try:
         return make()
     except FlexplantError as error:
@@ -393,7 +391,7 @@ Kind = TypeVar("Kind")
 
 
 class Design:
-    """Named values in the order in which they were given."""
+    """Named values in the given order."""
 
     def __init__(self, parts: Sequence[Any]) -> None:
         self.named: dict[str, Any] = {}
@@ -403,9 +401,7 @@ class Design:
                 raise ModelError(f"two parts of the report are named {own!r}: rename one.")
             self.named[own] = value
         if not self.named:
-            raise ModelError(
-                "there is nothing to report: pass values, such as a closed loop and its run."
-            )
+            raise ModelError("the report is empty: pass values, such as a closed loop and its run.")
 
     def of(self, kind: type[Kind]) -> dict[str, Kind]:
         """Return the values of a kind by name."""
@@ -413,7 +409,7 @@ class Design:
 
     @property
     def plant(self) -> AnyPlant | None:
-        """The plant that was given, else that of the first loop."""
+        """The given plant, else that of the first loop."""
         own: list[StandardPlant] = list(self.of(StandardPlant).values())
         return next(iter([*own, *(loop.plant for loop in self.of(ClosedLoop).values())]), None)
 
@@ -446,23 +442,23 @@ def report(
 ) -> Path:
     """Write a design to one self-contained HTML file: result, design, certificates, versions.
 
-    The file loads nothing from elsewhere. Its pictures can be zoomed, dragged and read with the
-    cursor, mode shapes move, and it prints. The same values give the same file, to the byte.
+    The file does not load anything. Its pictures can be zoomed, dragged and read with the cursor,
+    mode shapes move, and it can be printed. Equal values give equal files, to the byte.
 
     Parameters
     ----------
     path : str or Path
-        The file, replaced when it is there.
+        Path of the file; an existing file is replaced.
     *parts : values of this package, or mappings {name: value}
-        What to report, in any order: plants, observers, controllers, loops, runs, placements,
-        modes, updates, studies. Of several loops the figures at the top are those of the first.
-        A value of another kind shows its repr.
+        Values to report, in any order: plants, observers, controllers, loops, runs, placements,
+        modes, updates, studies. The figures at the top belong to the first of several loops. Other
+        values are shown by their repr.
     title, subtitle : str
-        What stands at the top. No date is added, which would make equal designs differ.
+        Title and subtitle. No date is added, so that equal designs give equal files.
     channel : str, optional
-        The z whose error comes first; the first error at a POI when not given.
+        Channel of z that is shown first; by default the first error at a POI.
     seeds : mapping {str: seed}, optional
-        What chance was drawn from, for the record, in addition to the seeds that runs keep.
+        Seeds of random numbers, for the record, in addition to the seeds stored in runs.
 
     Returns
     -------
@@ -472,7 +468,7 @@ def report(
     Raises
     ------
     ModelError
-        When there is nothing to report, or a part is not a value of this package.
+        When no value is given, or a part is not a value of this package.
 
     Examples
     --------

@@ -41,9 +41,9 @@ def stabilisation(
     Parameters
     ----------
     diagram : StabilisationDiagram
-        What to choose poles from.
+        Diagram from which poles are chosen.
     frf : Frf, optional
-        Its sum over all channels is drawn behind.
+        Response whose sum over all channels is drawn in the background.
     ax : Axes, optional
 
     Examples
@@ -84,7 +84,7 @@ def stabilisation(
 def identified(
     frf: Frf, modes: IdentifiedModes, output: str, input: str, *, ax: Axes | None = None
 ) -> Axes:
-    """Draw a measured response, the identified one and what is left between them.
+    """Draw a measured response, the identified one and their difference.
 
     Parameters
     ----------
@@ -136,5 +136,5 @@ def identified(
     return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit), given=given)
 
 
-#: lines of the table of poles: more do not fit next to the diagram
+#: largest number of lines of the table of poles next to the diagram
 _LISTED = 16

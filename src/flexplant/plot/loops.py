@@ -1,4 +1,4 @@
-"""How near a loop gain comes to -1, and what feedback does to errors, noise and commands."""
+"""Pictures of loops: Nyquist diagrams, poles, and sensitivity functions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from ._axes import (
     three_axes,
 )
 
-#: step of L relative to its distance from -1 that is filled in
+#: step of L relative to its distance from -1 above which points are added
 _STEEP = 0.15
 
 
@@ -57,7 +57,7 @@ def nyquist(
     reach: float = 2.5,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw loop gains L in the complex plane, with -1 and the circle in which ``|S| > modulus``.
+    """Draw loop gains L in the complex plane, with -1 and the circle with ``|S| > modulus``.
 
     Each of more than four has a separate panel.
 
@@ -68,22 +68,22 @@ def nyquist(
     Parameters
     ----------
     loop_gains : StateSpace, Frf, ClosedLoop, or mapping {label: one of these}
-        L of one channel each, the sign being that of ``1 + L``. Of a closed loop, the gain at each
-        actuator while the others stay closed.
+        Loop gains L of one channel each, with the sign of ``1 + L``. For a closed loop, the gain at
+        each actuator while the others stay closed.
     channel : (output, input), optional
-        Channel of systems with several.
+        Channel of systems with several channels.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     modulus : float
         Largest |S| of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
     reach : float
-        The picture shows real and imaginary parts up to it.
+        Largest real and imaginary part of the picture.
     ax : Axes, optional
 
     Raises
     ------
     ModelError
-        When there is nothing to draw, or one of several channels is not chosen.
+        When nothing is given to draw, or one of several channels must be chosen.
 
     Examples
     --------
@@ -177,14 +177,14 @@ _RATIOS = (1e-3, 1e-2, 0.1, 0.3, 0.7)
 def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Axes:
     """Draw poles (and zeros) by frequency and damping ratio, those right of the axis in red.
 
-    Lightly damped poles of a machine lie on the imaginary axis for the eye: |s| in Hz over the
-    damping ratio ``-Re s / |s|`` separates them. Poles of sampled systems are taken to ``log(z)
-    / dt``. Poles at zero frequency are named in the legend.
+    Lightly damped poles seem to lie on the imaginary axis; the damping ratio ``-Re s / |s|`` over
+    |s| in Hz separates them. Poles of sampled systems are mapped to ``log(z) / dt``. Poles at zero
+    frequency are named in the legend.
 
     Parameters
     ----------
     systems : StateSpace, or mapping {label: StateSpace} or list of them
-        Whose poles are drawn as crosses.
+        Systems whose poles are drawn as crosses.
     zeros : bool
         Whether invariant zeros are drawn too, as circles.
     ax : Axes, optional
@@ -233,7 +233,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
 
 
 def _wide(ax: Axes) -> None:
-    """Show a decade at least: ticks between those of decades lie on each other in a part of one."""
+    """Show at least a decade, since minor ticks overlap otherwise."""
     low, high = ax.get_xlim()
     room = np.sqrt(10.0 * low / high)
     if room > 1.0:
@@ -260,7 +260,7 @@ def _draw_roots(ax: Axes, roots: ComplexArray, marker: str, color: str, label: s
     ax.plot(freq[ratio < 0], ratio[ratio < 0], marker, **unstable)
 
 
-#: what weights limit
+#: functions that weights limit
 _LIMITED = ("S", "T", "KS")
 #: a frequency axis and sizes over it
 _Line = tuple[FloatArray, FloatArray]
@@ -282,17 +282,17 @@ def sensitivity(
     Parameters
     ----------
     curves : ClosedLoop, Frf, (plant, controller), (freq [Hz], size), or mapping {label: of these}
-        What to draw. Of a loop |S| from each reference to the error of its axis; without any,
-        and of `(plant, controller)`, the largest singular value of S at u; of an `Frf`, such as
-        `sensitivity(loop)`, its largest singular value.
+        Curves to draw. For a loop |S| from each reference to the error of its axis; without
+        references, and for `(plant, controller)`, the largest singular value of S at u; for an
+        `Frf`, such as `sensitivity(loop)`, its largest singular value.
     colors : mapping {label: color}, optional
         Colours of some lines.
     dashed : collection of str
-        Labels of lines to draw thin and dashed, so that they show on equal ones.
+        Labels of lines to draw thin and dashed, so that lines below them are visible.
     weight : StateSpace or float, optional
         W of ``|W S| < 1``: its inverse is drawn as the bound.
     freq : (n_freq,) array [Hz], optional
-        Where pairs of plant and controller are evaluated; a grid of each when not given.
+        Frequencies for pairs of plant and controller; by default a grid of each.
     ax : Axes, optional
 
     Raises
@@ -355,9 +355,9 @@ def sensitivities(
 ) -> Axes:
     """Draw S, T and KS of loops below each other, with the bounds that weights set.
 
-    ``S = (I - L)^-1``, ``T = I - S``, ``K S`` from measurements y to commands u, broken where `at`
-    says. Of several channels the largest singular value, which is the gain of the worst direction;
-    of S the smallest as well, as a thin line: more actuators than axes leave a direction free.
+    ``S = (I - L)^-1``, ``T = I - S``, ``K S`` from measurements y to commands u, broken at `at`.
+    For several channels the largest singular value is drawn, the gain of the worst direction; for S
+    also the smallest, as a thin line, since more actuators than axes leave a direction free.
 
     Parameters
     ----------
@@ -383,8 +383,8 @@ def sensitivities(
     Raises
     ------
     ModelError
-        When one is not a loop, weights are of other names or of several channels, or there are not
-        three axes.
+        When one is not a loop, weights have other names or several channels, or there are not three
+        axes.
 
     Examples
     --------
@@ -426,7 +426,7 @@ def sensitivities(
 
 
 def _draw_smallest(ax: Axes, found: Sequence[Frf], looks: Sequence[Style]) -> None:
-    """Draw the smallest singular values of S, and all from a hundredth of where they rise on."""
+    """Draw the smallest singular values of S, and limit the frequency axis."""
     lines = [(response.freq, singular(response)[:, -1]) for response in found]
     for line, response, style in zip(lines, found, looks, strict=True):
         if response.data.shape[0] > 1:

@@ -39,14 +39,14 @@ from ._axes import (
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
-    """Draw where one more sensor helps, seen from above.
+    """Draw the benefit of one more sensor by place, seen from above.
 
     Parameters
     ----------
     found : SensorMap
         From `flexplant.placement.sensor_map`.
     ports : Ports, optional
-        Sensors and actuators that are there already and POIs, where their places are points.
+        Existing sensors and actuators, and POIs, if their places are points.
     ax : Axes, optional
 
     Returns
@@ -102,7 +102,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
 
 
 def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
-    """Draw what each further device buys, and the bound below which no choice can be.
+    """Draw the benefit of each further device, and the lower bound of all choices.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     Returns
     -------
     Axes
-        The root of a mean square in nm, urad and so on; other criteria as they are.
+        Axes with the root of a mean square in nm, urad and so on; other criteria unchanged.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     ax.plot(found.amounts, values, "o-", color=BLUE, label="best found")
     if np.any(low):
         bound = STYLES["bound"]
-        ax.plot(found.amounts[low], bounds[low], label="no choice is below this", **bound)
+        ax.plot(found.amounts[low], bounds[low], label="lower bound of all choices", **bound)
         ax.fill_between(found.amounts[low], bounds[low], values[low], color=BLUE, alpha=0.15)
     if not found.by_cost:
         ax.set_xticks(found.amounts)
@@ -158,30 +158,30 @@ def placed(
 ) -> Axes:
     """Draw the sensors, actuators and POIs of a plant on its structure, seen from above.
 
-    Each is named; arrows show along what those in x and y act and measure. Of a solid with devices
-    in its lower half these are drawn next to it, seen from below.
+    Each device is named; arrows show the directions of those in x and y. For a solid, devices in
+    its lower half are drawn separately, seen from below.
 
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure, such as `placement.on(plant)`.
+        Plant assembled from a structure, such as `placement.on(plant)`.
     mode : int, optional
         Number of a mode from 1, rigid-body modes included: its motion in z is drawn as contours,
         and its nodal line.
     zones : sequence of Rectangle or Disc
-        Where nothing may be, hatched.
+        Excluded zones, hatched.
     ax : Axes, optional
-        Where to draw the view from above, with all devices in it.
+        Axes of the view from above, with all devices.
 
     Returns
     -------
     Axes
-        From above; `.figure.axes` are all.
+        Axes of the view from above; `.figure.axes` are all.
 
     Raises
     ------
     ModelError
-        When the plant has no structure, the mode does not exist, or there are no z-DOFs to draw.
+        When the plant has no structure, the mode does not exist, or the structure has no z-DOFs.
 
     Examples
     --------
@@ -243,7 +243,7 @@ def placed(
     return upper
 
 
-#: of the largest dimension: nodes that lie lower than this below the middle are another layer
+#: distance below the middle, relative to the largest dimension, at which nodes form another layer
 _LAYER = 1e-3
 
 
@@ -286,7 +286,7 @@ def _view(
 
 
 def _make_room(ax: Axes) -> None:
-    """Leave room for the names of what is at an edge, also where contours end there."""
+    """Leave room for names at an edge, also where contours end there."""
     ax.use_sticky_edges = False
     ax.margins(0.1)
 
@@ -300,7 +300,7 @@ def _patch(zone: Zone, factor: float, **style: Any) -> Patch:
     return Box((x, y), right - x, top - y, **style)
 
 
-#: shares of a mode are drawn from here on
+#: least participation of a mode that is drawn
 _FAINT = 1e-3
 #: most modes that a panel names one by one
 _NAMED = 24
@@ -319,8 +319,8 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     Returns
     -------
     list of Axes
-        A panel each: the error of decoupling, how far each mode is in the loop (of two positions
-        the least of them), each figure, its least and largest value marked.
+        One panel each for the decoupling error, the participation of each mode in the loop (the
+        least for two positions), and each figure, with its smallest and largest value marked.
 
     Raises
     ------
@@ -370,7 +370,7 @@ def _curve_panels(found: PositionMap, kind: str) -> list[Axes]:
         finish(ax, x="", y="decoupling error [%]").legend(loc="best", fontsize=8)
     if modes:
         ax = next(panels)
-        # those that leave the loop most, by number
+        # modes that leave the loop most, by number
         least = np.where(found.ever, found.visible.min(axis=0), np.inf)
         kept = np.sort(np.argsort(least, kind="stable")[:modes])
         shown = ax.pcolormesh(

@@ -1,4 +1,4 @@
-"""Where the poles of a loop go when its gain grows."""
+"""Root loci: poles of a loop over its gain."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ..errors import ModelError
 from ..lti.statespace import StateSpace, System, as_statespace
 from ._axes import BLUE, GREY, RED, axes, finish
 
-#: the gain is drawn from a thousandth to a thousand times the one given, 60 steps a decade: the
-#: steps of a pole are then hardly seen
+#: range of the gain in decades around the given one, and 60 steps per decade, which give smooth
+#: curves
 _RANGE, _STEPS = 1e3, 361
-#: the picture shows the poles at the nominal gain and the open loop's, and half as much again
+#: range of the picture relative to the poles at the nominal gain and of the open loop
 _ROOM = 1.5
 
 
@@ -83,7 +83,7 @@ def _closed_poles(g: StateSpace, k: float) -> ComplexArray:
 
 
 def _paths(g: StateSpace, gains: FloatArray) -> ComplexArray:
-    """Return the poles (n_gain, n) for growing gains, each in the column of the nearest before."""
+    """Return the poles (n_gain, n) for growing gains, each in the column of the closest one."""
     rows = [g.poles()]
     for k in gains:
         fresh = _closed_poles(g, float(k))
@@ -93,7 +93,7 @@ def _paths(g: StateSpace, gains: FloatArray) -> ComplexArray:
 
 
 def _frame(ax: Axes, roots: ComplexArray, *, sampled: bool) -> None:
-    """Show the roots, and the edge of stability."""
+    """Show the roots, and the stability limit."""
     if sampled:
         circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 200))
         ax.plot(circle.real, circle.imag, color=GREY, linewidth=0.8)

@@ -47,28 +47,28 @@ def response(
     exposures: npt.ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw channels of a run over time, one panel for each unit; of several runs the first.
+    """Draw channels of a run (the first of several) over time, one panel for each unit.
 
-    Each of more than four channels has a separate panel and scale: they would hide each other.
+    More than four channels get separate panels and scales, since they would hide each other.
 
     Parameters
     ----------
     run : Response
         From `simulate`.
     channels : sequence of str, optional
-        Which; the errors (or else the first channel) when not given.
+        Channels; by default the errors (or else the first channel).
     unit : str, optional
         SI unit of channels that have none in `run.units`. A prefix is chosen in each panel.
     label : str, optional
-        Put before the channels' names, or in place of a single one, to compare runs in one axes.
+        Prefix of the channel names, or name of a single channel, to compare runs on one axes.
     color : str, optional
-        Colour of the lines; a cycle when not given.
+        Colour of the lines; a cycle by default.
     span : (start, end) [s], optional
-        The part of the run to draw; all of it when not given. The prefix is chosen for that span.
+        Part of the run to draw; all of it by default. The prefix is chosen for that span.
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPointProfile.exposures`: they are shaded.
     ax : Axes, optional
-        Where to draw channels of one unit.
+        Axes for channels of one unit.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def _draw_panel(
     color: str | None,
     given: bool,
 ) -> None:
-    """Draw channels of one unit; colours follow the place among all channels."""
+    """Draw channels of one unit; colours follow the position among all channels."""
     signals = [np.atleast_2d(run[name])[0] for name in group]
     size = max(float(np.max(np.abs(signal), initial=0.0)) for signal in signals)
     factor, shown = shown_in(ax.yaxis, size, unit)
@@ -189,7 +189,8 @@ def step(
 ) -> Axes:
     """Draw the responses to a step of one unit at each input, a panel for each channel.
 
-    Exact at the instants drawn: continuous systems are sampled with a zero-order hold.
+    The response is exact at the drawn instants: continuous systems are sampled with a zero-order
+    hold.
 
     Parameters
     ----------
@@ -199,9 +200,9 @@ def step(
         Channels of the first one; all when not given, of a loop with references these and the
         motions of their POIs. Others are drawn by the same names.
     duration : float [s], optional
-        When not given, until the slowest pole has decayed to 1 % or for 20 of its periods.
+        Duration; by default until the slowest pole has decayed to 1 % or for 20 of its periods.
     ax : Axes, optional
-        Where one channel is drawn.
+        Axes for a single channel.
 
     Returns
     -------
@@ -256,7 +257,7 @@ def step(
 
 
 def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
-    """Return what references move, and these, of a loop that has some."""
+    """Return the motions that references move, and the references, of a loop."""
     if not isinstance(found, ClosedLoop) or not (refs := references(found.plant)):
         return None
     owners = {name.rpartition(":")[0] for name in refs}

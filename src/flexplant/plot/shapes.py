@@ -1,4 +1,4 @@
-"""Mode shapes in three dimensions, still and moving; where nodes and channels are."""
+"""Mode shapes in three dimensions, still and moving; places of nodes and channels."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from ._axes import (
 )
 
 _COLOURS = "viridis"
-#: triangles that are drawn quickly; of a coarse mesh each is drawn in parts, whose colours differ
+#: number of triangles that are drawn quickly; those of a coarse mesh are divided for smooth colours
 _MANY, _PARTS = 3000, 4
 
 
@@ -61,9 +61,9 @@ def mode_shape(
     number : int
         From 1, rigid-body modes included.
     scale : float
-        The largest displacement that is drawn, of the largest dimension of the structure.
+        Largest drawn displacement relative to the largest dimension of the structure.
     phase : float [rad]
-        Phase of the motion ``Re(phi exp(i phase))``: 0 is the end of its way.
+        Phase of the motion ``Re(phi exp(i phase))``: 0 is the largest displacement.
     color : str, optional
         One colour for the surface.
     ax : Axes3D, optional
@@ -71,8 +71,8 @@ def mode_shape(
     Raises
     ------
     ModelError
-        When the mode does not exist, there is no displacement along x, y or z, or there are more
-        nodes than a picture can show.
+        When the mode does not exist, the model has no displacement along x, y or z, or there are
+        too many nodes.
 
     Examples
     --------
@@ -94,14 +94,14 @@ class _Moving:
         instance(modes, Modes, "modes", "Pass what solve_modes returned, or model.modes().")
         if not 1 <= number <= modes.omega.size:
             raise ModelError(
-                f"there is no mode {number}: modes are numbered 1 to {modes.omega.size}."
+                f"mode {number} does not exist: modes are numbered 1 to {modes.omega.size}."
             )
         self.skin = surface_of(modes.dofs)
         motion = real_motion(self.skin.motion(np.asarray(modes.phi)[:, number - 1]))
         size = float(np.max(np.linalg.norm(motion, axis=1)))
         if not size:
             raise ModelError(
-                f"mode {number} moves no DOF along x, y or z: there is nothing to draw. Expand it "
+                f"mode {number} moves no DOF along x, y or z and cannot be drawn. Expand it "
                 "to the full model's DOFs (ReducedModel.expand)."
             )
         self.size = np.linalg.norm(motion, axis=1) / size
@@ -117,11 +117,11 @@ class _Moving:
 
     def _start(self, color: str | None) -> tuple[Poly3DCollection | None, Line3DCollection]:
         skin, rest = self.skin, self.skin.xyz / self.factor
-        self.ax.computed_zorder = False  # what is at rest never hides what moves
+        self.ax.computed_zorder = False  # the shape at rest never hides the moving one
         still = Line3DCollection(rest[skin.edges], colors=GREY, linewidths=0.8, linestyles="--")
         lines = Line3DCollection(rest[skin.edges], colors=BLACK, linewidths=1.2)
         self.ax.add_collection3d(still)
-        if not skin.is_solid:  # its edges at the back would lie on its face
+        if not skin.is_solid:  # its rear edges would lie on its face
             self.ax.add_collection3d(lines)
         still.set_zorder(1)
         lines.set_zorder(3)
@@ -174,11 +174,12 @@ def real_motion(motion: ComplexArray | FloatArray) -> ComplexArray | FloatArray:
 #: (n_dof,) or (n, 3), real or complex
 Shape: TypeAlias = Any
 
-#: nodes of a structure whose picture is drawn within seconds
+#: largest number of nodes of a picture that is drawn within seconds
 MOST = 30_000
-#: edges longer than this many times the distance between nodes join what is not connected
+#: length of edges relative to the distance between nodes above which they do not belong to the
+#: surface
 _REACH = 2.5
-#: share of the hull that a surface has at least: with less, the nodes are too irregular to judge
+#: least fraction of the hull that a surface has; with less the nodes are too irregular
 _WHOLE = 0.6
 #: cosine of the angle between faces, below which their edge is one of the body
 _EDGE = 0.8
@@ -306,7 +307,7 @@ def layout(
     marked: Mapping[str, Any] | None = None,
     ax: Axes | None = None,
 ) -> Any:
-    """Draw where nodes, desired DOFs, actuators, sensors and POIs are (paper, Fig. 3).
+    """Draw the places of nodes, desired DOFs, actuators, sensors and POIs (paper, Fig. 3).
 
     A plate is drawn from above, a solid in three dimensions with arrows along which its actuators
     push and its sensors measure.
@@ -354,7 +355,7 @@ def layout(
         point = _point(dofs, place) / factor
         ax.plot(point[0], point[1], "s", color=BLACK, fillstyle="none", markersize=11)
         ax.annotate(text, (point[0], point[1]), (8, -14), textcoords="offset points")
-    ax.margins(0.08)  # for the names of what is at an edge
+    ax.margins(0.08)  # room for names at an edge
     legend_below(ax)
     return ax
 
@@ -382,7 +383,7 @@ def _solid(
     ax = solid_axes(skin.xyz, ax, beyond=0.12 * skin.extent)
     factor = in_unit(skin.extent, "m")[0]
     rest = skin.xyz / factor
-    ax.computed_zorder = False  # what is inside and behind shows too
+    ax.computed_zorder = False  # points inside and behind stay visible
     faces = Poly3DCollection(rest[skin.triangles], facecolors=LIGHT, alpha=0.2, zorder=1)
     ax.add_collection3d(faces)
     ax.add_collection3d(Line3DCollection(rest[skin.edges], colors=GREY, linewidths=0.8, zorder=2))
@@ -409,7 +410,7 @@ def _solid(
     return ax
 
 
-#: sides of a mark where its name may stand, and how far away [points]
+#: sides of a mark for its name, and distance [points]
 _SIDES, _AWAY = np.exp(0.25j * np.pi * np.arange(8)), 15.0
 
 

@@ -1,4 +1,4 @@
-"""Pictures of an update and of a localisation: what is explained, by which parameters."""
+"""Pictures of an update and of a localisation: explained misfit and parameters."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from ._axes import (
     shown_in,
 )
 
-#: colours of what was chosen, cannot be distinguished from it, hardly can, and of all others
+#: colours of chosen candidates, of indistinguishable and hardly distinguishable ones, and of others
 COLOURS = {"chosen": RED, "alike": BLUE, "rival": GREY, "other": LIGHT}
 
 
@@ -50,14 +50,14 @@ def localisation(
     dofs: DofSet | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw how much of the misfit each candidate explains alone.
+    """Draw the fraction of the misfit that each candidate explains separately.
 
     Parameters
     ----------
     found : Localisation
-        Of `localise`.
+        Result of `localise`.
     candidates : sequence of Parameter, optional
-        As given to `localise`. With `dofs`: a plan view, the candidates where they act.
+        As given to `localise`. With `dofs` they give a plan view of the candidates at their places.
     dofs : DofSet, optional
         DOFs of the model.
     ax : Axes, optional
@@ -65,12 +65,12 @@ def localisation(
     Returns
     -------
     Axes
-        Bars of the best candidates; or places in x and y [m], coloured by the share explained.
+        Bars of the best candidates; or places in x and y [m], coloured by the explained fraction.
 
     Raises
     ------
     ModelError
-        When `found` is not a Localisation, or candidates are not those of it.
+        When `found` is not a Localisation, or candidates do not belong to it.
 
     Examples
     --------
@@ -152,7 +152,7 @@ def _plan(
 
 
 def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
-    """Return where a parameter acts, the mean of its weights' places."""
+    """Return the place of a parameter, the mean of the places of its weights."""
     at = parameter.at
     if isinstance(at, str):
         return np.asarray(dofs.location(at)[:2])
@@ -162,7 +162,7 @@ def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
     return np.asarray(row @ dofs.xyz[:, :2] / row.sum())
 
 
-#: number of parameters that are drawn separately; the rest are left to the repr
+#: number of parameters that are drawn separately; the repr shows the others
 SHOWN = 12
 
 
@@ -182,10 +182,10 @@ def update(
     before : ReducedModel or FEModel
         The model that was updated.
     residuals : sequence of Residual
-        What it was updated with, or anything measured that it shall be judged by.
+        Residuals of the update, or other measurements for the judgement.
     unused : Frf or FrfResidual, optional
-        A measurement that was not fitted, drawn instead of that of the residuals; as a residual
-        where its channels are not named by their DOFs, or it was measured behind a hold.
+        A measurement that was not fitted, drawn instead of that of the residuals; a residual if its
+        channels are not named by their DOFs, or it was measured after a hold.
     level : float
         Level of the confidence intervals.
 
@@ -251,7 +251,7 @@ def _draw_errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, 
     place = np.arange(len(seen.modes))
     unit = 100.0
     ax.bar(place - 0.2, unit * old, 0.38, color=GREY, label="before")
-    # a bar as low as the line at 0 is seen by its edge
+    # the edge of a bar is visible even if its height is near 0
     ax.bar(place + 0.2, unit * new, 0.38, color=BLUE, edgecolor=BLUE, linewidth=2.0, label="after")
     for x, value in zip(place + 0.2, unit * new, strict=True):
         side, off = ("bottom", 2) if value >= 0 else ("top", -2)
@@ -265,7 +265,7 @@ def _draw_errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, 
     ax.set_xticks(place, [str(number) for number in seen.modes])
     # one legend serves both
     kind, given = ("%", None) if what == "frequency" else ("percentage points", False)
-    finish(ax, x="mode", y=f"error [{kind}]", title=f"{what}, model less measured", given=given)
+    finish(ax, x="mode", y=f"error [{kind}]", title=f"{what}, model minus measured", given=given)
 
 
 def _mac(ax: Axes, seen: Correlation, name: str) -> None:
@@ -354,7 +354,7 @@ def _draw_responses(ax: Axes, residual: FrfResidual, before: Any, after: Any) ->
 
 
 def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = None) -> Axes:
-    """Draw how the model's eigenvalues reach the measured ones (paper, Fig. 7).
+    """Draw the convergence of the eigenvalues to the measured ones (paper, Fig. 7).
 
     Parameters
     ----------
@@ -387,7 +387,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
         for part, style, values in (("Re", "--", gap.real), ("Im", "-", gap.imag)):
             ax.semilogy(
                 steps,
-                # exact values have a place on a logarithmic axis
+                # exact values need a place on a logarithmic axis
                 np.maximum(np.abs(values), 1e-13 * abs(goal[i])),
                 style,
                 marker="os^D"[i % 4],
@@ -400,7 +400,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
 
 
 def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
-    """Draw how far the model is from the measurement over iterations (paper, eq. (12), Fig. 8).
+    """Draw the distance of model and measurement over iterations (paper, eq. (12), Fig. 8).
 
     Parameters
     ----------

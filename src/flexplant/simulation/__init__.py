@@ -1,15 +1,15 @@
-"""Set-points, sampled-data runs of a closed loop, and what they say of the error.
+"""Set-points, sampled-data runs of a closed loop, and error metrics.
 
-- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with `elements=` of the field
-  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, one's own) and between
-  samples where wished; noise as `fx.design_kalman` has it.
+- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with nonlinear `elements=`
+(`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, your own) and optionally
+between samples; the noise is that of `fx.design_kalman`.
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
   robust to a change of the frequency) and `quiet_setpoint` leave modes at rest.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
-- `Specification`: what is required of margins and errors; a verdict says what is reached.
+- `Specification`: limits on margins and errors; a verdict compares them with achieved values.
 - `rms_along(loop, moving=)`: the errors of a moving machine along its path.
-- `study(machines, pipeline, executor=)`: one pipeline for many machines, resumed where stopped.
+- `study(machines, pipeline, executor=)`: one pipeline for many machines, with resume.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -39,8 +39,8 @@ def pipeline(mass: float, rng: object) -> dict[str, object]:
     return {"margin": tried.modulus_margin, "stable": tried.is_stable, "MA": ma, "MSD": msd}
 ```
 
-The same study on a laptop, on a pool of processes and on a cluster. The three tables are equal to
-the last bit:
+The same study runs on a laptop, on a pool of processes and on a cluster. The three tables are equal
+to the last bit:
 
 ```python
 laptop = fx.study(MASSES, pipeline, rng=1, checkpoint="study.jsonl")  # killed, it goes on there

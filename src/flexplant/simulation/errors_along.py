@@ -1,7 +1,8 @@
-"""Errors of a machine on the move: of every channel of a loop, and of Kalman filters.
+"""Errors of a moving machine: of every channel of a loop, and of Kalman filters.
 
-All filters know where the machine is: the rows of sensors and POIs, and the columns of forces, are
-those of the present position. They differ in the gain by which innovations correct the state.
+All filters know the position of the machine: the rows of sensors and POIs, and the columns of
+forces, belong to the present position. They differ in the gain by which innovations correct the
+state.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from .moving_machine import (
 )
 from .sampled_runs import unscheduled
 
-#: repetitions of a trajectory after which its errors have to repeat, and to which part
+#: number of repetitions of a trajectory after which its errors must repeat, and relative tolerance
 _REPEATED, _SETTLED = 100, 1e-6
-#: times the least error at which a filter with a steady gain is of no use any more
+#: ratio to the smallest error above which a filter with a steady gain counts as diverged
 _DIVERGED = 100.0
-#: times the first error from which on an unstable filter is not followed
+#: ratio to the first error above which an unstable filter is not followed further
 _LOST = 1e6
 #: the gains, in the order of their columns
 GAINS = ("exact", "scheduled", "frozen")
@@ -53,11 +54,11 @@ class PathRms(Value):
     ----------
     time : (n_time,) array [s]
     rms : (n_channels, n_time) array
-        Of each channel, in its unit.
+        Standard deviation of each channel, in its unit.
     names : sequence of str
         The channels: z, y, driven u and what blocks show.
     units : mapping {str: str}
-        Of the channels.
+        Units of the channels.
     """
 
     time: FloatArray = field(metadata=checked(real_array, shape=(None,)))
@@ -88,20 +89,20 @@ def rms_along(
     """Return the standard deviation of every channel of a loop whose machine moves.
 
     ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` of plant and controller together, with the matrices
-    of each sample of the moving machine: what the white noises of the plant cause, exactly. The
-    controller stays as it was designed, observer included, or follows its schedule.
+    of each sample of the moving machine: the exact effect of the white noises of the plant. The
+    controller, including its observer, does not change, or follows its schedule.
 
     Parameters
     ----------
     loop : ClosedLoop or ScheduledLoop
-        Around a sampled plant with positions.
+        Loop around a sampled plant with positions.
     moving : mapping {position: path}
-        As for `simulate`: SetPoints, functions of time, or a value for each sample.
+        Paths as for `simulate`: SetPoints, functions of time, or a value for each sample.
     duration : float [s]
-        Of the trajectory.
+        Duration of the trajectory.
     repeats : bool
         Whether the trajectory repeats without end: the variance is then the periodic one,
-        ``P[0] = P[duration]``. Else the machine has stood at the beginning for a long time.
+        ``P[0] = P[duration]``. Otherwise the machine was at rest at the beginning for a long time.
 
     Returns
     -------
@@ -112,9 +113,7 @@ def rms_along(
     AssumptionError
         When the loop is not stable: at the beginning, or over the trajectory that repeats.
     ModelError
-        When nothing moves, or a port that moves has dynamics of its own.
-
-    References
+        When nothing moves, or a moving port has dynamics. References
     ----------
     [BittantiColaneri2009]_ (periodic Lyapunov equations).
 
@@ -160,12 +159,12 @@ def rms_along(
 
 
 def _standing(machine: MovingMachine) -> FloatArray:
-    """Return the covariance of the loop that has stood where it is for a long time."""
+    """Return the stationary covariance of the loop at its present position."""
     A, G, _, _ = machine.closed(0, next(machine.each(1)))
     if np.abs(np.linalg.eigvals(A)).max(initial=0.0) >= 1.0:
         raise AssumptionError(
             "the loop is not stable where the trajectory begins: it has no variance there. Design "
-            "it for that position, or pass repeats=True where it only passes by."
+            "it for that position, or pass repeats=True if the machine only passes it."
         )
     return solve_stein(A, G @ G.T)
 
@@ -181,7 +180,7 @@ def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
     if radius >= 1.0:
         raise AssumptionError(
             f"the loop grows {radius:.3g} times in each repetition of the trajectory: it is not "
-            "stable along it. Lower its gain, or schedule it."
+            "stable on this trajectory. Lower its gain, or schedule it."
         )
     return solve_stein(Phi, P)
 
@@ -196,11 +195,12 @@ class PathFilters(Value):
     names : sequence of str
         Motions of POIs, such as `die:z`.
     exact, scheduled, frozen : (n_names, n_time) arrays [m or rad]
-        Standard deviation of the error of each estimate y[k] included: with the time-varying gain
-        of the Riccati recursion, which is the least; with steady gains of some positions, linear
-        between them; with the steady gain where the plant stands.
+        Standard deviation of the error of each estimate, with the measurement y[k] included: with
+        the time-varying gain of the Riccati recursion (the smallest error); with steady gains of
+        some positions, interpolated linearly; with the steady gain of the present position of the
+        plant.
     units : mapping {str: str}
-        Of the motions.
+        Units of the motions.
     """
 
     time: FloatArray = field(metadata=checked(real_array, shape=(None,)))
@@ -224,7 +224,7 @@ class PathFilters(Value):
         return "\n".join(lines) + ">"
 
     def price(self, gain: str) -> dict[str, FloatArray]:
-        """Return what a steady gain adds to each error (n_time,), "scheduled" or "frozen"."""
+        """Return the increase of each error (n_time,) by a steady gain, "scheduled" or "frozen"."""
         require_known("gain", [gain], GAINS)
         extra = getattr(self, gain) - self.exact
         return {name: np.asarray(extra[i]) for i, name in enumerate(self.names)}
@@ -242,16 +242,16 @@ def filters_along(
     """Return the errors of three Kalman filters along a trajectory of a machine's positions.
 
     ``P+ = A (I - M C) P (I - M C)' A' + A M R M' A' + Q`` with the matrices of each sample; M is
-    the gain of the recursion itself, or a steady one.
+    the gain of the recursion, or a steady one.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with ports that move.
+        Sampled plant with moving ports.
     moving, duration, repeats
-        As for `rms_along`; what repeats has a periodic Riccati equation.
+        As for `rms_along`; a repeated trajectory has a periodic Riccati equation.
     positions : int
-        Places along the trajectory whose steady gains are scheduled.
+        Number of places along the trajectory whose steady gains are scheduled.
 
     Returns
     -------
@@ -262,9 +262,9 @@ def filters_along(
     AssumptionError
         When no steady filter exists: a rigid-body mode is not excited or not seen.
     ModelError
-        When nothing moves, a port that moves has dynamics of its own, or two positions move.
+        When nothing moves, a moving port has dynamics, or two positions move.
     SolverError
-        When the errors along a repeated trajectory do not settle.
+        When the errors along a repeated trajectory do not converge.
 
     References
     ----------
@@ -302,15 +302,15 @@ def filters_along(
             rms, P = filters.run(P, gain)
             if np.all(np.abs(rms - before) <= _SETTLED * rms):
                 break
-            # a steady gain may be unstable on the way: its errors then grow without bound
+            # a steady gain may be unstable at some positions: its errors then grow without bound
             if gain is not None and np.any(rms > _DIVERGED * found["exact"]):
                 break
         else:
             if repeats:
                 raise SolverError(
                     f"the errors change by more than {_SETTLED:g} after {_REPEATED} repetitions: "
-                    "the trajectory is short beside what the filter remembers. Take several of "
-                    "its repetitions as one, or repeats=False."
+                    "the trajectory is short compared with the memory of the filter. Use several "
+                    "repetitions as one trajectory, or repeats=False."
                 )
         found[name] = rms
     names = tuple(filters.names)
@@ -319,7 +319,7 @@ def filters_along(
 
 
 class _Filters:
-    """A moving plant, as filters see it: sensors with noise, motions of POIs."""
+    """A moving plant for filters: sensors with noise, motions of POIs."""
 
     def __init__(self, plant: Any, moving: Any, duration: Any, positions: Any) -> None:
         instance(plant, StandardPlant, "plant", "Pass a sampled plant with positions.")
@@ -351,7 +351,7 @@ class _Filters:
         return filter_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R).P
 
     def frozen(self) -> Callable[[int], FloatArray]:
-        """Return the steady gain where the plant stands."""
+        """Return the steady gain at the present position of the plant."""
         standing = {n: np.array([v]) for n, v in self.machine.path.standing.items()}
         gain = self._correcting(standing)
         return lambda k: gain
@@ -361,7 +361,7 @@ class _Filters:
         if len(self.moved) != 1:
             raise ModelError(
                 f"gains are scheduled by one position, and {', '.join(self.moved) or 'none'} "
-                "moves. Name one, or take others as functions of it in a PlaceTable."
+                "moves. Name one, or make others functions of it in a PlaceTable."
             )
         (name,), still = self.moved, self.machine.path.at(np.zeros(1))
         path = self.machine.path.at(self.time)[name]
@@ -420,16 +420,16 @@ def _constant(value: float, time: FloatArray) -> FloatArray:
 def estimate_along(
     plant: StandardPlant, records: Mapping[str, Any], *, moving: Mapping[str, Any]
 ) -> dict[str, FloatArray]:
-    """Return what the exact filter of a machine on the move makes of a record.
+    """Return the estimates of the exact filter of a moving machine from a record.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with ports that move.
+        Sampled plant with moving ports.
     records : mapping {name: (n_time,) array}
         Sensors y and commands u, by name; a `Response` serves.
     moving : mapping {position: path}
-        Where the machine was, as for `simulate`.
+        Positions of the machine, as for `simulate`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Errors over exposures: MA and MSD by POI and axis, and the time to settle to them."""
+"""Errors over exposures: MA and MSD by POI and axis, and settling times."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..words import instance, name_list
 from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
 from .sampled_runs import Signal, simulate
 
-#: share of the windows in the third column of the table: three standard deviations of a Gaussian
+#: fraction of the windows in the third column of the table: three standard deviations of a Gaussian
 SHARE = 0.997
 #: axes of a POI
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class ExposureFigures(NamedTuple):
-    """Of one channel, over all exposures and runs, in its unit."""
+    """Errors of one channel over all exposures and runs, in its unit."""
 
     ma: float
     ma_most: float
@@ -41,7 +41,7 @@ class ExposureErrors(Value):
     channels : sequence of str
         The errors.
     units : sequence of str
-        Their SI units.
+        SI units of the errors.
     values : (n, 4) array
         Largest |MA|, the |MA| that 99.7 % of the windows do not exceed; the same of the MSD.
     window : float [s]
@@ -78,19 +78,19 @@ def exposure_errors(
     """Return MA and MSD of errors over the exposures of a run, by POI and axis.
 
     The MA is the mean over a window (overlay), the MSD the deviation in it after this mean was
-    removed (fading). Windows lie wholly within an exposure and slide over it sample by sample, as
-    the slit does over the points of a die.
+    removed (fading). Windows lie completely within an exposure and slide over it sample by sample,
+    like the slit over the points of a die.
 
     Parameters
     ----------
     run : Response
         From `simulate`; all its runs count.
     channels : sequence of str, optional
-        Which; the errors of all POIs, and their axes without a reference, when not given.
+        Channels; by default the errors of all POIs, and their axes without a reference.
     window : float [s]
-        The time for which one point is exposed; None: each exposure is one window.
+        Exposure time of one point; None: each exposure is one window.
     start : float [s]
-        Without `exposures`: all after this time is exposed.
+        Time after which everything is exposed, without `exposures`.
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPointProfile.exposures`.
 
@@ -101,8 +101,8 @@ def exposure_errors(
     Raises
     ------
     ModelError
-        When `run` is no Response, has no error, or an exposure is not within it or shorter than
-        the window.
+        When `run` is not a Response, has no error, or an exposure is not within it or is shorter
+        than the window.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def settling_time(
     window: float = 5e-3,
     after: float = 0.0,
 ) -> Numbers:
-    """Return how long an error takes to stay within its specification.
+    """Return the time after which an error stays within its specification.
 
     Parameters
     ----------
@@ -151,20 +151,20 @@ def settling_time(
     ma, msd : float
         Largest |MA| and MSD that are allowed, in the channel's unit.
     window : float [s]
-        Of both.
+        Length of the window.
     after : float [s]
-        The time from which settling counts, such as the end of a move.
+        Start of the settling time, such as the end of a move.
 
     Returns
     -------
     float, or (n_runs,) array [s]
-        From `after` to the beginning of the first window from which on all windows are within;
-        infinite when the last one is not.
+        Time from `after` to the beginning of the first window after which all windows are within
+        the limits; infinite when the last one is not.
 
     Raises
     ------
     ModelError
-        When a limit is not positive, nothing is left after `after`, or the window does not fit.
+        When a limit is not positive, no sample remains after `after`, or the window is too long.
 
     Examples
     --------
@@ -212,7 +212,7 @@ def _poi_of(channel: str) -> str:
 
 
 def _fitting(window: float, dt: float, most: int, where: str) -> int:
-    """Return the samples of a window, which must be at most so many."""
+    """Return the number of samples of a window, up to a limit."""
     count = round(positive(window, "window") / dt)
     if not 1 <= count <= most:
         raise ModelError(
@@ -225,7 +225,9 @@ def _fitting(window: float, dt: float, most: int, where: str) -> int:
 def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
     """Return the samples of each exposure."""
     if run.time.size < 2:
-        raise ModelError("the run has a single sample: there is no window in it. Run it longer.")
+        raise ModelError(
+            "the run has a single sample, which is too short for a window. Run it longer."
+        )
     if exposures is None:
         first = round((float(real_array(start, "start", ())) - float(run.time[0])) / run.dt)
         if first >= run.time.size:
@@ -253,7 +255,7 @@ def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
 def _window_moments(signal: FloatArray, count: int, whole: bool) -> tuple[FloatArray, FloatArray]:
     """Return MA and MSD of all windows of `count` samples that lie within a stretch."""
     unit = signal_unit(signal)
-    # an offset would cost digits of the deviation: it is removed first
+    # an offset would reduce the accuracy of the deviation, and is removed first
     offset = np.mean(signal / unit, axis=-1, keepdims=True)
     rest = signal / unit - offset
     if whole:
@@ -277,7 +279,7 @@ class ErrorMap(Value):
     ma, msd : (p,) arrays [unit]
         Largest |MA| and MSD at each point.
     window : float [s]
-        Of both.
+        Length of the window.
     """
 
     axis: str
@@ -313,19 +315,19 @@ def error_map(
     noise: bool = True,
     rng: Any = None,
 ) -> ErrorMap:
-    """Return the error at many points of a structure through one run of a closed loop.
+    """Return the error at many points of a structure during one run of a closed loop.
 
-    Each point becomes a POI of its own; the reference of the loop's POI holds for all of them, as
-    for a wafer that moves as a whole.
+    Each point becomes a separate POI; the reference of the loop's POI applies to all of them, as
+    for a wafer that moves as a rigid body.
 
     Parameters
     ----------
     loop : ClosedLoop
-        Around a sampled plant that was assembled from a structure.
+        Loop around a sampled plant that was assembled from a structure.
     points : (p, 3) array [m]
     duration, noise, rng : as for `simulate`
     reference : signal, optional
-        As for `simulate`; along `axis`. Rest when not given.
+        Reference along `axis` as for `simulate`; rest by default.
     axis : str
         x, y, z, rx, ry or rz: the direction of the error.
     window, start, exposures : as for `exposure_errors`
@@ -380,6 +382,7 @@ def _map_reference(ports: Ports, axis: str) -> str:
         refs = [poi.derived(own, "ref") for poi, own in ports.followed]
         raise LabelError(
             f"the loop has {len(refs)} references {refs}, {len(found)} of them along {axis!r}; a "
-            "map is of one: add Ports(references=[Reference(poi)]), or leave the reference out."
+            "map needs exactly one: add Ports(references=[Reference(poi)]), or leave the "
+            "reference out."
         )
     return found[0][0].derived(found[0][1], "ref")

@@ -27,15 +27,15 @@ from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements
 
-#: lines of least squares: their number, and the slowest of them relative to the bandwidth of the
+#: number of frequency lines of the least squares, and lowest line relative to the bandwidth of the
 #: loop, or to one over the duration of the move
 _LINES, _SLOWEST = 200, 1e-2
-#: relative to the bandwidth, above which a set-point counts less when no move is given: as that of
-#: a move that takes about three times one over the bandwidth
+#: frequency relative to the bandwidth above which a set-point has less weight if no move is given:
+#: as for a move of about three times one over the bandwidth
 _FASTEST = 0.4
-#: samples of a move in continuous time
+#: number of samples of a move in continuous time
 _STEPS = 2000
-#: relative: errors that feedforward leaves and that are worth a warning
+#: relative error after feedforward above which a warning is given
 _LEFT = 0.2
 
 
@@ -49,14 +49,15 @@ class Feedforward(Value):
     Parameters
     ----------
     reference : str
-        The channel of the set-point r.
+        Channel of the set-point r.
     axes : sequence of str
-        The r channels of POIs that the forces move.
+        Channels of the r axes of POIs that the forces move.
     T : (nu, r) array
-        Forces of axes to actuators: sizes of a column add to one.
+        Distribution of the forces of axes to actuators; the magnitudes of a column add to one.
     actuators : sequence of str
     gains : (p, r, 5) array
-        On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
+        Gains of position, velocity, acceleration, jerk and snap; for one place, or for each of p
+        places.
     dt : float [s]
         Sampling time of the plant.
     """
@@ -88,8 +89,8 @@ class Feedforward(Value):
         """
         if len(self.gains) != 1:
             raise ModelError(
-                f"gains that depend on the place ({len(self.gains)} of them) are no constant "
-                "block: close the loop with simulation.known_forces(plant) and pass "
+                f"gains that depend on the place ({len(self.gains)} of them) do not form a "
+                "constant block: close the loop with simulation.known_forces(plant) and pass "
                 "forces(move, time) to "
                 "simulate as references."
             )
@@ -109,8 +110,8 @@ class Feedforward(Value):
     def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
         """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
 
-        As many times as places where the gains depend on the place. A set-point of an order below
-        that of the highest gain is refused.
+        If the gains depend on the place, the number of times must equal that of the places. A
+        set-point of an order below that of the highest gain is refused.
         """
         _check_order(move, self.gains)
         t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))
@@ -131,51 +132,52 @@ def design_feedforward(
 ) -> Feedforward:
     """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
 
-    With P the response of the axes to forces T along them (the hold, all delays, sensors' and
-    actuators' filters in it), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: of a free machine k_2 is
-    the mass, k_3 the mass times the delay, and k_4 holds half the square of the delay and,
-    negative, the compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
-    are their stiffness and damping. The coefficients are Cauchy's integrals on a circle around
-    rest, the largest on which two radii agree and within which the expansion is the inverse itself:
-    a zero of P (a mass on a spring near the POI) is left outside. All axes that the actuators
-    move apart (`flexplant.plant.driven_axes`, next to rest) are taken together: the forces that
-    keep the axes without a reference at rest are in it.
+    With P the response of the axes to forces T along them (including the hold, all delays and
+    filters of sensors and actuators), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: for a free machine
+    k_2 is the mass, k_3 the mass times the delay, and k_4 contains half the square of the delay and
+    the negative compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
+    are stiffness and damping. The coefficients are Cauchy integrals on the largest circle around
+    zero on which two radii agree and inside which the expansion equals the inverse; a zero of P (a
+    mass on a spring near the POI) lies outside. All axes that the actuators move independently
+    (`flexplant.plant.driven_axes`) are treated together, including the forces that keep the axes
+    without a reference at rest.
 
-    In a loop the gains are those of least squares of its error ``G_u F + G_r - 1``, with G_u and
-    G_r the responses of the POI to forces and reference in closed loop: where sensors and POI do
-    not move alike, the feedback would oppose the inverse of P. Poles of the controller and zeros of
-    P may be as slow as the moves. The errors are weighted with the spectrum of the move, or of one
-    that takes about three times one over the loop's bandwidth. Without a move, a plant that takes
-    no force at rest is given none. Gains of a lower order are the best of that order.
+    In a loop the gains minimise, by least squares, its error ``G_u F + G_r - 1``, with G_u and G_r
+    the responses of the POI to forces and reference in closed loop: where sensors and POI move
+    differently, the feedback would oppose the inverse of P. Poles of the controller and zeros of P
+    may be as slow as the moves. The errors are weighted with the spectrum of the move, or of a move
+    of about three times one over the loop's bandwidth. Without a move, a plant that needs no force
+    at rest gets none. Gains of a lower order are the best of that order.
 
     Parameters
     ----------
     given : StandardPlant or ClosedLoop
-        Assembled from a structure; sampled, for a sampled loop. Of a loop, that without
-        feedforward, on a model.
+        Plant that was assembled from a structure; sampled for a sampled loop. Or a loop on a model,
+        without feedforward.
     reference : str, optional
-        The reference's channel; the plant's only one when not given.
+        Channel of the reference; by default the only one of the plant.
     order : int
         Highest derivative, 2 to 4: acceleration, jerk, snap.
     move : SetPointProfile, optional
-        The move in which a loop is to have the least errors; its gains stop at its own order.
+        Move for which the errors of a loop are minimised; its order limits the gains.
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
     elements : mapping {name: element, or a list of some}, optional
-        Elements of actuators and sensors, as for `simulate`: a warning says which `Saturation` the
-        move exceeds, and what it needs. The gains do not depend on it.
+        Elements of actuators and sensors, as for `simulate`: a warning names a `Saturation` that
+        the move exceeds, with the required value. The gains do not depend on it.
 
     Returns
     -------
     Feedforward
-        Its `system` is a block for `close_loop`; the loop's reference must then be a SetPoint.
+        Feedforward; its `system` is a block for `close_loop`, and the loop's reference must then be
+        a SetPoint.
 
     Raises
     ------
     LabelError
         When it is not clear which reference is meant.
     AssumptionError
-        When the actuators cannot move the POI's axes apart from each other.
+        When the actuators cannot move the axes of the POI independently.
     ModelError
         When the plant was not assembled from a structure or is weighted, or the order is not 2 to
         4; when a move is given without a loop, or elements without a move.
@@ -183,7 +185,7 @@ def design_feedforward(
     Warns
     -----
     FlexplantWarning
-        When the gains leave a fifth of the loop's error or more; when a move exceeds a Saturation.
+        When the remaining error of the loop is a fifth or more; when a move exceeds a Saturation.
 
     References
     ----------
@@ -215,7 +217,7 @@ def design_feedforward(
     gains = at_rest(axes.inverse(_forced(plant, ()), along), plant.dt, axes.axes)
     if loop is not None and (loop.blocks or move is not None):
         last = highest if move is None else min(highest, move.order)
-        # a force that grows with the position would stay when a free machine has arrived
+        # a force proportional to the position would remain after the move of a free machine
         first = 0 if move is not None or np.any(gains[..., 0]) else 1
         orders = np.arange(first, last + 1)
         freq, size = _moved_size(loop, name, poi.derived(axis, "error"), move)
@@ -227,14 +229,14 @@ def design_feedforward(
 
 
 def known_forces(plant: StandardPlant) -> StateSpace:
-    """Return the block that passes forces given to `simulate` on to the actuators.
+    """Return the block that passes forces of `simulate` on to the actuators.
 
     Its inputs are `u1:feedforward`, ...: references of the loop, given as arrays.
 
     Parameters
     ----------
     plant : StandardPlant
-        Whose actuators they are.
+        Plant with the actuators.
 
     Raises
     ------
@@ -274,7 +276,7 @@ def _forced(plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop:
 
 
 class _Tracking(NamedTuple):
-    """The axes that forces move, the reference that one of them follows, and the others at rest."""
+    """The axes that forces move: one follows a reference, the others are at rest."""
 
     poi: Poi
     axes: tuple[str, ...]
@@ -288,7 +290,7 @@ class _Tracking(NamedTuple):
         axes, T = force_axes(plant)
         if channel not in axes:
             raise AssumptionError(
-                f"the actuators do not move {channel} apart from other POIs: they move "
+                f"the actuators do not move {channel} independently of other POIs: they move "
                 f"{', '.join(axes)}. Leave other POIs out of the ports, or add actuators."
             )
         return cls(poi, axes, T, np.array([[float(one == channel)] for one in axes]), name)

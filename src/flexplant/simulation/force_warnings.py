@@ -1,4 +1,4 @@
-"""Forces of a run: what a move needs, compared with ranges, and actuators that push apart."""
+"""Forces of a run: requirements of a move compared with ranges, and opposing actuators."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from .motion import SetPointProfile
 from .nonlinear_elements import Saturation
 from .response import Response
 
-#: derivatives of a move whose forces are counted: position (springs), velocity, acceleration
+#: number of derivatives of a move whose forces count: position (springs), velocity, acceleration
 _TERMS = 3
-#: excess, as a fraction of a range, that is not mentioned: no range is known better
+#: fraction of a range up to which an excess is ignored, since ranges are not known better
 _MET = 1e-3
 
 
 def warn_beyond_ranges(
     plant: StandardPlant, signals: Mapping[str, Any], elements: Mapping[str, Any], time: FloatArray
 ) -> None:
-    """Warn of the `Saturation` that moves of references exceed, with what they need.
+    """Warn of a `Saturation` that moves of references exceed, with the required values.
 
     Values and rates of forces and readings are those of the plant near rest that follows the moves
-    exactly, without the forces that answer disturbances. References without a set-point profile
+    exactly, without the forces that react to disturbances. References without a set-point profile
     count as at rest.
     """
     limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
@@ -76,11 +76,11 @@ def _limit(given: Any) -> Saturation | None:
 def _needed(
     plant: StandardPlant, moves: Mapping[str, SetPointProfile], names: list[str], time: FloatArray
 ) -> dict[str, FloatArray]:
-    """Return what actuators apply and sensors read over time, by name, while moves are followed."""
+    """Return actuator forces and sensor readings over time, by name, during moves."""
     found = {name: moves[name].at(time).position for name in names if name in moves}
     try:
         driven = driven_axes(plant, freq=resting_frequency(plant))
-    except AssumptionError:  # the plant has no inverse, which is for the design to say
+    except AssumptionError:  # the plant has no inverse, which the design reports
         return found
     followed = {
         p.derived(axis, "ref"): p.channel(axis) for p, axis in plant.assembled.ports.followed
@@ -108,21 +108,22 @@ def _needed(
     return found
 
 
-#: part of a run at its end in which forces are compared with their mean, and its fewest samples
+#: fraction of a run at its end for the mean of forces, and its least number of samples
 _END, _FEWEST = 0.1, 20
 
 
-#: steady force that is worth a warning, relative to the largest force of any actuator in the run
+#: steady force, relative to the largest force of any actuator in the run, above which a warning is
+#: given
 _SHARE = 0.05
 
 
-#: times the standard deviation at the end, below which a mean is not called steady
+#: multiple of the standard deviation at the end above which a mean counts as steady
 _STEADY = 3.0
 
 
 def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     """Warn of steady forces at the end of a run that move none of the axes of the POIs."""
-    # whatever the run does, these forces only heat the actuators and bend what is between them
+    # these forces only heat the actuators and bend the structure between them
     count = max(_FEWEST, round(_END * run.time.size))
     if not loop.machine.ports.z or len(loop.driven) < 2 or run.time.size <= count:
         return
@@ -136,7 +137,7 @@ def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     # the deviation of these forces alone: those that move the machine may vary more
     about = opposing_part(loop.machine, loop.driven, end.reshape(len(end), -1)).reshape(end.shape)
     steady = np.abs(mean) > np.maximum(_SHARE * most, _STEADY * about.std(axis=2))
-    opposed = np.sum(steady, axis=0) > 1  # no actuator pushes against another alone
+    opposed = np.sum(steady, axis=0) > 1  # a single actuator cannot oppose itself
     if np.any(opposed):
         worst = int(np.argmax(np.where(opposed, np.abs(mean).max(axis=0), -np.inf)))
         warn(_said(loop, mean[:, worst], steady[:, worst], float(most[worst])))
@@ -151,7 +152,7 @@ def _said(loop: ClosedLoop, mean: FloatArray, steady: FloatArray, most: float) -
         if steady[i]
     ]
     return (
-        f"at the end of the run actuators keep pushing against each other: {some_names(names)}. "
+        f"at the end of the run actuators steadily push against each other: {some_names(names)}. "
         f"These forces move none of the POIs' axes; the largest force of the run is {most:.3g}. "
         "Command the actuators together (design_servo, fx.plant.driven_axes), correct the offsets "
         "and scales of their sensors, or give the difference of the forces a weight."

@@ -15,15 +15,15 @@ from ..store import Value
 from ..words import one_of
 from .motion import SetPointProfile, setpoint
 
-#: a shaper of more factors than this lasts longer than any machine waits
+#: largest number of factors of a shaper; more would take too long
 _MOST = 6
-#: frequencies at which the residual of a band is looked at: a hundred on each lobe
+#: number of frequencies at which the residual of a band is evaluated: a hundred on each lobe
 _LINES = 100
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class InputShaper(Value):
-    """A few impulses whose answers cancel in the modes that they are made for.
+    """A few impulses whose responses cancel in the modes for which they are designed.
 
     A command is replaced by ``sum_i a_i command(t - t_i)``, with ``sum_i a_i = 1``; made by
     `input_shaper`.
@@ -31,9 +31,9 @@ class InputShaper(Value):
     Parameters
     ----------
     times : (n,) array [s]
-        From 0.
+        Times of the impulses, from 0.
     amplitudes : (n,) array
-        Positive: no actuator is asked for more than the command asks.
+        Positive amplitudes, so that no actuator force exceeds that of the command.
     """
 
     times: FloatArray
@@ -45,11 +45,11 @@ class InputShaper(Value):
 
     @property
     def duration(self) -> float:
-        """By how much a move becomes longer [s]."""
+        """Increase of the duration of a move [s]."""
         return float(self.times[-1])
 
     def residual(self, freq: npt.ArrayLike, damping: npt.ArrayLike) -> FloatArray:
-        """Return the vibration that is left of modes, as a part of that without the shaper.
+        """Return the remaining vibration of modes relative to that without the shaper.
 
         ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta omega t_i) e^(j omega_d t_i)|``, after an
         impulse [Singer1990]_.
@@ -67,7 +67,7 @@ class InputShaper(Value):
         """
         omega = 2.0 * np.pi * np.atleast_1d(positive_array(freq, "freq"))
         zeta = np.broadcast_to(real_array(damping, "damping"), omega.shape)
-        # e^(s* t) with the conjugate pole turned back in time, from the last impulse
+        # e^(s* t) with the conjugate pole, backwards in time from the last impulse
         pole = zeta * omega + 1j * omega * np.sqrt(1.0 - zeta**2)
         turns = np.exp(pole[:, None] * (self.times - self.times[-1]))
         return np.asarray(np.abs(turns @ self.amplitudes))
@@ -79,7 +79,7 @@ class InputShaper(Value):
         """
         delays = self.times / move.tick
         edges = np.unique(np.concatenate([move.edges + late for late in delays]))
-        # edges that rounding separates are one
+        # edges that only rounding separates are merged
         edges = edges[np.concatenate([[True], np.diff(edges) > 1e-12 * edges[-1]])]
         middle = 0.5 * (edges[1:] + edges[:-1])
         states = np.zeros((edges.size - 1, 5))
@@ -130,10 +130,10 @@ def input_shaper(
 ) -> InputShaper:
     """Return the shaper that leaves one or several modes at rest after a move.
 
-    ZV has two impulses half a period apart; ZVD three, whose residual is level at the mode; EI
-    three, which leave `left` at the mode and nothing on both sides of it. With `change` as many ZV
-    shapers follow each other, at frequencies spread over the band, as it takes to leave less than
-    `left` everywhere in it. Several modes have a shaper each, one after the other.
+    ZV has two impulses half a period apart; ZVD has three, with zero slope of the residual at the
+    mode; EI has three, with the residual `left` at the mode and zero on both sides. With `change`,
+    ZV shapers at frequencies over the band are combined until less than `left` remains everywhere
+    in it. Several modes get one shaper each, in series.
 
     Parameters
     ----------
@@ -142,11 +142,11 @@ def input_shaper(
     damping : float or (k,) array
         Damping ratios below 1.
     kind : {"ZV", "ZVD", "EI"}
-        Used where `change` is 0.
+        Kind of the shaper if `change` is 0.
     change : float
-        By which part of itself a frequency may be off, to both sides.
+        Relative uncertainty of a frequency, to both sides.
     left : float
-        Part of the vibration that may be left.
+        Largest remaining fraction of the vibration.
 
     Returns
     -------
@@ -155,8 +155,8 @@ def input_shaper(
     Raises
     ------
     ModelError
-        When a frequency is not positive, a damping ratio not below 1, or the band so wide that six
-        shapers leave more than `left`.
+        When a frequency is not positive, a damping ratio not below 1, or the band so wide that more
+        than `left` remains with six shapers.
 
     References
     ----------
@@ -175,11 +175,13 @@ def input_shaper(
     modes = np.atleast_1d(positive_array(freq, "freq"))
     ratios = np.broadcast_to(real_array(damping, "damping"), modes.shape)
     one_of(kind, "kind", ("ZV", "ZVD", "EI"))
-    between(left, "left", 0.0, 1.0, "It is a part of the vibration.")
+    between(left, "left", 0.0, 1.0, "It is a fraction of the vibration.")
     if np.any((ratios < 0) | (ratios >= 1.0)):
-        raise ModelError("damping ratios lie between 0 and 1: a mode that turns is shaped.")
+        raise ModelError(
+            "damping ratios lie between 0 and 1, since only oscillating modes are shaped."
+        )
     if change:
-        between(change, "change", 0.0, 0.5, "It is a part of the frequency.")
+        between(change, "change", 0.0, 0.5, "It is a fraction of the frequency.")
         found = [_over_band(f, zeta, change, left) for f, zeta in zip(modes, ratios, strict=True)]
     else:
         weights = {"ZV": (1, 1), "ZVD": (1, 2, 1), "EI": (1 + left, 2 - 2 * left, 1 + left)}[kind]
@@ -188,7 +190,7 @@ def input_shaper(
 
 
 def _half_periods(freq: float, zeta: float, weights: tuple[float, ...]) -> InputShaper:
-    """Return impulses half a damped period apart, as large as their answers must be at the end."""
+    """Return impulses half a damped period apart, with amplitudes that cancel at the end."""
     root = np.sqrt(1.0 - zeta**2)
     decay = np.exp(-np.pi * zeta / root)  # in half a period
     sizes = np.array(weights) * decay ** np.arange(len(weights))
@@ -196,7 +198,7 @@ def _half_periods(freq: float, zeta: float, weights: tuple[float, ...]) -> Input
 
 
 def _over_band(freq: float, zeta: float, change: float, left: float) -> InputShaper:
-    """Return ZV shapers at Chebyshev's points of a band, as many as it takes."""
+    """Return enough ZV shapers at Chebyshev points of a band."""
     for count in range(1, _MOST + 1):
         points = np.cos(np.pi * (np.arange(count) + 0.5) / count)
         one = reduce(
@@ -207,8 +209,8 @@ def _over_band(freq: float, zeta: float, change: float, left: float) -> InputSha
         if one.residual(band, zeta).max() <= left:
             return one
     raise ModelError(
-        f"{_MOST} shapers leave more than {left:.0%} of a mode that is off by {change:.0%}: allow "
-        "more with left=, or measure the frequency better."
+        f"{_MOST} shapers leave more than {left:.0%} of a mode with a frequency error of "
+        f"{change:.0%}: allow more with left=, or measure the frequency better."
     )
 
 
@@ -225,9 +227,9 @@ def quiet_setpoint(
     """Return a set-point of third order whose ramps last whole periods of one or two modes.
 
     The motion is ``distance`` times three rectangles of lengths T_1 >= T_2 >= T_3 convolved, whose
-    transforms are zero where ``f T_i`` is a whole number: T_3 lasts a period of the first mode, and
-    T_2 one of the second. Bounds on velocity and acceleration hold; the jerk is what the first
-    period gives.
+    transforms are zero where ``f T_i`` is a whole number: T_3 is a period of the first mode, and
+    T_2 one of the second. Bounds on velocity and acceleration hold; the jerk follows from the first
+    period.
 
     Parameters
     ----------
@@ -235,7 +237,7 @@ def quiet_setpoint(
     velocity, acceleration : float [m/s, m/s^2]
         Bounds on the magnitudes.
     freq : float or (2,) array [Hz]
-        Of the mode, or of two.
+        Frequency of the mode, or of two modes.
     start, settle, exposure : float
         As in `setpoint`.
 
@@ -264,7 +266,7 @@ def quiet_setpoint(
     length = abs(float(distance))
     third = 1.0 / float(modes[0])
     second = max(v / a, third)
-    if modes.size > 1:  # as many whole periods as the bound on acceleration asks for
+    if modes.size > 1:  # as many whole periods as the bound on acceleration requires
         second = float(np.ceil(second * modes[1] - 1e-9)) / float(modes[1])
     first = max(length / v, second + third, length / (a * second))
     speed = length / first

@@ -23,12 +23,12 @@ from .sampled_runs import simulate
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedFeedforward(Value):
-    """A feedforward with learnt gains, and the error of each trial; prints as a table.
+    """A feedforward with learned gains, and the error of each trial; prints as a table.
 
     Parameters
     ----------
     feedforward : Feedforward
-        With the gains of the move of the least error.
+        Feedforward with the gains of the move with the smallest error.
     errors : (trials,) array [m]
         Rms of the error in each move.
     gains : (trials, r, 5) array
@@ -59,18 +59,18 @@ def learn_feedforward(
     """Return feedforward gains tuned on repeated moves, by least squares on basis functions.
 
     The basis functions are the set-point's derivatives, one for each axis of the forces. In a
-    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``; Phi, what a
-    unit of each does to the error in closed loop, is from a model, and may be rough: each move
-    measures what is left, and the gains that least squares find for it are added. The residue e_0
-    itself is never modelled, so that whatever is left after the feedforward and repeats (a wrong
-    mass, a compliance, a delay) is compensated as far as the basis functions reach.
+    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``; Phi, the effect
+    of a unit of each gain on the error in closed loop, comes from a model and may be approximate:
+    each move measures the remaining error, and the least-squares gains for it are added. The
+    residual e_0 is not modelled, so that every repeating error (a wrong mass, a compliance, a
+    delay) is compensated as far as the basis functions allow.
 
     Parameters
     ----------
     start : Feedforward
         Feedforward of the first move.
     trial : function
-        Makes the move with a Feedforward on the machine and returns what was recorded.
+        Function that makes the move with a Feedforward on the machine and returns the record.
     loop : ClosedLoop
         The same controller (without feedforward) on a model of the machine, for Phi.
     move : SetPointProfile
@@ -79,9 +79,10 @@ def learn_feedforward(
     terms : sequence of str
         Derivatives that are tuned.
     trials : int
-        Moves.
+        Number of moves.
     step : float
-        Part of each correction that is made: 1 unless the noise is larger than what repeats.
+        Fraction of each correction that is applied: 1 unless the noise is larger than the repeating
+        error.
 
     Returns
     -------
@@ -117,7 +118,7 @@ def learn_feedforward(
     orders = term_numbers(terms)
     part = positive(step, "step")
     if part > 1.0:
-        raise ModelError(f"step is a part of a correction, at most 1, got {part:g}. Pass 1.0.")
+        raise ModelError(f"step is a fraction of a correction, at most 1, got {part:g}. Pass 1.0.")
     _, poi, own, _ = tracked(loop.machine, start.reference)
     others = [one for one in start.axes if one != poi.channel(own)]
     channels = [poi.derived(own, "error"), *others]
@@ -164,7 +165,7 @@ def _gain_effects(
     orders: list[int],
     channels: list[str],
 ) -> FloatArray:
-    """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
+    """Return the effect of a unit of each gain on the errors (n_gain, n_channel * n_time)."""
     plant = loop.machine.replace(evaluation=None)
     forced = close_loop(
         plant.replace(evaluation=None), *loop.blocks, known_forces(plant), idle=loop.idle
@@ -174,7 +175,7 @@ def _gain_effects(
     rows = []
     for axis in range(len(start.axes)):
         for order in orders:
-            # of size one: a unit gain may make forces far larger than any that is meant
+            # scaled to size one: a unit gain may cause forces that are far too large
             size = float(np.max(np.abs(signals[order]))) or 1.0
             force = np.outer(start.T[:, axis], signals[order] / size)
             given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}

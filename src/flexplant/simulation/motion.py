@@ -22,8 +22,8 @@ ON_GRID = 1e-6
 class Motion(NamedTuple):
     """Position and its derivatives at the same times.
 
-    What is above the order of a set-point is given as zero: it is an impulse where the highest
-    derivative jumps.
+    Derivatives above the order of a set-point are given as zero; they are impulses where the
+    highest derivative jumps.
 
     Parameters
     ----------
@@ -52,19 +52,19 @@ class SetPointProfile(Value):
     Parameters
     ----------
     edges : (m + 1,) array [ticks]
-        Where the phases begin, from 0, and the end of the last one.
+        Starts of the phases, from 0, and end of the last phase.
     lengths : (m,) array [s]
-        Of the phases, also where the edges are large numbers beside them.
+        Lengths of the phases, accurate also where the edges are much larger numbers.
     from_end : (m,) bool array
         Whether a phase's state is given at its end, not at its beginning.
     states : (m, 5) array
         Position, velocity, acceleration, jerk and snap of each phase there.
     start, stop : float [m or rad]
-        Where it rests before and after.
+        Position at rest before and after.
     order : int
-        Of the highest derivative, constant in each phase: 2, 3 or 4.
+        Order of the highest derivative, which is constant in each phase: 2, 3 or 4.
     tick : float [s]
-        The grid that all edges are whole numbers on; 1 s when there is none.
+        Grid spacing of the edges; 1 s without a grid.
     gridded : bool
         Whether there is a grid.
     exposures : (k, 2) array [s]
@@ -94,7 +94,7 @@ class SetPointProfile(Value):
 
     @property
     def duration(self) -> float:
-        """Time until all is over, rests and windows included [s]."""
+        """Total time including rests and windows [s]."""
         return float(self.edges[-1]) * self.tick
 
     @property
@@ -104,7 +104,7 @@ class SetPointProfile(Value):
 
     @property
     def peaks(self) -> Motion:
-        """Largest magnitudes that are reached, the position's as the distance from the start."""
+        """Largest magnitudes; that of the position is the distance from the start."""
         found = np.abs(np.concatenate([self._at(self.edges[:-1]), self._before()], axis=1))
         far = max(abs(self.stop - self.start), float(np.ptp(self._at(self.edges[:-1])[0])))
         return Motion(np.asarray(far), *found[1:].max(axis=1))
@@ -281,7 +281,7 @@ def constant_snap(state: FloatArray, t: float | FloatArray) -> FloatArray:
 def _durations(
     distance: float, velocity: float, acceleration: float, jerk: float, snap: float | None = None
 ) -> tuple[float, float, float, float]:
-    """Return for how long snap, jerk, acceleration and velocity are held in one flank."""
+    """Return the durations of constant snap, jerk, acceleration and velocity in one flank."""
     # a jerk pulse lasts J = 2 ramp + hold and adds the acceleration a; the acceleration lasts 2 J +
     # steady and adds the velocity a (J + steady)
     if snap is None:
@@ -365,7 +365,8 @@ def setpoint(
     settle, exposure : float [s]
         Time to settle after the motion, and length of the exposure window after that.
     rate : float, optional [Hz]
-        Of the controller, to switch on its samples; rests are rounded up to whole samples.
+        Rate of the controller, if the motion shall switch at its samples; rests are rounded up to
+        whole samples.
 
     Returns
     -------
@@ -423,11 +424,12 @@ def scan(
     length : float [m or rad]
         Signed length that is exposed at constant velocity.
     velocity : float [m/s]
-        During the exposure; with a grid lowered so that the exposure takes whole samples.
+        Velocity during the exposure; with a grid it is lowered so that the exposure takes whole
+        samples.
     acceleration, jerk, snap : float [m/s^2, m/s^3, m/s^4]
         Bounds, as for `setpoint`.
     settle : float [s]
-        At constant velocity before the exposure.
+        Settling time at constant velocity before the exposure.
     start : float [m]
         Position before the scan. The exposure begins later: see ``at(exposures)``.
     rest, rate : as for `setpoint`
@@ -456,7 +458,7 @@ def scan(
     grid = _Grid(rate)
     wait = [grid.whole(rest, "rest"), grid.whole(settle, "settle")]
     exposed = grid.whole(abs(signed) / bounds[0], "length / velocity")
-    exposed = max(exposed, grid.tick) if grid else exposed  # a sample at least
+    exposed = max(exposed, grid.tick) if grid else exposed  # at least one sample
     speed = abs(signed) / exposed
     t = grid.durations(speed, bounds[1:])
     up = flank(t, speed)

@@ -1,4 +1,4 @@
-"""A machine whose ports move with its position: exact within each sample.
+"""A machine whose ports move with its position, simulated exactly within each sample.
 
 ``x+ = A x + sum_i int e^(A (T - s)) b_i(p(s)) f_i(s) ds``: the modes do not depend on the position,
 only where forces act and motions are seen. The integrals are taken by Gauss's rule, to rounding,
@@ -27,7 +27,8 @@ from .motion import SetPointProfile
 from .nonlinear_elements import Acting
 from .runs import ABREAST, NO_NOISE, STRETCH
 
-#: nodes of Gauss's rule in a sample, beyond one for each radian of the fastest mode
+#: number of nodes of Gauss's rule in a sample, in addition to one for each radian of the fastest
+#: mode
 _NODES = 12
 
 
@@ -46,12 +47,12 @@ class Trajectory:
 
 
 def trajectory(plant: StandardPlant, moving: Mapping[str, Any], time: FloatArray) -> Trajectory:
-    """Return how positions move that were given: SetPoints, functions, or a value a sample."""
+    """Return the paths of positions: from SetPoints, functions, or a value per sample."""
     ports = plant.assembled.ports
     known = {one.name: one for one in ports.positions}
     require_known("position to move", moving, known)
     dt = float(plant.dt)
-    # the end of the last sample counts too
+    # includes the end of the last sample
     ends = np.append(time, time[-1] + dt)
     paths: dict[str, Callable[[FloatArray], FloatArray]] = {}
     for name, path in moving.items():
@@ -91,7 +92,7 @@ def _path(name: str, path: Any, time: FloatArray) -> Callable[[FloatArray], Floa
 
 
 class _Force(NamedTuple):
-    """A force that moves: whole samples and the fraction of one by which it is late."""
+    """A moving force with its delay: whole samples and a fraction."""
 
     port: Any
     whole: int
@@ -141,10 +142,10 @@ class MovingPlant:
         self._fixed(noise)
 
     def _fixed(self, noise: bool) -> None:
-        """Take what moves out of the matrices of the sampled plant."""
+        """Separate the moving parts of the matrices of the sampled plant."""
         g, plant = self.plant.system, self.plant
         A, B, C = np.array(g.A), np.array(g.B), np.array(g.C)
-        #: the state or input that holds the new, and the old, sample of each force
+        #: state or input with the new, and the old, sample of each force
         self.new: list[tuple[bool, int]] = []
         self.old: list[tuple[bool, int]] = []
         for force in self.forces:
@@ -170,7 +171,7 @@ class MovingPlant:
         self.noise = _noise_without(loud, {force.port.name for force in self.forces})
 
     def each(self, count: int) -> Iterator[Sample]:
-        """Return the matrices of so many samples, from the first."""
+        """Return the matrices of a number of samples, from the first."""
         self.first = 0
         loud = [force.asd / np.sqrt(2.0) for force in self.forces]
         while self.first < count:
@@ -256,7 +257,7 @@ class MovingMachine(MovingPlant):
         w = np.broadcast_to(given, (runs, k, nw)).copy()
         state_noise = self._drawn(w, B, k)
         inputs = np.zeros((runs, nw + len(plant.u)))
-        flow = sp.csr_array(self.A)  # modes see themselves alone
+        flow = sp.csr_array(self.A)  # modes only act on themselves
         for i in range(k):
             x = self.x
             inputs[:, :nw] = w[:, i]
@@ -368,8 +369,8 @@ class _Rule:
     @cached_property
     def white(self) -> tuple[FloatArray, FloatArray]:
         """Mixing (q, r) of white samples at the nodes, and what r of them add (b, 2 r, 6)."""
-        # over the states of each mode, for three columns of two entries: nodes for the fastest mode
-        # are many, the singular values of what they add to all modes fall fast
+        # over the states of each mode, for three columns of two entries: the fastest mode needs
+        # many nodes, but the singular values of their effect on all modes decrease fast
         weight, share, flow = self._at(0.0, self.h)
         parts = np.einsum("q,qj,qbcd->qbcjd", np.sqrt(weight), share, flow)
         full = parts.reshape(weight.size, -1)
@@ -380,7 +381,7 @@ class _Rule:
         return U[:, :kept], np.ascontiguousarray(ordered)
 
     def kicks(self, columns: FloatArray) -> FloatArray:
-        """Return what r white samples, mixed as `white` says, add to the states (k, r, 2 b)."""
+        """Return the effect of r white samples, mixed by `white`, on the states (k, r, 2 b)."""
         k, b = len(columns), len(self.pairs)
         sides = columns.reshape(k, 3, b, 2).transpose(2, 1, 3, 0).reshape(b, 6, k)
         found = self.white[1] @ sides  # (b, 2 r, k)
@@ -426,12 +427,13 @@ def _noise_without(plant: StandardPlant, moving: set[str]) -> WhiteNoise:
 
 
 def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
-    """Refuse what is not exact: filters and late sensors that move, motions that follow at once."""
+    """Refuse inexact cases: moving filters and late sensors, motions that respond without delay."""
     own = plant.assembled.realisation
     if own.coupling is not None or own.static_outputs.size:
         raise ModelError(
-            f"the plant's modes are in the form {own.form!r}, or residual vectors answer at once: "
-            "a moving machine needs modes by themselves. Take proportional or modal damping, and "
+            f"the plant's modes are in the form {own.form!r}, or residual vectors respond "
+            "without delay: a moving machine needs uncoupled modes. Use proportional or modal "
+            "damping, and "
             "residual=fx.plant.FastStates()."
         )
     if plant.modal_states[0] and any(hasattr(port, "push") for port in moves):
@@ -452,7 +454,7 @@ def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
         }
         if why := [reason for reason, holds in refused.items() if holds]:
             raise ModelError(
-                f"{port.name!r} moves and {why[0]}: what it does within a sample is not computed "
-                "along a trajectory. Leave that out of ports that move, or put its dynamics into "
+                f"{port.name!r} moves and {why[0]}: its motion within a sample is not computed "
+                "along a trajectory. Leave this out of moving ports, or put its dynamics into "
                 "the controller's blocks."
             )

@@ -1,4 +1,4 @@
-"""What is not linear in a loop: limits, steps, hysteresis, lost samples, times that jitter."""
+"""Nonlinear elements of a loop: limits, quantisation, hysteresis, lost samples, jitter."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class Saturation(Value):
     limit : float [unit of the channel]
         Largest magnitude; infinite when only the rate is limited.
     rate : float [unit/s], optional
-        Largest change per time; the signal starts at 0. Not limited when not given.
+        Largest change per time; the signal starts at 0. None: not limited.
     least : float [unit of the channel], optional
-        Smallest value; ``-limit`` when not given. 0 for what only pushes.
+        Smallest value; ``-limit`` by default. 0 for an actuator that only pushes.
 
     Raises
     ------
     ModelError
-        When a limit is not positive, or `least` is; so for the numbers of all other elements.
+        When a limit is not positive, or `least` is positive; likewise for the other elements.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class Saturation(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Quantiser(Value):
-    """A signal in whole steps: ``step round(v / step)``, of a converter or an encoder.
+    """A signal in discrete steps: ``step round(v / step)``, as from a converter or an encoder.
 
     Parameters
     ----------
@@ -91,13 +91,13 @@ class Quantiser(Value):
     step: float = field(metadata=checked(positive))
 
 
-#: what an element does to the values (runs,) of a channel at a sample; it returns as many
+#: function of the values (runs,) of a channel at a sample, which returns new values (runs,)
 Act: TypeAlias = Callable[[FloatArray], FloatArray]
 
 
 @runtime_checkable
 class Element(Protocol):
-    """What a nonlinear element of one's own has: `begin`. It may be any object.
+    """Protocol of your own nonlinear element: any object with `begin`.
 
     >>> class DeadZone:
     ...     def begin(self, dt, generators):
@@ -107,28 +107,28 @@ class Element(Protocol):
     """
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return what acts on the values (runs,) of the channel, sample after sample.
+        """Return the function that acts on the values (runs,) of the channel, sample by sample.
 
-        On a disturbance they are those of the channel of y that the element names as `reads`, and
-        what it returns is the force: a stop, a stiffening spring.
+        On a disturbance they are values of the channel of y that the element names as `reads`, and
+        the result is the force, as of a stop or a stiffening spring.
 
         Parameters
         ----------
         dt : float [s]
-            Between two samples of the controller.
+            Sampling time of the controller.
         generators : sequence of Generator
-            One for each of the runs, for what is random: a run is then the same whichever others
-            are computed with it. What is remembered starts anew here.
+            Random generators, one for each run, so that a run does not depend on the others. The
+            memory of the element starts again here.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Hysteresis(Value):
-    """Play of a signal, a gear or a magnet: it follows once it is pushed by `width`.
+    """Play of a signal, a gear or a magnet: the output follows after a change of `width`.
 
-    ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))``, from 0. Sums of these are the model of
-    Prandtl and Ishlinskii.
+    ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))``, from 0. Sums of these are the
+    Prandtl-Ishlinskii model.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Hysteresis(Value):
     width: float = field(metadata=checked(positive))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the play of so many runs."""
+        """Return the play for the given number of runs."""
         now = np.zeros(len(generators))
 
         def play(values: FloatArray) -> FloatArray:
@@ -158,12 +158,12 @@ class Hysteresis(Value):
 
 @dataclass(frozen=True, eq=False)
 class Dropout(Value):
-    """Samples that get lost: the last one that came is read again.
+    """Lost samples: the last received value is read again.
 
     Parameters
     ----------
     share : float
-        Of the samples, each by itself; the first one comes.
+        Probability of losing a sample, independent for each sample; the first one is never lost.
 
     Examples
     --------
@@ -174,11 +174,13 @@ class Dropout(Value):
     """
 
     share: float = field(
-        metadata=checked(between, low=0.0, high=1.0, hint="It is a part of the samples: 0.01.")
+        metadata=checked(
+            between, low=0.0, high=1.0, hint="It is a fraction of the samples, such as 0.01."
+        )
     )
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return what loses samples of so many runs."""
+        """Return the function that loses samples for the given number of runs."""
         last = np.full(len(generators), np.nan)
 
         def read(values: FloatArray) -> FloatArray:
@@ -191,17 +193,18 @@ class Dropout(Value):
 
 @dataclass(frozen=True, eq=False)
 class Friction(Value):
-    """Dry friction with presliding, on a disturbance at its place: a spring that yields.
+    """Dry friction with presliding, on a disturbance at its place: an elastoplastic spring.
 
     ``-s``, ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])`` within ``-level`` and ``level``, in every
-    finer sample: held over it, so that stiffness dt^2 must be small beside the mass.
+    finer sample: it is constant over a sample, so that stiffness dt^2 must be small compared with
+    the mass.
 
     Parameters
     ----------
     level : float [N]
-        At which it slides.
+        Force at which it slides.
     stiffness : float [N/m]
-        Before it does.
+        Stiffness before sliding.
     reads : str
         The channel of y that measures the motion x at the place, without its noise.
 
@@ -219,7 +222,7 @@ class Friction(Value):
     reads: str = field(metadata=checked(instance, kind=str, hint="Name a channel of y."))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the forces of so many runs, none at the first sample."""
+        """Return the forces for the given number of runs, zero at the first sample."""
         force, last = np.zeros(len(generators)), np.full(len(generators), np.nan)
 
         def pull(motion: FloatArray) -> FloatArray:
@@ -233,14 +236,15 @@ class Friction(Value):
 
 @dataclass(frozen=True, eq=False)
 class Jitter(Value):
-    """Times that jitter: a sensor is read early, or a command goes out late, by up to `spread`.
+    """Jitter: a sensor is read early, or a command is applied late, by up to `spread`.
 
-    Uniform, in steps of the finer samples, each sample and channel by itself. It needs `finer`.
+    It is uniform in steps of the finer samples, independent for each sample and channel. It needs
+    `finer`.
 
     Parameters
     ----------
     spread : float [s]
-        The largest one; less than the time between two samples of the controller.
+        Largest jitter; less than the sampling time of the controller.
 
     Examples
     --------
@@ -264,15 +268,15 @@ class Jitter(Value):
         return found
 
 
-#: what may act on a channel
+#: types that may act on a channel
 Acts: TypeAlias = "Saturation | Quantiser | Jitter | Element"
 
 
 class Acting:
-    """The elements on some channels, sample after sample and in place.
+    """The elements on some channels, applied sample by sample and in place.
 
     Values are quantised first, then limited in rate and magnitude: a converter before its
-    amplifier; then the others act as they were listed. `hold` finer samples of dt / hold are one.
+    amplifier; then the others act in the listed order. `hold` finer samples of dt / hold are one.
     """
 
     def __init__(
@@ -301,7 +305,7 @@ class Acting:
         self.is_slow = bool(np.any(np.isfinite(self.change)))
 
     def begin(self, generators: Sequence[np.random.Generator]) -> None:
-        """Start at 0, so many runs side by side; what is random is apart from the runs' noises."""
+        """Start a number of runs at 0; random elements do not use the noises of the runs."""
         shape = (len(generators), self.step.size)
         self.last, self.low, self.high = np.zeros((3, *shape))
         self.acts: list[tuple[int, Act]] = []
@@ -335,7 +339,7 @@ class Acting:
             values[:, i] = _acted(act, values[:, i])
 
     def read(self, j: int, motion: FloatArray, y: FloatArray) -> None:
-        """Read sensors early: put what they were into y (runs, n), `motion` being what they are."""
+        """Read sensors early: put past values into y (runs, n); `motion` has the present values."""
         if not self.jitters:
             return
         if not j:
@@ -345,7 +349,7 @@ class Acting:
         self.past[j] = motion
 
     def send(self, j: int, command: FloatArray) -> None:
-        """Let commands (runs, n) go out late, in place: until then the one before acts."""
+        """Apply commands (runs, n) late, in place: until then the previous command acts."""
         if not self.jitters:
             return
         if not j:
@@ -360,7 +364,7 @@ class Acting:
 
 
 def _begun(element: Element, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-    """Return what an element does in these runs; one that cannot be called is refused."""
+    """Return the function of an element for these runs; refuse one that cannot be called."""
     why = why_not_called(element.begin, dt, generators)
     if why:
         raise ModelError(
@@ -378,7 +382,7 @@ def _begun(element: Element, dt: float, generators: Sequence[np.random.Generator
 
 
 def _acted(act: Act, values: FloatArray) -> FloatArray:
-    """Return what an element makes of the values (runs,)."""
+    """Return the result of an element for the values (runs,)."""
     found = np.asarray(act(values.copy()))
     if found.shape != values.shape or found.dtype.kind not in "fiu":
         raise ModelError(
@@ -386,12 +390,14 @@ def _acted(act: Act, values: FloatArray) -> FloatArray:
             "for each run: element.begin(dt, generators)(values) is (runs,)."
         )
     if np.any(np.isnan(found)) and not np.any(np.isnan(values)):
-        raise ModelError(f"an element returned {short(found)} for {short(values)}. Mend it there.")
+        raise ModelError(
+            f"an element returned {short(found)} for {short(values)}. Correct the element."
+        )
     return found
 
 
 class Answering:
-    """Forces that answer motions, in every finer sample: the elements on channels of w."""
+    """Forces that react to motions in every finer sample: the elements on channels of w."""
 
     def __init__(self, plant: StandardPlant, elements: Mapping[str, Any], dt: float) -> None:
         self.dt, self.parts = dt, []
@@ -402,26 +408,27 @@ class Answering:
                 if not isinstance(one, Element) or reads is None:
                     raise ModelError(
                         f"{name!r} is a disturbance, but {short(one)} does not name the channel of "
-                        "y that it answers as `reads`. Use simulation.Friction, or an element with "
+                        "y to which it reacts as `reads`. Use simulation.Friction, or an element "
+                        "with "
                         "`reads`; limits act on sensors and actuators."
                     )
                 require_known("channel that an element reads", [reads], plant.y, "the plant's y")
                 if np.any(plant.D21[:, i]):
                     raise ModelError(
                         f"{name!r} reaches a sensor within the sample, before an element could "
-                        "answer its motion. Give the accelerometer dynamics that roll off."
+                        "react to its motion. Give the accelerometer dynamics that roll off."
                     )
                 self.parts.append((i, plant.y.index(reads), one, plant.B1[:, i].copy()))
 
     def begin(self, generators: Sequence[np.random.Generator]) -> None:
-        """Start anew, so many runs side by side."""
+        """Start again with a number of runs."""
         own = [one.spawn(len(self.parts)) for one in generators]
         self.acts = [
             _begun(part[2], self.dt, [each[j] for each in own]) for j, part in enumerate(self.parts)
         ]
 
     def push(self, motion: FloatArray, following: FloatArray, w: FloatArray) -> None:
-        """Add the forces at motions (runs, ny) to w (runs, nw), and what they do to the states."""
+        """Add the forces at motions (runs, ny) to w (runs, nw), and their effect to the states."""
         for act, (i, row, _, column) in zip(self.acts, self.parts, strict=True):
             force = _acted(act, motion[:, row])
             w[:, i] += force
@@ -458,5 +465,5 @@ def _checked_elements(name: str, element: Any) -> list[Acts]:
             f"or Friction or have begin(dt, generators), got {short(element)}. Pass one, or a list."
         )
     if len(set(kinds)) < len(kinds):
-        raise ModelError(f"{name!r} has two elements of one kind: give the tighter one.")
+        raise ModelError(f"{name!r} has two elements of one kind: give only one.")
     return listed

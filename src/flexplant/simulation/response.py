@@ -1,4 +1,4 @@
-"""What a run recorded, and the servo metrics of it: RMS, moving average, moving deviation."""
+"""Records of a run, and servo metrics: RMS, moving average, moving standard deviation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Response(Value, Mapping[str, FloatArray]):
     units : mapping {channel: unit}, optional
         SI units of the channels that have a known one.
     seed : int or tuple of int, optional
-        What its noise was drawn from: passed as `rng`, it gives the same run again.
+        Seed of the noise; as `rng` it gives the same run again.
 
     Raises
     ------
@@ -58,7 +58,7 @@ class Response(Value, Mapping[str, FloatArray]):
     units: Mapping[str, str] = field(default_factory=dict)
     seed: int | tuple[int, ...] | None = None
 
-    # values are compared by identity; Mapping's == would compare arrays
+    # compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
@@ -114,8 +114,8 @@ class Response(Value, Mapping[str, FloatArray]):
     def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the root mean square of a channel about zero, a number or one for each run.
 
-        Samples before `start` [s] are left out: transients. An unknown channel is a LabelError, a
-        start that leaves nothing a ModelError; so in all that follow.
+        Samples before `start` [s] are left out (transients). An unknown channel raises LabelError,
+        a start after the end ModelError; the same holds for the other methods.
         """
         signal = self._from(channel, start)
         unit = signal_unit(signal)
@@ -126,8 +126,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float, float]:
         """Return the root mean square over all runs, and the ends of its confidence interval.
 
-        The mean squares of two or more independent runs are taken as normal: Student's interval of
-        their mean; its lower end is not below zero.
+        The mean squares of two or more independent runs count as normal: Student's interval of
+        their mean, with a lower end of at least zero.
         """
         if self.data.ndim != 3 or self.data.shape[0] < 2:
             raise ModelError(
@@ -184,8 +184,8 @@ class Response(Value, Mapping[str, FloatArray]):
     def moving_std(self, channel: str, *, window: float = 5e-3) -> FloatArray:
         """Return the standard deviation of a channel in a window [s] centred at each time (MSD).
 
-        From the window's own mean. In lithography the MSD of the error is fading: how much the
-        image is smeared out.
+        The deviation is about the mean of the window. In lithography the MSD of the error is
+        fading, the blur of the image.
         """
         return self._moments(channel, window)[1]
 
@@ -210,7 +210,7 @@ class Response(Value, Mapping[str, FloatArray]):
         keep = self.time >= first - 0.5 * self.dt
         if not np.any(keep):
             raise ModelError(
-                f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s. "
+                f"start={first:g} s is too late: the response ends at {self.time[-1]:g} s. "
                 "Choose an earlier start, or simulate for longer."
             )
         return keep
@@ -240,12 +240,11 @@ def as_numbers(values: FloatArray) -> Numbers:
 def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Return mean and standard deviation (..., n) over `count` samples around each sample."""
     # cumulative sums restart at every multiple of `count`, and each window spans exactly one such
-    # edge: it is the tail of one stretch and the head of the next. Both are taken relative to the
-    # sample at the edge, which the window holds, so that an offset or a far-away motion, however
-    # large, costs no digits
+    # edge: it is the tail of one stretch and the head of the next. Both are relative to the sample
+    # at the edge, which lies in the window, so that a large offset does not reduce the accuracy
     n = signal.shape[-1]
     before = count // 2
-    lead = count  # a stretch of no weight before the record, so that every window has its edge
+    lead = count  # samples of zero weight before the record, so that every window has its edge
     stretches = -(-(lead + n + count) // count) + 1
     tail = stretches * count - lead - n
     edge = [(0, 0)] * (signal.ndim - 1) + [(lead, tail)]

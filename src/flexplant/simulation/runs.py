@@ -20,7 +20,7 @@ from .nonlinear_elements import Acting, Answering
 
 
 class Conditions(NamedTuple):
-    """What makes a run differ from that of the linear loop at its own samples.
+    """Conditions under which a run differs from that of the linear loop at its samples.
 
     `paths` are the places (n_time, 3) of POIs; the controller acts in every `finer`-th sample.
     """
@@ -34,7 +34,7 @@ class Conditions(NamedTuple):
 
     @property
     def one_by_one(self) -> bool:
-        """Whether there is something that is not linear."""
+        """Whether the run has nonlinear elements."""
         return bool(self.on_y or self.on_u or self.on_w)
 
 
@@ -58,7 +58,7 @@ class Moving:
         self.plant, self.paths = plant, paths
 
     def rows(self, first: int, count: int) -> list[Rows]:
-        """Return the rows of the samples from `first`; a place that comes again is found once."""
+        """Return the rows of the samples from `first`; repeated places are computed once."""
         found = []
         for name, points in self.paths.items():
             places, at = np.unique(points[first : first + count], axis=0, return_inverse=True)
@@ -72,8 +72,8 @@ class Machine(NamedTuple):
     """The matrices of one sample, arranged for speed.
 
     ``x+ = diagonal x + coupling x[partner] + inflow [x[columns]; u] + noise`` is the plant,
-    ``[c+; u; watched] = law [c; y]`` the controller. Where actuators do not apply what they are
-    commanded, ``command [c; y]`` is commanded and ``[c+; u; watched] = law [c; y; u]``.
+    ``[c+; u; watched] = law [c; y]`` the controller. Where applied commands differ from commands,
+    ``command [c; y]`` is the command and ``[c+; u; watched] = law [c; y; u]``.
     """
 
     diagonal: FloatArray
@@ -91,7 +91,8 @@ class Machine(NamedTuple):
 class Buffers(NamedTuple):
     """A stretch of samples: states (k + 1, runs, n), y (k, runs, ny), out (k, runs, ...).
 
-    On entry `states[0]` is the state now, `states[1:]` and `y` hold what noise and references add.
+    On entry `states[0]` is the present state; `states[1:]` and `y` contain the effects of noise and
+    references.
     """
 
     states: FloatArray
@@ -200,11 +201,12 @@ def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, Floa
     return diagonal, coupling, partner, rest
 
 
-#: part of a state's largest noise that is rounding: its square is that of a covariance
+#: fraction of the largest noise of a state below which it is rounding: its square is that of a
+#: covariance
 NO_NOISE = 1e-8
-#: states of a plant from which on this is not searched for: it would take longer than a run
+#: number of states above which this is not searched, since it would take longer than a run
 _MANY = 256
-#: samples that are drawn and mixed at a time: they stay in the cache
+#: number of samples drawn and mixed together, which fit the cache
 _CHUNK = 256
 
 
@@ -212,9 +214,9 @@ class Drawn:
     """The white noises of a plant, drawn for a stretch of samples at a time.
 
     Few forces through many modes make a factor whose singular values fall fast: r columns of white
-    samples are mixed into the few that are not rounding, ``L V'`` the factor. They are drawn as r,
-    whose number and order do not hang on rounding. And always for a whole stretch: a longer run
-    begins with the shorter one, bit by bit.
+    samples are mixed into the few that are not rounding, ``L V'`` the factor. They are drawn as r
+    columns, whose number and order do not depend on rounding, and always for a whole stretch, so
+    that a longer run begins with the shorter one bit by bit.
     """
 
     def __init__(self, noise: WhiteNoise, plant: StandardPlant) -> None:
@@ -259,15 +261,16 @@ class Drawn:
         return white, single
 
 
-#: samples per stretch and runs side by side: what fits the cache of one core
+#: number of samples per stretch and of parallel runs that fit the cache of one core
 STRETCH, ABREAST = 128, 16
-#: samples of the controller of which a stretch in blocks has a whole number: those of any block
+#: number of controller samples that divides a stretch in blocks, for any block size
 _WHOLE = 128
-#: a run for which the preparation of blocks must pay [samples]; a fixed one, because the first
-#: samples of a long run are those of a short one to the last bit
+#: length of a run for which the preparation of blocks must pay off [samples]; fixed, since the
+#: first samples of a long run equal those of a short one to the last bit
 _TYPICAL = 10_000
-#: part of a channel's peak by which blocks may differ from single samples, beside this many times
-#: the rounding of single samples: a channel that symmetry keeps at zero is nothing but rounding
+#: largest difference of blocks from single samples relative to the peak of a channel, in addition
+#: to this multiple of the rounding of single samples: a channel that is zero by symmetry is only
+#: rounding
 _AGREE, _ROUNDING = 1e-10, 100.0
 
 
@@ -282,12 +285,11 @@ def make_runner(
     """Return the faster way through a linear loop.
 
     Blocks of samples cost less unless a plant in modal blocks is so large that its O(n) operations
-    for a sample are fewer. They are taken when a block agrees with the same samples one by one to
-    1e-10 of each channel's peak, for white inputs as large as those of the run; the rounding of
-    single samples is seen by running them with inputs three times as large. POIs that move are
-    shown from the plant's states, which come in blocks too; of finer samples, those of one sample
-    of the controller are one step. An unstable loop goes sample by sample, and so does one with
-    elements that are not linear.
+    for a sample are fewer. They are used when a block agrees with the same samples one by one to
+    1e-10 of each channel's peak, for white inputs as large as those of the run; running single
+    samples with three times larger inputs shows their rounding. Moving POIs are computed from the
+    plant's states, which come in blocks too; the finer samples of one controller sample are one
+    step. Unstable loops and loops with nonlinear elements run sample by sample.
     """
     drawn, met = Drawn(noise, loop.machine), met or Conditions()
     if met.one_by_one:
@@ -317,7 +319,7 @@ def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
 
 
 class SampleBySample:
-    """All runs at once, each sample by itself."""
+    """All runs together, sample by sample."""
 
     abreast = ABREAST
 

@@ -1,4 +1,4 @@
-"""simulate: a sampled closed loop with its noises and set-points, run after run."""
+"""simulate: runs of a sampled closed loop with its noises and set-points."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def simulate(
 ) -> Response:
     """Return the time response of a sampled closed loop.
 
-    Within a sample: the sensors are read, the blocks update, the commands go out and are held
+    In each sample the sensors are read, the blocks update, and the commands are applied and held
     until the next sample (after the plant's delay). White disturbances act on the plant with the
     exact covariance `plant.process_noise` per sample, that of `design_kalman`; sensors have the
     variance asd^2 rate / 2.
@@ -57,56 +57,56 @@ def simulate(
     Parameters
     ----------
     loop : ClosedLoop or ScheduledLoop
-        Around a sampled plant. An unstable one is run all the same, with a warning that names
-        its spectral radius and by how much it grows in the run.
+        Loop around a sampled plant. An unstable loop is simulated too, with a warning that gives
+        its spectral radius and its growth during the run.
     duration : float [s]
-        Of the run; round(duration * rate) samples, the first at 0.
+        Duration of the run: round(duration * rate) samples, the first at 0.
     reference : signal or mapping {name: signal}, optional
-        For references such as `die:ref`; one signal where the plant has one reference. A signal is
-        a SetPoint, an array of one value per sample, a number, or a function of the times [s]; an
-        array (runs, samples) has one row for each run.
-        Derivatives of a SetPoint that blocks read are taken from it.
+        Signals of references such as `die:ref`; a single signal if the plant has one reference. A
+        signal is a SetPoint, an array of one value per sample, a number, or a function of the times
+        [s]; an array (runs, samples) has one row for each run. Derivatives of a SetPoint that
+        blocks read are taken from it.
     disturbance : mapping {name: signal}, optional
-        For other channels of w, held over each sample, in addition to their noise.
+        Signals of other channels of w, constant over each sample, in addition to their noise.
     elements : mapping {name: element, or a list of some}, optional
-        What acts on channels of y before they are read, and on driven actuators: u is then what
-        they apply, and blocks that read an actuator's name (observers) are fed this. A
+        Elements that act on channels of y before they are read, and on driven actuators: u is then
+        the applied value, which blocks with an input named like the actuator (observers) receive. A
         `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
-        `Dropout`, any `Element` of one's own. `Jitter` moves the instants, unknown to blocks. On a
-        disturbance, `Friction` (or an `Element` with `reads`) is a force that answers a motion.
-        A `Saturation` that the SetPoints of the references exceed (force of an actuator, range of
-        a sensor or of the reference itself) is warned of beforehand, with what they need.
+        `Dropout`, or your own `Element`. `Jitter` moves the instants, unknown to blocks. On a
+        disturbance, `Friction` (or an `Element` with `reads`) is a force that reacts to a motion. A
+        warning before the run names a `Saturation` that the SetPoints exceed (force of an actuator,
+        range of a sensor or of the reference), with the required value.
     anti_windup : float [s], optional
-        Time constant in which integrators (all poles slower than it) of blocks that drive
-        actuators return to what is applied while that is not what they command.
+        Time constant with which integrators (all slower poles) of blocks that drive actuators
+        follow the applied value while it differs from the command.
     moving : mapping {POI or position: path}, optional
         Places (n_time, 3) [m] of POIs over time, or functions of the times: the channels of such a
         POI in z are those of its place at each sample. Or values of the plant's positions [m or
         rad] over time, as a SetPoint (which may be a reference too), a function, or an array
         (n_time,): all ports that move with it do, forces within each sample too.
     finer : int
-        Samples of the plant in each sample of the controller, whose commands are held: what z does
+        Samples of the plant in each sample of the controller, whose commands are held; it shows z
         between samples. Sensors are read (noise, elements) in the controller's samples; between
-        them y is the motion alone. Signals are then of the finer samples.
+        them y is the motion only. Signals then have the finer samples.
     noise : bool
         Whether the white noises of the plant act.
     rng : int, SeedSequence, Generator or None
-        Seed of the noises. Run i draws from the i-th child of it, so it is the same to the last
-        bit whichever other runs are computed with it.
+        Seed of the noises. Run i draws from its i-th child, so that it does not depend on the other
+        runs.
     runs : int or sequence of int, optional
-        How many runs, or which ones (numbered from 0); the response then has an axis for them.
-        One run without that axis when not given.
+        Number of runs, or numbers of the runs (from 0); the response then has an axis for them.
+        None: one run without that axis.
     start : (n,) array, optional
-        State of the plant, or of plant and controller, at time 0; rest when not given.
+        State of the plant, or of plant and controller, at time 0; rest by default.
     progress : bool, optional
-        Show a progress bar; on a terminal, after two seconds, when not given.
+        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
 
     Returns
     -------
     Response
-        All z, y, driven u and monitored outputs of blocks. A warning names actuators that end a
-        run with a reference or a disturbance by steadily pushing against each other: forces that
-        move none of the POIs' axes.
+        All z, y, driven u and monitored outputs of blocks. A warning names actuators that steadily
+        push against each other at the end of a run with a reference or a disturbance, without
+        moving an axis of a POI.
 
     Raises
     ------
@@ -118,8 +118,8 @@ def simulate(
         When a reference, a disturbance or the channel of an element is unknown, or it is not clear
         which is meant.
     ModelError, ShapeError
-        When a signal or the state has the wrong length, an element is none, integrators cannot be
-        found from the commands, or the loop diverges beyond all numbers.
+        When a signal or the state has the wrong length, an element has a wrong type, integrators
+        cannot be found from the commands, or the loop diverges beyond floating-point numbers.
 
     Examples
     --------
@@ -151,8 +151,8 @@ def simulate(
     positions = _positions(plant, moving)
     if positions and (finer > 1 or len(positions) < len(moving or {})):
         raise ModelError(
-            "positions move in runs without finer samples and without paths of single POIs: leave "
-            "these out, or let the machine stand."
+            "positions move in runs without finer samples and without paths of single POIs: "
+            "leave these out, or keep the machine at rest."
         )
     met = Conditions(
         *split_elements(elements, plant, loop.driven),
@@ -181,8 +181,8 @@ def simulate(
             path = trajectory(plant, positions, time)
             if acted := [*met.on_u, *met.on_w]:
                 raise ModelError(
-                    f"{acted[0]!r} has an element: commands and forces are applied as they are "
-                    "where positions move. Leave it out, or let the machine stand."
+                    f"{acted[0]!r} has an element: elements cannot be combined with moving "
+                    "positions. Leave the element out, or keep the machine at rest."
                 )
             sensed = Acting(plant.y, met.on_y, float(plant.dt)) if met.on_y else None
             runner = MovingMachine(loop, path, noise=noise, schedule=schedule, sensed=sensed)
@@ -198,7 +198,8 @@ def simulate(
                     stretch = slice(first, min(first + runner.stretch, steps))
                     if not runner.fill(own[:, stretch], data[group, :, stretch]):
                         raise ModelError(
-                            f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
+                            "the loop diverged beyond floating-point numbers before "
+                            f"{time[stretch][-1]:g} s: "
                             f"it is unstable (spectral radius {closed.spectral_radius:.6g}). Look "
                             "at loop.is_stable first, or simulate a shorter time."
                         )
@@ -211,15 +212,15 @@ def simulate(
 
 
 def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
-    """Return a loop whose plant is sampled so many times in a sample of its controller."""
+    """Return a loop whose plant has several samples in each sample of its controller."""
     # the same plant before sampling, with the same delay in seconds
     if whole(finer, "finer", maximum=10_000) == 1:
         return loop
     plant = loop.machine
     if plant.continuous.dt:
         raise ModelError(
-            "finer= needs the plant before it was sampled, which is not known of a plant made "
-            "elsewhere. Make it by assemble_plant(model, ports).discretized(rate), or simulate at "
+            "finer= needs the plant before it was sampled, which is unknown for this plant. Make "
+            "it by assemble_plant(model, ports).discretized(rate), or simulate at "
             "its own samples."
         )
     bare = plant.continuous.replace(evaluation=None)
@@ -271,7 +272,7 @@ def _check_sampled(loop: ClosedLoop) -> None:
 
 
 def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
-    """Warn of an unstable loop and return whether it is one; a free integrator is none."""
+    """Warn of an unstable loop and return whether it is unstable; a free integrator is not."""
     radius = loop.spectral_radius
     if radius <= 1:
         return False
@@ -282,9 +283,10 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
         growth = float(np.float64(radius) ** steps)
     by = f"{growth:.3g} times" if np.isfinite(growth) else "beyond all numbers"
     warn(
-        f"the loop is unstable (spectral radius {radius:.9g}; {found.reason}): what grows fastest "
-        f"grows {by} in these {steps} samples, and no rms of it means anything. Lower the gain or "
-        "the delay of its controller; loop.modulus_margin shows how far a loop is from this."
+        f"the loop is unstable (spectral radius {radius:.9g}; {found.reason}): its fastest "
+        f"growing part grows {by} in these {steps} samples, so that rms values have no meaning. "
+        "Lower the gain or the delay of its controller; loop.modulus_margin shows how far a "
+        "loop is from this."
     )
     return True
 
@@ -292,7 +294,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
 def _named(
     plant: StandardPlant, reference: Signal | Mapping[str, Signal] | None
 ) -> Mapping[str, Signal]:
-    """Return signals of references by name, where one alone is for the plant's only reference."""
+    """Return signals of references by name; a single signal is for the plant's only reference."""
     if reference is None:
         return {}
     if isinstance(reference, Mapping):
@@ -313,8 +315,8 @@ def _known_inputs(
     own, others = references(plant), [name for name in plant.w if name not in both]
     if disturbance is not None and not isinstance(disturbance, Mapping):
         raise ModelError(
-            f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "
-            "meant, disturbance={name: signal}."
+            f"disturbance must be a mapping, got {short(disturbance)}: name the channel of w, "
+            "disturbance={name: signal}."
         )
     given = np.zeros((1, time.size, len(plant.w)))
     for kind, known, signals in (
@@ -348,7 +350,7 @@ def _derivatives(
         if move.order < DERIVATIVES.index(kind) + 1:
             raise ModelError(
                 f"a block reads {name!r}, but {move!r} is of order {move.order}, so that its "
-                f"{kind} is impulses. Give the set-point a bound on {kind}, or use "
+                f"{kind} consists of impulses. Give the set-point a bound on {kind}, or use "
                 "feedforward.up_to of a lower derivative."
             )
         found[name] = getattr(move.at(time), kind)
@@ -389,7 +391,7 @@ def _check_setpoint(move: SetPointProfile, name: str, time: FloatArray) -> None:
             )
 
 
-#: samples of one run
+#: largest number of samples of one run
 MOST_STEPS = 10**9
 
 
@@ -430,7 +432,7 @@ def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
 Density: TypeAlias = (
     "Callable[[FloatArray], npt.ArrayLike] | Sequence[npt.ArrayLike] | npt.NDArray[Any]"
 )
-#: length of the record of which one is a part, so that its ends do not meet
+#: length of the generated record relative to the returned part, so that its ends do not match
 _LONGER = 4
 
 
@@ -441,22 +443,21 @@ def spectral_noise(
 
     A floor's measured vibration, 1/f noise of a sensor, slow drift: lines of random amplitude and
     phase, ``E |X_k|^2 = asd(f_k)^2 rate n / 2``, four times as dense as the record can resolve.
-    Slower parts than a quarter of a period in the record are left out, a mean too: a drift beyond
-    that is an array of one's own. What the synthesis shall know of goes into a port
+    Components slower than a quarter of a period in the record, including the mean, are left out:
+    pass your own array for such a drift. Noise that the synthesis shall know belongs into a port
     (`fx.plant.FirstOrder`, `NarrowBand`, `RandomWalk`, a shape).
 
     Parameters
     ----------
     asd : function or (frequencies [Hz], densities)
-        One-sided amplitude spectral density [unit/sqrt(Hz)]. A function of an array of
-        frequencies; a measured one is interpolated, both scales logarithmic, and is nothing
-        outside its band.
+        One-sided amplitude spectral density [unit/sqrt(Hz)]. A function of an array of frequencies;
+        a measured one is interpolated on logarithmic scales, and is zero outside of its band.
     rate : float [Hz]
-        Of the samples: that of the plant, or `finer` times it.
+        Rate of the samples: that of the plant, or `finer` times it.
     duration : float [s]
-        Of the record.
+        Duration of the record.
     runs : int, optional
-        So many records; one without that axis when not given.
+        Number of records. None: one record without that axis.
     rng : int, SeedSequence, Generator or None
 
     Returns
@@ -526,7 +527,7 @@ def _density_at(asd: Any, freq: FloatArray) -> FloatArray:
 
 
 def unscheduled(loop: ClosedLoop | ScheduledLoop) -> tuple[ClosedLoop, ScheduledLoop | None]:
-    """Return a loop, that of the standing machine where a schedule is given, and the schedule."""
+    """Return the loop (of the machine at rest for a schedule) and the schedule."""
     schedule = loop if isinstance(loop, ScheduledLoop) else None
     own = loop.standing if isinstance(loop, ScheduledLoop) else loop
     return instance(own, ClosedLoop, "loop", "Pass close_loop(plant, *blocks)."), schedule

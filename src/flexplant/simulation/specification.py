@@ -1,4 +1,4 @@
-"""Specifications of a closed loop, and the table of what it reaches."""
+"""Specifications of a closed loop, and the table of achieved values."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .response import Response
 
 #: limits that need a run, in the order of the table
 _OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
-#: those of the loop itself
+#: limits of the loop itself
 _OF_LOOPS = ("noise", "bandwidth", "modulus_margin")
 
 
 def _efforts(value: Any, name: str) -> float | dict[str, float]:
-    """Return the limit of all actuators, or that of each."""
+    """Return the limit of all actuators, or of each actuator."""
     if isinstance(value, Mapping):
         return {n: positive(limit, f"{name} of {n}") for n, limit in value.items()}
     return positive(value, name)
@@ -31,7 +31,7 @@ def _efforts(value: Any, name: str) -> float | dict[str, float]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Verdict(Value):
-    """Achieved values beside the specified limits; prints as a table.
+    """Achieved values with the specified limits; prints as a table.
 
     In a test: ``verdict = specification.check(loop, run)``, then
     ``assert verdict.passed, str(verdict)``, whose message is the table.
@@ -39,9 +39,9 @@ class Verdict(Value):
     Parameters
     ----------
     names, units : sequence of str
-        Of the requirements.
+        Names and units of the requirements.
     values, limits : (n,) arrays
-        What is reached, and what is allowed; NaN where there is nothing to measure.
+        Achieved and allowed values; NaN where nothing is measured.
     at_least : (n,) bool array
         Whether the limit is a lower one.
 
@@ -82,7 +82,7 @@ class Verdict(Value):
         return tuple(name for name, met in zip(self.names, self.met, strict=True) if not met)
 
     def __getitem__(self, name: str) -> float:
-        """Return what is reached of a requirement."""
+        """Return the achieved value of a requirement."""
         require_known("requirement", [name], self.names)
         return float(self.values[self.names.index(name)])
 
@@ -100,7 +100,7 @@ class Verdict(Value):
 
 @dataclass(frozen=True, eq=False)
 class Specification(Value):
-    """Limits that a closed loop and its runs must keep; those that are not given are not checked.
+    """Limits for a closed loop and its runs; only given limits are checked.
 
     Parameters
     ----------
@@ -116,16 +116,16 @@ class Specification(Value):
     noise : float, optional [m or rad]
         Stationary rms of the error under the white noises, in closed form.
     bandwidth : float, optional [Hz]
-        At least; where |S| at u first crosses 0 dB.
+        Least bandwidth, at which |S| at u first crosses 0 dB.
     modulus_margin : float, optional
-        At least; the smaller one of those with and without the modes left out, where these are
+        Least modulus margin: the smaller of those with and without truncated modes, if these are
         known.
     channel : str, optional
-        The error that is meant; the only one of the loop when not given.
+        Channel of the error; by default the only one of the loop.
     window : float [s]
-        Of MA and MSD.
+        Window of MA and MSD.
     start : float [s]
-        The end of the move: what is before is not exposed.
+        End of the move; samples before it are not exposed.
 
     Raises
     ------
@@ -166,7 +166,7 @@ class Specification(Value):
     def check(
         self, loop: ClosedLoop, run: Response | None = None, *, exposures: Any = None
     ) -> Verdict:
-        """Return what a loop, on the machine or on its model, and a run of it reach.
+        """Return the achieved values of a loop, on the machine or its model, and of a run.
 
         All runs of the run count; `exposures` (k, 2) [s] are as for `exposure_errors`, all after
         `start` (and `settling`) when not given. Limits on errors and efforts need a run.
@@ -185,7 +185,7 @@ class Specification(Value):
         return Verdict(names, units, np.array(values), np.array(limits), np.array(least))
 
     def _watched(self, loop: ClosedLoop) -> str:
-        """Return the channel that is meant: the one named, or the only error."""
+        """Return the named channel, or the only error."""
         if self.channel is not None:
             return self.channel
         errors = [name for name in loop.machine.z if name.endswith(":error")]

@@ -1,4 +1,4 @@
-"""Tables: one pipeline over many machines, resumed where it was stopped; several estimators."""
+"""Tables: one pipeline over many machines, with resume; comparison of estimators."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from ..words import instance, mapping
 from ..work import Checkpoint
 from .response import Response
 
-#: a row of the table, or the reason why there is none
+#: a row of the table, or the reason why it is missing
 Outcome: TypeAlias = Mapping[str, Any] | str
 
 
@@ -50,32 +50,32 @@ def study(
 ) -> StudyTable:
     """Return the results of a pipeline for each machine, as a table.
 
-    A machine that raises, exits or returns something else than a row gets a row with its reason,
-    the others go on. The table is the same to the bit whatever executes it: seeds belong to
-    machines, linear algebra runs on one thread.
+    A machine whose pipeline raises, exits or does not return a row gets a row with the reason, and
+    the others continue. The table is equal to the last bit for every executor: seeds belong to
+    machines, and linear algebra uses one thread.
 
     Parameters
     ----------
     machines : sequence
-        What differs from row to row: virtual machines, measurements, parameters.
+        Values that differ between rows: virtual machines, measurements, parameters.
     pipeline : callable
         ``pipeline(machine)``, or ``pipeline(machine, generator)`` when rng is given; returns a
-        mapping {column: number, truth or text}. For a process pool it can be pickled: a function of
-        a module, or a `functools.partial` of one. `examples/fleet.py` has the usual chain.
+        mapping {column: number, truth or text}. For a process pool it must be picklable: a function
+        of a module, or a `functools.partial` of one. `examples/fleet.py` has the usual chain.
     executor : concurrent.futures.Executor, optional
         A process pool, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; None is a
-        plain loop. When a process of a pool dies, the machines that were out are tried once more,
-        each alone, and one whose process dies again fails; the rest goes on in a pool of processes
-        that start as its own did (context, initializer).
+        plain loop. When a process of a pool dies, its machines are tried again one by one, and a
+        machine whose process dies again fails; the rest continues in a new pool with the same
+        settings (context, initializer).
     checkpoint : path, optional
-        A file that keeps each row as it comes. With a file that exists the study goes on where it
-        was stopped, also after being killed: no machine that is in the file is computed again. It
-        belongs to the machines, by the contents of their values, to the name of the pipeline with
-        the arguments of a partial, and to `key`; a file of others is refused.
+        File that stores each finished row. With an existing file the study continues where it was
+        stopped, also after being killed: machines in the file are not computed again. The file
+        belongs to the values of the machines, to the name of the pipeline with the arguments of a
+        partial, and to `key`; another file is refused.
     rng : int, SeedSequence or Generator, optional
-        From it a seed is spawned for each machine.
+        Seed from which a seed is spawned for each machine.
     progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
     key : str
         Name of this study in its checkpoint. The code of the pipeline is not compared: give another
         key when you change it.
@@ -83,17 +83,16 @@ def study(
     Returns
     -------
     StudyTable
-        A mapping of arrays by column, in the order of the machines. What only some rows have is
-        missing in the others (NaN, False or ""), with a warning.
+        A mapping of arrays by column, in the order of the machines. Values that only some rows have
+        are missing in the others (NaN, False or ""), with a warning.
 
     Raises
     ------
     ModelError
-        When there are no machines, the pipeline cannot be called, it returns something else than
-        a mapping of numbers, truths and texts for the first machine, or the checkpoint is of
-        another study.
+        When `machines` is empty, the pipeline cannot be called, it does not return a mapping of
+        numbers, truths and texts for the first machine, or the checkpoint belongs to another study.
     FlexplantError
-        When the checkpoint cannot be written, or another study writes to it now.
+        When the checkpoint cannot be written, or another study is writing to it.
 
     Examples
     --------
@@ -106,7 +105,7 @@ def study(
     """
     items = list(instance(machines, Iterable, "machines", "Give a sequence of them."))
     if not items:
-        raise ModelError("a study needs machines, got none. Give a sequence of them.")
+        raise ModelError("a study needs machines, got an empty sequence. Give at least one.")
     if not callable(pipeline):
         raise ModelError(
             f"pipeline must be callable, got {short(pipeline)}. Give a function of a machine that "
@@ -153,14 +152,14 @@ def _outcomes(
 
 
 def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome | ModelError:
-    """Return the row of one machine, or why there is none; what is no row is an error."""
+    """Return the row of one machine, or the reason why it is missing."""
     try:
         with one_thread():
             if seed is None:
                 found = pipeline(machine)
             else:
                 found = pipeline(machine, np.random.default_rng(seed))
-    except (Exception, SystemExit) as error:  # whatever it is, the other machines go on
+    except (Exception, SystemExit) as error:  # for any error the other machines continue
         return _error_text(error)
     try:
         return checked_row(found)
@@ -169,7 +168,7 @@ def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome |
 
 
 def _kept(outcome: Outcome | ModelError | Lost, number: int) -> Outcome:
-    """Return a row or a reason; that the first machine has no row is an error of the pipeline."""
+    """Return a row or a reason; a missing row of the first machine is an error of the pipeline."""
     if isinstance(outcome, ModelError):
         if number == 0:
             raise outcome
@@ -181,12 +180,12 @@ def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-#: reasons that the repr lists
+#: number of reasons in the repr
 _SHOWN = 3
-#: what stands for a missing number, truth or text, and what each is called
+#: value of a missing number, truth or text, and its name
 _MISSING: dict[type, Any] = {float: np.nan, bool: False, str: ""}
 _CALLED = {float: "number", bool: "truth", str: "text"}
-#: what becomes each of these, a truth before a number
+#: types that become each of these, truth before number
 _PLAIN: dict[type, Any] = {
     bool: bool | np.bool_,
     str: str,
@@ -204,9 +203,9 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     Parameters
     ----------
     columns : mapping {str: (n,) array}
-        Of numbers, truths or texts.
+        Columns of numbers, truths or texts.
     failed : sequence of str
-        Why each machine has no results; "" where it has.
+        Reason why a machine has no results; "" if it has results.
     """
 
     columns: Mapping[str, npt.NDArray[Any]]
@@ -244,7 +243,7 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
 
 
 def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
-    """Return the table of rows; a text in place of a row is the reason why there is none."""
+    """Return the table of rows; a text in place of a row is the reason why it is missing."""
     # a row whose value is of another kind than most in its column counts as failed
     found = [row for row in rows if not isinstance(row, str)]
     kinds: dict[str, type] = {}
@@ -272,7 +271,7 @@ def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
 
 
 def _row_misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
-    """Return why a row does not fit into a table; "" when it does."""
+    """Return the reason why a row does not fit into a table, or ""."""
     for name, value in row.items():
         if type(value) is not kinds[name]:
             return (
@@ -293,7 +292,7 @@ def checked_row(row: Any) -> dict[str, Any]:
         if kind is None:
             raise ModelError(
                 f"column {name!r} holds {short(value)}: a table has one number, truth or text for "
-                "each machine. Return several columns, or save arrays to files of your own."
+                "each machine. Return several columns, or save arrays to separate files."
             )
         found[name] = kind(value)
     return found
@@ -309,13 +308,13 @@ class EstimatorComparison(Value):
     Parameters
     ----------
     channel : str
-        The motion that is estimated.
+        Estimated motion.
     names : sequence of str
-        Of the estimators.
+        Names of the estimators.
     errors : (n, 4) array [m or rad]
-        Predicted, measured, and the ends of the confidence interval of what was measured.
+        Predicted and measured errors, and the ends of the confidence interval of the measured ones.
     level : float
-        Of the interval.
+        Probability of the interval.
     """
 
     channel: str
@@ -350,12 +349,12 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     Returns
     -------
     tuple of StateSpace
-        For `close_loop` or `simulate`, beside the blocks that control.
+        Blocks for `close_loop` or `simulate`, in addition to the controllers.
 
     Raises
     ------
     ModelError
-        When there is no mapping of estimators.
+        When `designs` is not a mapping of estimators.
 
     Examples
     --------
@@ -380,20 +379,20 @@ def compare_estimators(
     start: float = 0.0,
     level: float = 0.95,
 ) -> EstimatorComparison:
-    """Return the errors that estimators predict beside those measured in runs of a machine.
+    """Return predicted errors of estimators with those measured in runs of a machine.
 
     Parameters
     ----------
     designs : mapping {name: KalmanEstimator or StaticEstimator}
         As given to `reading_along`.
     run : Response
-        Several runs of a loop in which they read along, with the POI's motion.
+        Several runs of a loop that contains the estimators, with the motion of the POI.
     channel : str
         The motion at the POI, `die:z`.
     start : float [s]
-        Samples before this time are left out: transients.
+        Start time; earlier samples (transients) are left out.
     level : float
-        Of the confidence intervals (`Response.rms_interval`).
+        Probability of the confidence intervals (`Response.rms_interval`).
 
     Returns
     -------
@@ -402,7 +401,7 @@ def compare_estimators(
     Raises
     ------
     ModelError
-        When there is no mapping of estimators, or there is only one run.
+        When `designs` is not a mapping of estimators, or only one run is given.
     LabelError
         When the run lacks the motion or an estimate of it.
 
