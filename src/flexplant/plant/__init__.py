@@ -7,7 +7,8 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
 - `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` has a set of them.
 - `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is not known, opened
-  as Deltas and drawn as machines; a kind of one's own derives from `Uncertainty`.
+  as Deltas and drawn as machines; a kind of one's own derives from `Uncertainty`. Dynamics that
+  the model lacks: `Neglected` modes, `UnmodelledDynamics(weight, at="u1")`.
 - `decouple`: the axes that the actuators move (`gravity_axes`: of a free body, with its mass);
   `frequency_response` of structures between their ports.
 
@@ -133,6 +134,7 @@ from .uncertainty.neglected_dynamics import neglected_modes as neglected_modes
 from .uncertainty.parameter_amounts import Parameters as Parameters
 from .uncertainty.shape_directions import Shapes as Shapes
 from .uncertainty.uncertain_plants import UncertainPlant as UncertainPlant
+from .uncertainty.unmodelled import UnmodelledDynamics as UnmodelledDynamics
 from .visibility import ModeVisibility as ModeVisibility
 from .weights import StageWeights as StageWeights
 from .weights import mixed_sensitivity as mixed_sensitivity

@@ -113,7 +113,11 @@ class PlantMachines:
         seeds = generator(rng).spawn(whole(count, "count", maximum=MOST_DRAWS))
         for i, own in enumerate(seeds, 1):
             try:
-                machines.append(self._machine(own))
+                machine = self._machine(own)
+                uncertain = self.plant.uncertainty
+                if uncertain is not None and uncertain.delta_blocks:
+                    machine = uncertain.with_drawn_blocks(machine, own)
+                machines.append(machine)
             except ModelError as error:
                 raise ModelError(
                     f"machine {i} of those drawn is not physical: {error} The uncertainty reaches "
@@ -128,6 +132,8 @@ class PlantMachines:
         if self.fit is None and any(isinstance(delta, ParameterDelta) for delta, _ in drawn):
             changes = [(delta.of_matrices(self.plant), delta.amount(x)) for delta, x in drawn]
             return with_changes(self.plant, changes)
+        if self.fit is None and not drawn:
+            return self._base
         of_modes = [one for one in drawn if isinstance(one[0], ModeDelta)]
         others = [one for one in drawn if not isinstance(one[0], ModeDelta | ParameterDelta)]
         machine = MachineParts.of(self._base)

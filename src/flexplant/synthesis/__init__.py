@@ -8,7 +8,8 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
 - `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf`;
   `design_structured` (fixed order, PID and notches).
 - `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
-- `mu`, `robust_stability`, `worst_case_gain`, `design_mu`: guarantees for uncertain plants.
+- `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
+  uncertain plants, of machines (``plant.uncertain``) or of one's own blocks (`uncertain_system`).
 
 To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
 `second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write what runs elsewhere.
@@ -35,10 +36,13 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 | ``allmargin``, ``diskmargin`` | `margins` |
 | ``mussv``, ``robstab`` | `mu`, `robust_stability` |
 | ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
+| ``ultidyn``, ``uss`` | `fx.plant.UnmodelledDynamics`, `uncertain_system` |
 
 Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `design_lmi` 20.
 """
 
+from ..plant.uncertainty.delta_blocks import FullBlock as FullBlock
+from ..plant.uncertainty.delta_blocks import RepeatedScalar as RepeatedScalar
 from ..rooms import public_names as _public_names
 from .aftercare.forms import anti_windup_form as anti_windup_form
 from .aftercare.forms import second_order_sections as second_order_sections
@@ -89,8 +93,9 @@ from .robustness.guarantees import robust_stability as robust_stability
 from .robustness.guarantees import worst_case_gain as worst_case_gain
 from .robustness.mu_bounds import MuBounds as MuBounds
 from .robustness.mu_bounds import mu as mu
-from .robustness.uncertainty_blocks import FullBlock as FullBlock
-from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
+from .robustness.robust_performance import robust_performance as robust_performance
+from .robustness.uncertain_systems import BlockStructure as BlockStructure
+from .robustness.uncertain_systems import uncertain_system as uncertain_system
 from .structured.judges import Judge as Judge
 from .structured.measured_objective import MeasuredObjective as MeasuredObjective
 from .structured.structured_design import design_structured as design_structured

@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import FloatArray
+from ...lti.statespace import StateSpace
 from ...store import Value
 from ..partitioned import Partition
 from .delta import Delta
+from .delta_blocks import Block
 
 #: standard deviations at which a Delta is 1, where nothing else is said
 DEVIATIONS = 2.0
@@ -51,7 +53,8 @@ class Uncertainty(Value):
     """Something that is not known of a machine, for ``plant.uncertain(...)``.
 
     A new kind says by `deltas` which Deltas a plant has; one whose Deltas are correlated, or that
-    draws something else for a machine, by `known`.
+    draws something else for a machine, by `known`; one of dynamics by `delta_blocks` and
+    `with_blocks`.
 
     Examples
     --------
@@ -81,6 +84,14 @@ class Uncertainty(Value):
     def bound(self, plant: Partition) -> Any:
         """Return the `NeglectedModes` of a plant, None of a kind that bounds nothing."""
         return None
+
+    def delta_blocks(self, plant: Partition) -> Sequence[Block]:
+        """Return the blocks of a plant that are no numbers of its machine: dynamics, say."""
+        return ()
+
+    def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
+        """Return a system of the plant, or of its bilinear image, with their channels first."""
+        return system
 
     def larger(self, plant: Partition) -> Any:
         """Return the plant with more modes that machines of a plant have, None where not known."""

@@ -23,7 +23,7 @@ _LARGEST = 0.05
 
 
 class DeltaChannels(NamedTuple):
-    """``[z_Delta; neglected; z; y] = G [w_Delta; neglected; w; u]``, continuous.
+    """``[blocks; z_Delta; neglected; z; y] = G [blocks; w_Delta; neglected; w; u]``, continuous.
 
     Of a sampled plant G is its bilinear image, with the same gains and stability; the weights of
     neglected modes are not in it: `neglected` has them.
@@ -46,7 +46,7 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     # corners of the uncertainty. A gain is exact: it is a channel of what all others act on
     plant, neglected = uncertain.plant, uncertain.neglected
     if not plant.dt:
-        return _with_neglected(uncertain.opened, neglected, 0.0)
+        return _with_others(uncertain, uncertain.opened, neglected, 0.0)
     opened = _sampled_channels(uncertain)
     distance = _distance(uncertain, opened)
     if distance > _LARGEST:
@@ -59,7 +59,8 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
             "the bound on neglected modes is of a continuous plant, this one is sampled: pass the "
             "whole model itself, plant.Neglected(whole)."
         )
-    return _with_neglected(opened, None if neglected is None else neglected.sampled, distance)
+    bound = None if neglected is None else neglected.sampled
+    return _with_others(uncertain, opened, bound, distance)
 
 
 def _not_affine(uncertain: UncertainPlant[Any]) -> str:
@@ -77,15 +78,19 @@ def _not_affine(uncertain: UncertainPlant[Any]) -> str:
     )
 
 
-def _with_neglected(
-    opened: Opened, neglected: NeglectedModes | None, distance: float
+def _with_others(
+    uncertain: UncertainPlant[Any],
+    opened: Opened,
+    neglected: NeglectedModes | None,
+    distance: float,
 ) -> DeltaChannels:
-    if neglected is None:
-        return DeltaChannels(opened.system, opened.sizes, None, distance)
-    names = neglected.outputs
-    plain = StateSpace([], [], [], np.eye(len(names)), inputs=names, outputs=names)
-    whole = with_neglected(opened.system, neglected.replace(weights=plain), opened.width)
-    return DeltaChannels(whole, opened.sizes, neglected, distance)
+    """Return the channels of Deltas with those of neglected modes and of blocks."""
+    system = opened.system
+    if neglected is not None:
+        names = neglected.outputs
+        plain = StateSpace([], [], [], np.eye(len(names)), inputs=names, outputs=names)
+        system = with_neglected(system, neglected.replace(weights=plain), opened.width)
+    return DeltaChannels(uncertain.with_blocks(system), opened.sizes, neglected, distance)
 
 
 def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float]) -> StateSpace:

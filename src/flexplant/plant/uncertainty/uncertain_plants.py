@@ -11,8 +11,9 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray, number
-from ...errors import ModelError, counted, require_known
+from ...errors import ModelError, counted, require_known, some_names
 from ...identification import MeasuredModes
+from ...lti.interconnection import append, lft
 from ...lti.statespace import StateSpace
 from ...store import Value
 from ...updating import Machines, ModalUncertainty, UpdateResult
@@ -21,6 +22,7 @@ from ..building import P
 from ..partitioned import Partition
 from .channels import Opened, require_exact
 from .delta import Delta, with_changes
+from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
 from .kind import DEVIATIONS, Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta
@@ -92,6 +94,22 @@ class UncertainPlant(Value, Generic[P]):
         return tuple(every[i] for i in self._order)
 
     @cached_property
+    def delta_blocks(self) -> tuple[Block, ...]:
+        """The Deltas that are no numbers of the machine: unmodelled dynamics, one's own blocks."""
+        found = [block for kind in self.kinds for block in kind.delta_blocks(self.plant)]
+        names = [delta.name for delta in self.deltas] + [block.name for block in found]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ModelError(f"{some_names(twice)} is uncertain twice. Give each a name, name=....")
+        return tuple(found)
+
+    def with_blocks(self, system: StateSpace) -> StateSpace:
+        """Return a system of the plant with the channels of `delta_blocks` first."""
+        for kind in self.kinds:
+            system = kind.with_blocks(self.plant, system)
+        return system
+
+    @cached_property
     def covariance(self) -> FloatArray:
         """Covariance (m, m) of the Deltas as random numbers."""
         whole = la.block_diag(np.zeros((0, 0)), *(known.covariance for known in self._known))
@@ -131,13 +149,14 @@ class UncertainPlant(Value, Generic[P]):
     def system(self) -> StateSpace:
         """The continuous system with all channels.
 
-        Inputs [Delta channels `mode6:freq:w`; neglected modes `die:z:neglected:w`,
-        `y1:neglected:w`; w; u], outputs [`mode6:freq:z`; `amp1:neglected:z`, `u1:neglected:z`; z;
-        y].
+        Inputs [blocks `u1:dynamics:w`; Delta channels `mode6:freq:w`; neglected modes
+        `die:z:neglected:w`, `y1:neglected:w`; w; u], outputs [`u1:dynamics:z`; `mode6:freq:z`;
+        `amp1:neglected:z`, `u1:neglected:z`; z; y].
         """
-        if self.neglected is None:
-            return self.opened.system
-        return with_neglected(self.opened.system, self.neglected, self.opened.width)
+        system = self.opened.system
+        if self.neglected is not None:
+            system = with_neglected(system, self.neglected, self.opened.width)
+        return self.with_blocks(system)
 
     def discretized(self, rate: float, *, delay: float = 0.0) -> Self:
         """Return the plant sampled at a rate with the same uncertainty."""
@@ -182,7 +201,8 @@ class UncertainPlant(Value, Generic[P]):
     @property
     def is_of_frequencies(self) -> bool:
         """Whether nothing but frequencies of modes is uncertain."""
-        return self.neglected is None and len(self.frequencies) == len(self.deltas)
+        others = len(self.frequencies) < len(self.deltas) or self.delta_blocks
+        return self.neglected is None and not others
 
     @cached_property
     def of_matrices(self) -> bool:
@@ -213,15 +233,18 @@ class UncertainPlant(Value, Generic[P]):
         lines += [f"  {delta.text}" for delta in self.deltas[:6]]
         if len(self.deltas) > 6:
             lines.append(f"  ... and {len(self.deltas) - 6} more")
+        lines += [f"  {one.name}, a block of {one.w} x {one.z}" for one in self.delta_blocks]
         return "\n".join(lines) + ">"
 
-    def lft(self, values: Mapping[str, float] | None = None) -> P:
+    def lft(self, values: Mapping[str, Any] | None = None) -> P:
         """Return the plant at some values of the Deltas, exactly; sampled like the nominal one.
 
         Parameters
         ----------
-        values : mapping {name: float}, optional
-            Such as {"mode6:freq": 0.5}; Deltas that are not named are 0. Beyond 1 is allowed.
+        values : mapping {name: float, array or StateSpace}, optional
+            Such as {"mode6:freq": 0.5}; Deltas that are not named are 0. Beyond 1 is allowed. A
+            block such as `u1:dynamics` takes a number, a matrix or a stable system; a continuous
+            one is sampled like the plant (Tustin).
 
         Raises
         ------
@@ -232,14 +255,40 @@ class UncertainPlant(Value, Generic[P]):
         hint = "Such as {'" + self.deltas[0].name + "': 0.5}." if self.deltas else ""
         given = {} if values is None else mapping(values, "values of Deltas", hint)
         known = {delta.name: delta for delta in self.deltas}
-        require_known("Delta", given, known)
-        return with_changes(
-            self.plant,
-            [
-                (self._acting(known[name]), known[name].scale * number(x, f"the value of {name!r}"))
-                for name, x in given.items()
-            ],
+        blocks = {block.name: block for block in self.delta_blocks}
+        require_known("Delta", given, [*known, *blocks])
+        changes = [
+            (self._acting(known[name]), known[name].scale * number(x, f"the value of {name!r}"))
+            for name, x in given.items()
+            if name in known
+        ]
+        machine = with_changes(self.plant, changes) if changes or not blocks else self.plant
+        return self._closed(machine, {n: given[n] for n in blocks if n in given})
+
+    def _closed(self, machine: P, values: Mapping[str, Any]) -> P:
+        """Return a machine with systems in the places of some blocks."""
+        if not values:
+            return machine
+        own = (block for block in self.delta_blocks if block.name in values)
+        parts = [delta_system(block, values[block.name], machine.dt) for block in own]
+        system = self.with_blocks(machine.system.replace(blocks=None))
+        delta = append(*parts)
+        opened = system.select(
+            [*delta.inputs, *machine.z, *machine.y], [*delta.outputs, *machine.w, *machine.u]
         )
+        return made_of(machine, lft(opened, delta))
+
+    def with_drawn_blocks(self, machine: P, rng: np.random.Generator) -> P:
+        """Return a machine with a drawn system in the place of each block."""
+        return self._closed(machine, self.drawn_blocks(rng))
+
+    def drawn_blocks(self, rng: np.random.Generator, size: float | None = None) -> dict[str, Any]:
+        """Draw a stable system of a gain, at most 1 when not given, for each block, by name."""
+        poles = self.plant.continuous.system.poles()
+        return {
+            one.name: drawn_delta(one, rng, poles, rng.uniform() if size is None else size)
+            for one in self.delta_blocks
+        }
 
     @property
     def machines(self) -> Any:
@@ -277,6 +326,18 @@ class UncertainPlant(Value, Generic[P]):
             Sampled, moved or with other ports, say.
         """
         return self.replace(plant=plant.replace(uncertainty=None))
+
+
+def made_of(plant: P, system: StateSpace) -> P:
+    """Return the plant of a system with a plant's channels, whose states come first in it."""
+    factor = plant.origin.noise_factor
+    if factor is not None:
+        extra = system.n_states - len(factor)
+        factor = np.vstack([factor, np.zeros((extra, factor.shape[1]))])
+    return type(plant).from_statespace(
+        system.replace(units=plant.system.units),
+        w=plant.w, u=plant.u, z=plant.z, y=plant.y, asd=plant.asd, noise_factor=factor,
+    )  # fmt: skip
 
 
 def _opened(base: Partition, deltas: Sequence[Delta]) -> Opened:
@@ -317,10 +378,11 @@ def uncertain_plant(plant: P, kinds: Sequence[Uncertainty]) -> UncertainPlant[P]
     """Return a plant with what is not known of it, checked: see `StandardPlant.uncertain`."""
     ordered = sorted(map(understood, kinds), key=lambda kind: type(kind).__name__)
     found: UncertainPlant[P] = UncertainPlant(plant, tuple(ordered))
-    if not found.deltas and not any(isinstance(kind, Neglected) for kind in ordered):
+    bounded = any(isinstance(kind, Neglected) for kind in ordered)
+    if not found.deltas and not found.delta_blocks and not bounded:
         raise ModelError(
             "there is nothing uncertain: pass what is not known, such as frequency=0.005, "
-            "plant.Gains(0.02) or a fit."
+            "plant.Gains(0.02), plant.UnmodelledDynamics(weight, at='u1') or a fit."
         )
     _ = found.system  # what no channels express is refused here
     return found

@@ -17,10 +17,11 @@ from ...lti.response_solvers import points, responder
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant, StandardPlant
 from ...plant.realisation import natural
+from ...plant.uncertainty.delta_blocks import FullBlock
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...store import Value
 from ...tolerances import RANK, TINY
-from ..robustness.uncertainty_blocks import FullBlock, block_places, evened
+from ..robustness.uncertainty_blocks import block_places, evened
 
 #: G over D of real mu, as a part of the response of a channel at its resonance
 _SHIFT = 0.7

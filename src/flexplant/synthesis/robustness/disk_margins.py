@@ -13,9 +13,9 @@ from ...loop.broken import BrokenLoop, inverted, scaled_size
 from ...loop.report import LoopMargins, report_loops
 from ...loop.sensitivity_functions import Loop, taken_apart
 from ...lti.frequency_sweep import highest
+from ...plant.uncertainty.delta_blocks import FullBlock
 from ...store import Value
 from .mu_bounds import mu
-from .uncertainty_blocks import FullBlock
 
 #: the three disks in use, by their skew sigma [Seiler2020]_: symmetric in gain, S and T
 SKEWS = {"S-T": 0.0, "S": 1.0, "T": -1.0}

@@ -27,6 +27,7 @@ from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
+from ...plant.uncertainty.delta_blocks import FullBlock
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
@@ -40,7 +41,7 @@ from ..hinf.tolerated_modes import (
     with_mode_channels,
 )
 from ..preparation import prepared
-from .mu_bounds import Cover
+from .robust_performance import performance_bound
 from .uncertain_loops import (
     UncertainLoop,
     open_plant,
@@ -48,7 +49,7 @@ from .uncertain_loops import (
     uncertain_loop,
     weighted_names,
 )
-from .uncertainty_blocks import FullBlock, Scalings, block_places, osborne
+from .uncertainty_blocks import Scalings, block_places, osborne
 from .upper import upper_level
 
 #: the route of the certificate of an iteration
@@ -88,9 +89,10 @@ def design_mu(
     """Return a controller whose weighted gain stays small on every machine of an uncertainty.
 
     D-K iteration: an H-infinity controller for the plant with its Deltas scaled by D(s), then D
-    for its loop, a filter of few states per Delta, and so on. In the design real Deltas count as
-    complex, which is cautious; what is judged, and kept, is the controller of the smallest mixed
-    mu, real Deltas real, between all frequencies. The first candidate is that without uncertainty.
+    for the best loop so far, a filter of few states per Delta, and so on. In the design real Deltas
+    count as complex, which is cautious; what is judged, and kept, is the controller of the smallest
+    mixed mu, real Deltas real, between all frequencies. The first candidates are those without
+    uncertainty and for D = 1.
 
     Where all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
     plant, with the shift of real mu and a constant D, evened out in closed loop; the bound is that
@@ -100,7 +102,8 @@ def design_mu(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, plant.Neglected())`, continuous or sampled.
+        From `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M, blocks)`, continuous
+        or sampled.
     w, z : mapping {name: weight}, or sequence of str
         Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
         None leaves a channel out, as does not naming it.
@@ -176,25 +179,27 @@ def _best_step(
 def _filter_steps(
     uncertain: UncertainPlant[Any], w: Any, z: Any, method: Any, most: int, order: int
 ) -> Iterator[_DkStep]:
-    """Yield the nominal controller, then those of plants scaled by D(s) of the loop before."""
+    """Yield the controllers without uncertainty, for D = 1, then for D(s) of the best loop."""
     plant = open_plant(uncertain, w=w, z=z)
     # the weights of neglected modes by few states, D one
     omega = _fit_grid(plant.system)
     scales = _filters(plant, omega, np.ones((omega.size, len(plant.blocks))), 1)
+    best: _DkStep | None = None
     for number in range(most + 1):
+        if best is not None and number > 1:
+            scales = _scales_of(plant, best.after, order)
         try:
             K = _scaled_controller(plant, scales, method, nominal=not number)
             loop = uncertain_loop(uncertain, [K], w=w, z=z)
-            # mu of robust performance, real Deltas real
-            blocks = [*loop.blocks, loop.performance]
-            found = Cover(loop.system, blocks, heights=loop.heights, accuracy=0.02).run()
+            mu, freq = performance_bound(loop)
         except (AssumptionError, SolverError):
-            if number:
+            if number > 1:
                 raise
             continue
-        mu, freq = float(np.sqrt(found.level)), float(loop.freq(found.omega))
-        yield _DkStep(number, mu, K, loop, freq)
-        scales = _scales_of(plant, loop, order)
+        step = _DkStep(number, mu, K, loop, freq)
+        yield step
+        if best is None or mu < best.mu:
+            best = step
 
 
 #: filters on each output and on each input of the uncertainty's channels
@@ -229,30 +234,36 @@ def _scales_of(plant: UncertainLoop, loop: UncertainLoop, order: int) -> _DFilte
     blocks = [FullBlock(block.w, block.z) for block in (*loop.blocks, loop.performance)]
     scalings, where = Scalings(blocks), block_places(blocks)
     omega = _fit_grid(loop.system)
-    rows = []
+    rows, levels = [], []
     for one in omega:
         M = loop.system.evaluated(1j * one) * loop.heights(one, one)
         if not np.any(M):
             rows.append(np.ones(len(blocks)))
+            levels.append(0.0)
             continue
         start = scalings.scaled(scalings.start, osborne(M, where))
-        x = upper_level(M, scalings, start).x
-        rows.append(np.sqrt(scalings.stacks(x)[0][:, 0, 0].real))  # all are numbers
-    d = np.array(rows)
-    return _filters(plant, omega, d / d[:, -1:], order)  # performance is not scaled
+        found = upper_level(M, scalings, start)
+        rows.append(np.sqrt(scalings.stacks(found.x)[0][:, 0, 0].real))  # all are numbers
+        levels.append(found.level)
+    d, matters = np.array(rows), np.array(levels) / max(levels)
+    return _filters(plant, omega, d / d[:, -1:], order, matters)  # performance is not scaled
 
 
-def _filters(plant: UncertainLoop, omega: FloatArray, d: FloatArray, order: int) -> _DFilters:
+def _filters(
+    plant: UncertainLoop, omega: FloatArray, d: FloatArray, order: int, matters: Any = 1.0
+) -> _DFilters:
     """Return filters of D (n_freq, blocks), and of the weights of columns over D."""
     weights = iter(np.array([plant.heights(one, one) for one in omega]).T)
     out: list[StateSpace] = []
     into: list[StateSpace] = []
     for block, size in zip(plant.blocks, d.T, strict=False):
-        one = fitted_magnitude(omega, size, order)
+        one = fitted_magnitude(omega, size, order, matters)
         out += [one] * block.z
         for weight in islice(weights, block.w):
             flat = np.ptp(weight) < ROUNDING * weight.max()
-            into.append(inverse(one) if flat else fitted_magnitude(omega, weight / size, order + 1))
+            into.append(
+                inverse(one) if flat else fitted_magnitude(omega, weight / size, order + 1, matters)
+            )
     return out, into
 
 
@@ -260,9 +271,11 @@ def _filters(plant: UncertainLoop, omega: FloatArray, d: FloatArray, order: int)
 _CLOSE = 0.05
 
 
-def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSpace:
+def fitted_magnitude(
+    omega: FloatArray, size: FloatArray, order: int, matters: Any = 1.0
+) -> StateSpace:
     """Return ``k prod (s + a_i) / (s + b_i)`` near a magnitude, of at most some order."""
-    # least squares of the logarithm; the fewest factors that come close
+    # least squares of the logarithm, errors weighted; the fewest factors that come close
     from scipy.optimize import least_squares  # not loaded with the package
 
     # a fit of logarithms: zeros would count without limit
@@ -278,7 +291,7 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
             a, b = np.exp(2 * q[1 : n + 1]), np.exp(2 * q[n + 1 :])
             square = omega[:, None] ** 2
             ratio = 0.5 * (np.log(square + a) - np.log(square + b)).sum(axis=1)
-            return np.asarray(q[0] + ratio - goal)
+            return np.asarray(matters * (q[0] + ratio - goal))
 
         start = np.concatenate([[goal.mean()], corners[::2], corners[1::2]])
         best = least_squares(error, start, max_nfev=200)

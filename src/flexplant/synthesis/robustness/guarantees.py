@@ -23,7 +23,7 @@ from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
 from ...store import Value, checked
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
-from .lower import Destabilising, destabilising, smallest_with_block
+from .lower import Destabilising, crossing_multiple, destabilising, smallest_with_block
 from .mu_bounds import INTERVALS, Cover, Covered, sought
 from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
@@ -123,13 +123,14 @@ def robust_stability(
     """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
 
     Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
-    block. The bound holds between grid points; a sampled loop is examined as it is sampled and
-    delayed. What it says is tried on machines drawn from the uncertainty, each closed exactly.
+    block, unmodelled dynamics and the blocks of `uncertain_system` what they are. The bound holds
+    between grid points; a sampled loop is examined as it is sampled and delayed. What it says is
+    tried on machines drawn from the uncertainty, each closed exactly.
 
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, plant.Neglected())`.
+        From `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M, blocks)`.
     *blocks : StateSpace, or values with a `system`
         The controller, as for `close_loop`.
     quick : bool
@@ -209,10 +210,14 @@ def _worst(
     if loop.neglected is None:
         return destabilising(loop.system, loop.blocks, omegas, upper, rng)
     where, best = block_places(loop.blocks), None
+    alone = not loop.uncertain.delta_blocks  # reals and one full block, the neglected modes
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
         for start in power_iterations(gain, where, rng, _STARTS, omega):
-            one = smallest_with_block(gain, where, start, 0.99 / upper)
+            if alone:
+                one = smallest_with_block(gain, where, start, 0.99 / upper)
+            else:
+                one = crossing_multiple(gain, where, start)
             if one is not None and (best is None or one[0] < best.size):
                 best = Destabilising(one[0], one[1], omega)
     return best
@@ -275,7 +280,8 @@ def _tried_on(
     size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
     for _ in range(count):
         ends = (size * rng.choice([-1.0, 1.0], len(names))).tolist()
-        loop = nominal.around(uncertain.lft(dict(zip(names, ends, strict=True))))
+        values = dict(zip(names, ends, strict=True)) | uncertain.drawn_blocks(rng, size)
+        loop = nominal.around(uncertain.lft(values))
         worst = max(worst, stability(loop.poles(), loop.plant.dt))
     if not worst < (1.0 if nominal.plant.dt else 0.0):
         raise CertificateError(

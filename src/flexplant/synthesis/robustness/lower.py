@@ -11,14 +11,12 @@ import scipy.linalg as la
 
 from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
+from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
 from ...tolerances import SPLIT, TINY
 from .power_starts import power_iterations
 from .uncertainty_blocks import (
-    Block,
-    FullBlock,
     Perturbation,
     Place,
-    RepeatedScalar,
     block_places,
     matrix_of,
     perturbed,

@@ -22,22 +22,13 @@ from ...lti.modal_map import obstacle
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
+from ...plant.uncertainty.delta_blocks import Block, RepeatedScalar, filled_blocks
 from ...seeds import generator
 from ...store import Value
 from ...tolerances import ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
 from .power_starts import power_iterations
-from .uncertainty_blocks import (
-    Block,
-    Perturbation,
-    Place,
-    RepeatedScalar,
-    Scalings,
-    block_places,
-    evened,
-    filled_blocks,
-    matrix_of,
-)
+from .uncertainty_blocks import Perturbation, Place, Scalings, block_places, evened, matrix_of
 from .upper import WIDE, centred, reached_level, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from ...plant.uncertainty.delta_blocks import RepeatedScalar
 from ...tolerances import TINY
-from .uncertainty_blocks import Perturbation, Place, RepeatedScalar
+from .uncertainty_blocks import Perturbation, Place
 
 #: steps of a power iteration; change at which it has settled
 _STEPS, _SETTLED = 60, 1e-6

@@ -16,13 +16,14 @@ from ...lti.discretisation import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.response_solvers import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace, single_channel
-from ...plant import AnyPlant, StandardPlant
+from ...plant import AnyPlant
 from ...plant.building import at_rate
+from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar, channels_of
 from ...plant.uncertainty.neglected_dynamics import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
-from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...plant.uncertainty.uncertain_plants import UncertainPlant, made_of
 from ...words import name_list
-from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
+from .uncertainty_blocks import Perturbation, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval
 _SAFE = 1.002
@@ -83,7 +84,7 @@ class UncertainLoop:
         most = np.abs(self._weights(_sampled(W, low, high))).max(axis=2).diagonal()
         if np.isinf(high):
             most = np.maximum(most, np.abs(np.diag(W.D)))
-        start = sum(size for _, size in self.channels.deltas)
+        start = sum(block.w for block in self.blocks[:-1])
         tall[start : start + most.size] = most if low == high else _SAFE * most
         return tall
 
@@ -93,18 +94,34 @@ class UncertainLoop:
 
     def deltas(self, found: Perturbation, size: float) -> dict[str, float]:
         """Return the real Deltas of a perturbation of some size, by name."""
-        names = [block.name for block in self.blocks if not isinstance(block, FullBlock)]
-        numbers = [size * number.real for number in found.scalars[: len(names)]]
-        return dict(zip(names, numbers, strict=True))
+        scalars = [block for block in self.blocks if isinstance(block, RepeatedScalar)]
+        pairs = zip(scalars, found.scalars, strict=False)
+        return {block.name: size * number.real for block, number in pairs if block.real}
+
+    def _dynamic(self, found: Perturbation, size: float) -> dict[str, StateSpace]:
+        """Return the Deltas of dynamic blocks of a perturbation as systems, by name."""
+        scalars, vectors, made = iter(found.scalars), iter(found.vectors), {}
+        own = self.blocks[:-1] if self.neglected else self.blocks
+        for block in own:
+            if isinstance(block, FullBlock):
+                one = found._replace(scalars=(), vectors=(next(vectors),))
+            else:
+                one = found._replace(scalars=(next(scalars),), vectors=())
+                if block.real:
+                    continue
+            delta = realised_delta(one, [block])
+            made[block.name] = delta.replace(C=size * delta.C, D=size * delta.D)
+        return made
 
     def machine(self, found: Perturbation, size: float) -> AnyPlant:
         """Return the plant of a perturbation: its modes exact, sampled like the nominal one."""
         # white noises do not pass the neglected modes in a sampled machine: their covariance is
         # that of the modes it has
-        plant: AnyPlant = self.uncertain.lft(self.deltas(found, size))
-        part, factor = self.neglected, None
+        values = {**self.deltas(found, size), **self._dynamic(found, size)}
+        plant = self.uncertain.lft(values)
+        part = self.neglected
         if part is None:
-            return plant
+            return plant  # type: ignore[no-any-return]
         delta = self._neglected_delta(found, size)
         if plant.dt:
             rate = 1.0 / plant.dt
@@ -117,22 +134,16 @@ class UncertainLoop:
         system = system.select(
             [*(name for name in starts if name in delta.inputs), *plant.z, *plant.y], None
         )
-        closed = lft(system, delta)
-        if plant.dt:
-            known = plant.noise_factor
-            extra = closed.n_states - len(known)
-            factor = np.vstack([known, np.zeros((extra, known.shape[1]))])
-        return StandardPlant.from_statespace(
-            closed.replace(units=plant.system.units),
-            w=plant.w, u=plant.u, z=plant.z, y=plant.y, asd=plant.asd, noise_factor=factor,
-        )  # fmt: skip
+        made: AnyPlant = made_of(plant, lft(system, delta))
+        return made
 
     def _neglected_delta(self, found: Perturbation, size: float) -> StateSpace:
         """Return the Delta of neglected modes as a system, bilinear image of a sampled one."""
-        full = next(block for block in self.blocks if isinstance(block, FullBlock))
+        full = self.blocks[-1]
         # the phase that the weights have there is taken out: columns of M bear magnitudes
         W = np.diag(self.neglected.weights.evaluated(1j * found.omega))
-        a, b = found.vectors[0]
+        # the last full block; what performance may have behind it is no Delta
+        a, b = found.vectors[sum(isinstance(block, FullBlock) for block in self.blocks) - 1]
         # a sampled one begins with a delay of one sample, whose phase is made up for
         ahead = 2.0 * np.arctan(0.5 * self.dt * found.omega)
         turned = a, b * np.exp(1j * (ahead - np.angle(W)))
@@ -171,7 +182,10 @@ def open_plant(
     channels = delta_channels(uncertain)
     (into, before), (out, behind) = weighted_names(w, "w"), weighted_names(z, "z")
     g, plant, part = channels.system, uncertain.plant, channels.neglected
-    n_real = sum(size for _, size in channels.deltas)
+    own = uncertain.delta_blocks
+    n_real, k, p = (
+        sum(size for _, size in channels.deltas), sum(b.w for b in own), sum(b.z for b in own)
+    )  # fmt: skip
     ends = [n for n in (part.outputs if part else ()) if loop is None or n in loop.fed_back]
     starts = [n for n in (part.inputs if part else ()) if loop is None or n in loop.driven]
     if not ends or not starts:
@@ -180,11 +194,19 @@ def open_plant(
     listed: list[Block] = [
         RepeatedScalar(size, real=True, name=name) for name, size in channels.deltas
     ]
+    listed += own
     if part is not None:
         part = part.narrowed(ends)
         listed.append(FullBlock(len(ends), len(starts), name="neglected modes"))
-    inputs = [*g.inputs[:n_real], *(f"{name}:neglected:w" for name in ends), *into, *plant.u]
-    outputs = [*g.outputs[:n_real], *z_names, *out, *plant.y]
+    block_ends = [channels_of(block) for block in own]
+    inputs = [
+        *g.inputs[k : k + n_real], *(name for one, _ in block_ends for name in one),
+        *(f"{name}:neglected:w" for name in ends), *into, *plant.u,
+    ]  # fmt: skip
+    outputs = [
+        *g.outputs[p : p + n_real], *(name for _, one in block_ends for name in one),
+        *z_names, *out, *plant.y,
+    ]  # fmt: skip
     before, behind = _checked_weights(before, plant.dt), _checked_weights(behind, plant.dt)
     images = (
         {n: bilinear(W, 1.0 / plant.dt) if plant.dt and W.n_states else W for n, W in side.items()}
@@ -201,7 +223,7 @@ def uncertain_loop(
 ) -> UncertainLoop:
     """Return the loop of an uncertain plant with its channels, and some of w and z."""
     require_uncertain(uncertain)
-    loop = close_loop(uncertain.plant, *blocks)
+    loop = _nominal_loop(uncertain.plant, blocks)
     if loop.obstacle is not None:
         raise AssumptionError(
             f"the loop is {loop.obstacle.reason} without any uncertainty: there is nothing to be "
@@ -220,11 +242,19 @@ def uncertain_loop(
     )
 
 
+def _nominal_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop:
+    """Return the nominal loop; a plant without actuators is a loop that is closed already."""
+    if plant.u or blocks:
+        return close_loop(plant, *blocks)
+    return ClosedLoop(plant, (), StateSpace([], [], [], np.zeros((0, 0)), plant.dt), ())
+
+
 def require_uncertain(given: object) -> None:
     """Raise ModelError when a value is no uncertain plant."""
     if not isinstance(given, UncertainPlant):
         raise ModelError(
-            f"need an UncertainPlant, got {short(given)}. Make it by plant.uncertain(fit)."
+            f"need an UncertainPlant, got {short(given)}. Make it by plant.uncertain(fit), or "
+            "synthesis.uncertain_system(M, blocks)."
         )
 
 

@@ -1,99 +1,18 @@
-"""The structure of an uncertainty: repeated scalars and full blocks, and the scalings it allows."""
+"""The scalings that the structure of an uncertainty allows, and its perturbations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, IntArray, whole
-from ...errors import ModelError, ShapeError, short
+from ...arrays import ComplexArray, FloatArray, IntArray
 from ...lti.blocks_of_states import block_matrix
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, as_statespace
-from ...store import Value, checked
+from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
 from ...tolerances import ROUNDING, TINY
-from ...words import flag
-
-
-@dataclass(frozen=True, eq=False)
-class RepeatedScalar(Value):
-    """An uncertainty ``w = delta z`` on `size` channels alike, delta one number.
-
-    Parameters
-    ----------
-    size : int
-        How many channels it acts on.
-    real : bool
-        Whether delta is a real number (a parameter) or a complex one.
-    name : str
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.synthesis.RepeatedScalar(2).w
-    2
-    """
-
-    size: int = field(default=1, metadata=checked(whole))
-    real: bool = field(default=True, metadata=checked(flag))
-    name: str = ""
-
-    @property
-    def w(self) -> int:
-        """Number of its outputs."""
-        return self.size
-
-    @property
-    def z(self) -> int:
-        """Number of its inputs."""
-        return self.size
-
-
-@dataclass(frozen=True, eq=False)
-class FullBlock(Value):
-    """An uncertainty ``w = Delta z``, Delta any complex matrix (w, z): dynamics.
-
-    Parameters
-    ----------
-    w, z : int
-        Numbers of its outputs, which drive the plant, and of its inputs.
-    name : str
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.synthesis.FullBlock(2, 3)
-    FullBlock(w=2, z=3, name='')
-    """
-
-    w: int = field(default=1, metadata=checked(whole))
-    z: int = field(default=1, metadata=checked(whole))
-    name: str = ""
-
-
-Block: TypeAlias = RepeatedScalar | FullBlock
-
-
-def filled_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
-    """Return blocks that fill w outputs and z inputs of an uncertainty."""
-    if not isinstance(blocks, Sequence) or not blocks or any(
-        not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
-    ):  # fmt: skip
-        raise ModelError(
-            "blocks must be a list of synthesis.RepeatedScalar(...) and "
-            "synthesis.FullBlock(...), got "
-            f"{short(blocks)}. Pass one for each uncertainty, in the order of the channels."
-        )
-    found = sum(block.w for block in blocks), sum(block.z for block in blocks)
-    if found != (w, z):
-        raise ShapeError(
-            f"the blocks have {found[0]} outputs and {found[1]} inputs in all, M has {w} inputs "
-            f"and {z} outputs: w = Delta z goes into M. List the blocks in the order of channels."
-        )
-    return tuple(blocks)
 
 
 class Place(NamedTuple):
