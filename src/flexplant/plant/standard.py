@@ -292,7 +292,8 @@ class StandardPlant(Partition):
         *kinds : Uncertainty, UpdateResult, ModalUncertainty or MeasuredModes
             `Frequencies`, `Dampings`, `Shapes` of modes, `Parameters` of the model, `Gains`,
             `Delay`, `Neglected` modes, `UnmodelledDynamics`, or what a `Fit` leaves open: a fit,
-            its uncertainty or measured modes may be given as they are. A user's own kind derives from `Uncertainty`.
+            its uncertainty or measured modes may be given as they are. A user's own kind derives
+            from `Uncertainty`.
         frequency, damping : float, (m,) array or {mode: float}, optional
             Short for `Frequencies` and `Dampings`.
 
