@@ -13,6 +13,8 @@
 .. [AndersonLiu1989] Anderson, Liu, Controller reduction: concepts and approaches, IEEE Trans.
    Autom. Control 34, 1989.
 .. [AndersonMoore1979] Anderson, Moore, Optimal Filtering, Prentice Hall, 1979.
+.. [Aphale2007] Aphale, Fleming, Moheimani, Integral resonant control of collocated smart
+   structures, Smart Mater. Struct. 16, 2007.
 .. [ApkarianNoll2006] Apkarian, Noll, Nonsmooth H-infinity synthesis, IEEE Trans. Autom. Control 51,
    2006.
 .. [AstromMurray2008] Astrom, Murray, Feedback Systems, Princeton University Press, 2008.
@@ -75,6 +77,8 @@
    unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
 .. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
    uncertainty, Syst. Control Lett. 18, 1992.
+.. [Fanson1990] Fanson, Caughey, Positive position feedback control for large space structures, AIAA
+   J. 28, 1990.
 .. [Fiedler1973] Fiedler, Algebraic connectivity of graphs, Czechoslovak Math. J. 23, 1973.
 .. [Fletcher1987] Fletcher, Practical Methods of Optimization, 2nd ed., Wiley, 1987.
 .. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,
@@ -188,6 +192,7 @@
    analysis, Mech. Syst. Signal Process. 21, 2007, 2359-2373.
 .. [PintelonSchoukens2012] Pintelon, Schoukens, System Identification: A Frequency Domain Approach,
    2nd ed., Wiley, 2012.
+.. [Preumont2018] Preumont, Vibration Control of Active Structures, 4th ed., Springer, 2018.
 .. [Reynders2008] Reynders, Pintelon, De Roeck, Uncertainty bounds on modal parameters obtained from
    stochastic subspace identification, Mech. Syst. Signal Process. 22, 2008.
 .. [Richardson1911] Richardson, The approximate arithmetical solution by finite differences of

@@ -55,6 +55,8 @@ from .hinf.hinf_riccati import Riccati as Riccati
 from .hinf.ncf import design_ncf as design_ncf
 from .hinf.ncf import ncf_margin as ncf_margin
 from .hinf.stage_design import design_stage as design_stage
+from .laws.active_damping import ActiveDamping as ActiveDamping
+from .laws.active_damping import damp_modes as damp_modes
 from .laws.controller_elements import FixedBlock as FixedBlock
 from .laws.controller_elements import Integrator as Integrator
 from .laws.controller_elements import Lag as Lag
@@ -62,6 +64,10 @@ from .laws.controller_elements import Lead as Lead
 from .laws.controller_elements import LowPass as LowPass
 from .laws.controller_elements import Notch as Notch
 from .laws.controller_elements import Pid as Pid
+from .laws.damping_elements import DampingElement as DampingElement
+from .laws.damping_elements import IntegralResonantControl as IntegralResonantControl
+from .laws.damping_elements import PositivePositionFeedback as PositivePositionFeedback
+from .laws.damping_elements import VelocityFeedback as VelocityFeedback
 from .laws.hand_design import LoopDesign as LoopDesign
 from .laws.hand_design import ShapedAxis as ShapedAxis
 from .laws.law import Law as Law
@@ -93,7 +99,7 @@ from .robustness.guarantees import robust_stability as robust_stability
 from .robustness.guarantees import worst_case_gain as worst_case_gain
 from .robustness.mu_bounds import MuBounds as MuBounds
 from .robustness.mu_bounds import mu as mu
-from .robustness.robust_performance import robust_performance as robust_performance
+from .robustness.performance_bounds import robust_performance as robust_performance
 from .robustness.uncertain_systems import BlockStructure as BlockStructure
 from .robustness.uncertain_systems import uncertain_system as uncertain_system
 from .structured.judges import Judge as Judge

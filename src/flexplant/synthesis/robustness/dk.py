@@ -41,7 +41,7 @@ from ..hinf.tolerated_modes import (
     with_mode_channels,
 )
 from ..preparation import prepared
-from .robust_performance import performance_bound
+from .performance_bounds import performance_bound
 from .uncertain_loops import (
     UncertainLoop,
     open_plant,

@@ -1,0 +1,168 @@
+"""Elements that damp modes: velocity feedback, positive position feedback, integral resonance."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, Self
+
+import numpy as np
+
+from ...arrays import number, positive
+from ...store import checked
+from .law import Section, SingleElement
+
+#: where the damping of velocity feedback ends, over the frequency of the mode
+_ENDS = (3.0, 10.0, 30.0)
+#: frequency of positive position feedback over that of the mode, and its damping ratios
+_FILTERS, _DAMPINGS = (0.9, 1.0, 1.1, 1.25, 1.5, 2.0), (0.1, 0.2, 0.35, 0.5, 0.7, 0.9)
+#: corner of integral resonant control over the frequency of the mode
+_CORNERS = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DampingElement(SingleElement):
+    """An element from error to command (``u = -L y``) whose gain damps a mode.
+
+    A new kind says its `section`, and by `candidates` which ones `damp_modes` tries.
+    """
+
+    gain: float = field(metadata=checked(number))
+
+    @classmethod
+    @abstractmethod
+    def candidates(cls, freq: float) -> Iterator[Self]:
+        """Yield elements of gain 1 for a mode at a frequency [Hz]."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class VelocityFeedback(DampingElement):
+    """``gain s / (1 + s / w)``: the velocity of a displacement sensor.
+
+    Between an actuator and a sensor at one place every mode below w gains damping, rigid-body
+    modes as well.
+
+    Parameters
+    ----------
+    gain : float
+        Command per velocity.
+    pole : float [Hz]
+        Corner w.
+
+    References
+    ----------
+    [Preumont2018]_, chapter 7.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.VelocityFeedback(2.0, pole=500.0)
+    VelocityFeedback(gain=2, pole=500 Hz)
+    """
+
+    pole: float = field(metadata=checked(positive, unit="Hz"))
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.pole
+        return Section((0.0, self.gain * w, 0.0), (0.0, 1.0, 1.0), w)
+
+    @classmethod
+    def candidates(cls, freq: float) -> Iterator[Self]:
+        """Yield elements of gain 1 for a mode at a frequency [Hz]."""
+        yield from (cls(1.0, ratio * freq) for ratio in _ENDS)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PositivePositionFeedback(DampingElement):
+    """``-gain / (p^2 + 2 damping p + 1)``, p = s / w: ``u = +gain F(s) y``.
+
+    A filter near the frequency of the mode, whose damping the mode shares; it rolls off above.
+    Displacements are fed back with positive sign: the gain at rest must stay below the stiffness,
+    so that a free body cannot be damped by it.
+
+    Parameters
+    ----------
+    gain : float
+        Command per displacement at rest.
+    freq : float [Hz]
+        w of the filter.
+    damping : float
+        Damping ratio of the filter.
+
+    References
+    ----------
+    [Fanson1990]_; [Preumont2018]_, section 7.6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.PositivePositionFeedback(100.0, 20.0)
+    PositivePositionFeedback(gain=100, freq=20 Hz, damping=0.5)
+    """
+
+    freq: float = field(metadata=checked(positive, unit="Hz"))
+    damping: float = field(default=0.5, metadata=checked(positive))
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.freq
+        return Section((0.0, 0.0, -self.gain), (1.0, 2.0 * self.damping, 1.0), w, w)
+
+    @classmethod
+    def candidates(cls, freq: float) -> Iterator[Self]:
+        """Yield elements of gain 1 for a mode at a frequency [Hz]."""
+        for ratio, damping in product(_FILTERS, _DAMPINGS):
+            yield cls(1.0, ratio * freq, damping)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class IntegralResonantControl(DampingElement):
+    """``-gain / (1 + s / w)``: an integrator around the plant with a negative feedthrough.
+
+    With ``k / s`` behind ``y - d u``: gain = 1 / d and w = k d. The feedthrough d above the static
+    compliance puts a zero below each resonance of a collocated pair, and integral feedback damps
+    all modes that lie between its poles and zeros.
+
+    Parameters
+    ----------
+    gain : float
+        1 / d, command per displacement at rest; below the static stiffness.
+    freq : float [Hz]
+        Corner w.
+
+    References
+    ----------
+    [Aphale2007]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.IntegralResonantControl(100.0, 20.0)
+    IntegralResonantControl(gain=100, freq=20 Hz)
+    """
+
+    freq: float = field(metadata=checked(positive, unit="Hz"))
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.freq
+        return Section((0.0, 0.0, -self.gain), (0.0, 1.0, 1.0), w, w)
+
+    @classmethod
+    def candidates(cls, freq: float) -> Iterator[Self]:
+        """Yield elements of gain 1 for a mode at a frequency [Hz]."""
+        yield from (cls(1.0, ratio * freq) for ratio in _CORNERS)
+
+
+#: the kinds by the names that the field gives them
+KINDS: dict[str, Any] = {
+    "velocity": VelocityFeedback,
+    "ppf": PositivePositionFeedback,
+    "irc": IntegralResonantControl,
+}
