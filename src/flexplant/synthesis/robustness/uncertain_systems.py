@@ -65,8 +65,8 @@ def uncertain_system(
               y <---|     |<--- u
 
     The answer is what `robust_stability`, `worst_case_gain`, `robust_performance` and `design_mu`
-    take; ``.lft(values)`` closes some Deltas, ``.machines.drawn(count)`` draws systems. Without u and y
-    it is a loop that is closed already: ``robust_stability(uncertain)``.
+    take; ``.lft(values)`` closes some Deltas, ``.machines.drawn(count)`` draws systems. Without u
+    and y it is a loop that is closed already: ``robust_stability(uncertain)``.
 
     Parameters
     ----------
