@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
-from scipy.optimize import linear_sum_assignment
 
 from ...arrays import ComplexArray, FloatArray, between, whole
 from ...errors import AssumptionError, LabelError, ModelError, counted, require_known, short
@@ -295,6 +294,8 @@ def _eigenvector(A: FloatArray, pole: complex) -> ComplexArray:
 
 def _shares(poles: ComplexArray, others: ComplexArray) -> tuple[float, float]:
     """Return the least damping ratio of the mode and the filter, and what other modes keep."""
+    from scipy.optimize import linear_sum_assignment  # not loaded with the package
+
     ratio = -poles.real / np.abs(poles)
     rows, columns = linear_sum_assignment(np.abs(others[:, None] - poles))
     own = np.setdiff1d(np.arange(poles.size), columns)
