@@ -27,6 +27,11 @@ class DampingElement(SingleElement):
     """An element from error to command (``u = -L y``) whose gain damps a mode.
 
     A new kind says its `section`, and by `candidates` which ones `damp_modes` tries.
+
+    Parameters
+    ----------
+    gain : float
+        Factor of the element.
     """
 
     gain: float = field(metadata=checked(number))
