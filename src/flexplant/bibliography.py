@@ -75,10 +75,10 @@
 .. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.
 .. [Fan1991] Fan, Tits, Doyle, Robustness in the presence of mixed parametric uncertainty and
    unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
-.. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
-   uncertainty, Syst. Control Lett. 18, 1992.
 .. [Fanson1990] Fanson, Caughey, Positive position feedback control for large space structures, AIAA
    J. 28, 1990.
+.. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
+   uncertainty, Syst. Control Lett. 18, 1992.
 .. [Fiedler1973] Fiedler, Algebraic connectivity of graphs, Czechoslovak Math. J. 23, 1973.
 .. [Fletcher1987] Fletcher, Practical Methods of Optimization, 2nd ed., Wiley, 1987.
 .. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,

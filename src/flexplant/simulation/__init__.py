@@ -5,7 +5,8 @@
 between samples; the noise is that of `fx.design_kalman`.
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
-  robust to a change of the frequency) and `quiet_setpoint` leave modes at rest.
+  robust to a change of the frequency) and `quiet_setpoint` leave modes at rest;
+  `residual_vibration` says what is left on the evaluation model.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: limits on margins and errors; a verdict compares them with achieved values.
 - `rms_along(loop, moving=)`: the errors of a moving machine along its path.
@@ -90,6 +91,8 @@ from .nonlinear_elements import Jitter as Jitter
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
 from .plant_inverse import inverse_forces as inverse_forces
+from .residual_vibrations import ResidualVibration as ResidualVibration
+from .residual_vibrations import residual_vibration as residual_vibration
 from .response import Response as Response
 from .sampled_runs import simulate as simulate
 from .sampled_runs import spectral_noise as spectral_noise

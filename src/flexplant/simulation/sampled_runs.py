@@ -161,8 +161,8 @@ def simulate(
         _paths(plant, None if positions else moving, time),
     )
     numbers = _run_numbers(runs)
-    signals = _named(plant, reference)
-    given = _known_inputs(plant, signals, disturbance, time, 0 if runs is None else len(numbers))
+    signals = named_references(plant, reference)
+    given = known_inputs(plant, signals, disturbance, time, 0 if runs is None else len(numbers))
     if not positions:
         warn_beyond_ranges(plant, signals, elements or {}, time)
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
@@ -291,7 +291,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
     return True
 
 
-def _named(
+def named_references(
     plant: StandardPlant, reference: Signal | Mapping[str, Signal] | None
 ) -> Mapping[str, Signal]:
     """Return signals of references by name; a single signal is for the plant's only reference."""
@@ -303,7 +303,7 @@ def _named(
     return {name: reference}
 
 
-def _known_inputs(
+def known_inputs(
     plant: StandardPlant,
     reference: Mapping[str, Signal],
     disturbance: Mapping[str, Signal] | None,

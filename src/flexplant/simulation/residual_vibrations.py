@@ -1,0 +1,191 @@
+"""The vibration that a move leaves: predicted by the modes of the loop, and simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..arrays import FloatArray, positive
+from ..errors import ModelError, require_known
+from ..loop import ClosedLoop
+from ..plant.evaluation_model import NOT_JUDGED
+from ..store import Value
+from ..words import instance, with_unit
+from .motion import SetPointProfile
+from .sampled_runs import known_inputs, named_references, simulate
+
+#: eigenvalues of a sampled loop below this are delays: what they hold is gone after some samples
+_GONE = 1e-9
+#: poles with a smaller part of their size in phase do not vibrate
+_TURNING = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ResidualVibration(Value):
+    """What is left of a signal after the end of a move; made by `residual_vibration`.
+
+    Parameters
+    ----------
+    channel : str
+    freq, damping : (k,) arrays [Hz, 1]
+        Modes of the closed loop, the largest amplitude first.
+    amplitude : (k,) array
+        Amplitude of each at the end of the move, in the unit of the channel.
+    predicted : float
+        Largest magnitude after the end by the sum of the modes.
+    simulated : float
+        The same from a simulation.
+    rest : float
+        Final value of the channel, from which both are counted.
+    unit : str
+        Unit of the channel.
+    judged : bool
+        Whether the loop is that of the evaluation model.
+    """
+
+    channel: str
+    freq: FloatArray
+    damping: FloatArray
+    amplitude: FloatArray
+    predicted: float
+    simulated: float
+    rest: float
+    unit: str
+    judged: bool
+
+    def __repr__(self) -> str:
+        shown = zip(self.freq[:3], self.amplitude[:3], strict=True)
+        modes = ", ".join(f"{with_unit(a, self.unit)} at {f:.4g} Hz" for f, a in shown)
+        sizes = [with_unit(size, self.unit) for size in (self.predicted, self.simulated)]
+        lines = [
+            f"<ResidualVibration of {self.channel}: {sizes[0]} predicted, {sizes[1]} simulated",
+            f"  {modes or 'no mode vibrates'}",
+        ]
+        if not self.judged:
+            lines.append(f"  {NOT_JUDGED}")
+        return "\n".join(lines) + ">"
+
+
+def residual_vibration(
+    loop: ClosedLoop,
+    move: SetPointProfile,
+    *,
+    reference: str | None = None,
+    channel: str | None = None,
+    wait: float | None = None,
+) -> ResidualVibration:
+    """Return how much a set-point leaves vibrating, on the evaluation model where there is one.
+
+    Predicted: after the end of the move the reference is constant, and every mode of the closed
+    loop decays from what the samples of the move have left in it. Simulated: the largest magnitude
+    of a run without noise. Both are independent calculations of one number.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        Around a sampled plant, stable.
+    move : SetPointProfile
+        From `setpoint`, `quiet_setpoint` or ``shaper.shaped(move)``.
+    reference : str, optional
+        Reference that follows the move; needed where there are several.
+    channel : str, optional
+        Channel of z; the error of the reference when not given.
+    wait : float [s], optional
+        Time after the end that is judged; ten periods of the slowest mode that vibrates, at most
+        the duration of the move and at least a hundred samples, when not given.
+
+    Returns
+    -------
+    ResidualVibration
+
+    Raises
+    ------
+    ModelError
+        When the loop is no sampled stable ClosedLoop, or the move no SetPointProfile.
+    LabelError
+        When the reference or the channel is unknown or must be named.
+
+    References
+    ----------
+    [Singer1990]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=20.0))
+    >>> move = fx.setpoint(1e-3, velocity=0.05, acceleration=2.0, jerk=200.0)
+    >>> left = fx.simulation.residual_vibration(loop, move)
+    >>> abs(left.predicted / left.simulated - 1.0) < 1e-3
+    True
+    """
+    instance(loop, ClosedLoop, "loop", "Make it by close_loop(plant, ...).")
+    instance(move, SetPointProfile, "move", "Make it by setpoint(...).")
+    own_plant = loop.machine.evaluation_plant
+    own = loop if own_plant is None else loop.around(own_plant)
+    if not own.plant.dt or not own.is_stable:
+        where = "" if own_plant is None else " with the modes left out"
+        raise ModelError(
+            f"need a stable loop around a sampled plant, this one is "
+            f"{'continuous' if not own.plant.dt else 'not stable' + where}. Use "
+            "plant.discretized(rate), or see loop.left_out."
+        )
+    machine = own.machine
+    given = move if reference is None else {reference: move}
+    (name,) = named_references(machine, given)
+    seen = f"{name.removesuffix(':ref')}:error" if channel is None else channel
+    require_known("channel of z", [seen], machine.z)
+    modes = _Modes(own, seen)
+    last = int(np.ceil(move.duration / machine.dt - 1e-9))
+    seconds = modes.shown(move.duration) if wait is None else positive(wait, "wait")
+    after = max(int(seconds / machine.dt), 1)
+    time = np.arange(last + 1 + after) * machine.dt
+    inputs = known_inputs(machine, named_references(machine, given), None, time, 0)[0]
+    amounts, rest = modes.left(inputs[: last + 1], inputs[-1])
+    steps = np.exp(np.outer(np.arange(after), modes.logs))
+    predicted = np.abs((steps @ amounts).real).max()
+    run = simulate(own, reference=given, duration=(time.size + 0.25) * machine.dt, noise=False)
+    simulated = np.abs(run[seen][last + 1 : last + 1 + after] - rest).max()
+    turning = modes.logs.imag > _TURNING * np.abs(modes.logs)
+    size = 2.0 * np.abs(amounts[turning])
+    order = np.argsort(-size)
+    poles = modes.logs[turning][order] / machine.dt
+    return ResidualVibration(
+        seen, np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles), size[order],
+        float(predicted), float(simulated), rest, own.units.get(seen, ""), own_plant is not None,
+    )  # fmt: skip
+
+
+class _Modes:
+    """The modes of a closed loop, w to one channel, that last longer than its delays."""
+
+    def __init__(self, loop: ClosedLoop, channel: str) -> None:
+        self.system = loop.system.select([channel], loop.machine.w)
+        values, left, right = la.eig(self.system.A, left=True)
+        lasting = np.abs(values) > _GONE
+        self.values, self.right = values[lasting], right[:, lasting]
+        rows = left[:, lasting].conj().T
+        # repeated modes: rows and columns of one eigenvalue are not yet each other's duals
+        self.rows = np.linalg.solve(rows @ self.right, rows)
+        self.logs = np.log(self.values)
+
+    def shown(self, duration: float) -> float:
+        """Return the time [s] of ten periods of the slowest vibration, within bounds."""
+        dt = self.system.dt
+        turning = np.abs(self.logs.imag[np.abs(self.logs.imag) > _TURNING * np.abs(self.logs)])
+        slowest = 20.0 * np.pi / float(turning.min()) if turning.size else 0.0
+        return dt * max(min(slowest, duration / dt), 100.0)
+
+    def left(self, inputs: FloatArray, final: FloatArray) -> tuple[Any, float]:
+        """Return what each mode adds to the channel in the sample after inputs, and the rest."""
+        g = self.system
+        powers = np.exp(np.outer(np.arange(len(inputs))[::-1], self.logs))
+        state = np.sum(powers * (inputs @ (self.rows @ g.B).T), axis=0)
+        constant = self.rows @ g.B @ final / (1.0 - self.values)
+        amounts = (g.C @ self.right)[0] * (state - constant)
+        rest = g.C @ np.linalg.solve(np.eye(g.n_states) - g.A, g.B @ final) + g.D @ final
+        return amounts, float(rest[0])

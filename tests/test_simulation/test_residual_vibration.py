@@ -1,0 +1,85 @@
+"""What a move leaves, against a recursion written out, and shapers on the evaluation model."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import LabelError, ModelError
+from flexplant.simulation import input_shaper, residual_vibration
+
+pytestmark = pytest.mark.slow
+
+
+@cache
+def loop():
+    """A chain whose plant has the first two modes and whose evaluation model has all four."""
+    model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e4] * 3, ground=[1e3, 0, 0, 0])
+    whole = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
+    ports = fx.Ports(
+        w=[fx.Disturbance("f", at="1:x", asd=1e-3)],
+        u=[fx.Actuator("u", at="1:x")],
+        z=[fx.Poi("die", at="4:x", axes=("x",))],
+        y=[fx.Sensor("y", at="1:x", direction="x", asd=1e-9)],
+        references=[fx.Reference("die")],
+    )
+    plant = fx.assemble_plant(whole.select([0, 1]), ports, evaluation=whole)
+    plant = plant.discretized(2e3, delay=1)
+    pd = fx.lti.tustin(fx.lti.tf([60.0, 2e3], [1e-3, 1.0]), 2e3)
+    both = fx.StateSpace(pd.A, np.hstack([pd.B, -pd.B]), pd.C, np.hstack([pd.D, -pd.D]), pd.dt,
+                         inputs=["die:ref", "y"], outputs=["u"])  # fmt: skip
+    return fx.close_loop(plant, both)
+
+
+MOVE = fx.setpoint(1e-3, velocity=0.1, acceleration=10.0, jerk=1e4)
+
+
+def test_predicted_and_simulated_and_by_hand():
+    """Both agree with x[k+1] = A x + B w of the loop with all modes, sample by sample."""
+    found = residual_vibration(loop(), MOVE)
+    assert found.judged and found.predicted == pytest.approx(found.simulated, rel=1e-6)
+    own = loop().around(loop().plant.evaluation_plant)
+    g = own.system.select(["die:error"], ["die:ref"])
+    last = int(np.ceil(MOVE.duration * 2e3 - 1e-9))
+    time = np.arange(last + 4000) / 2e3
+    ref, x, error = np.asarray(MOVE.at(time).position), np.zeros(g.n_states), []
+    for r in ref:
+        error.append(float(g.C[0] @ x + g.D[0, 0] * r))
+        x = g.A @ x + g.B[:, 0] * r
+    end = 1e-3 * (g.C @ np.linalg.solve(np.eye(len(g.A)) - g.A, g.B) + g.D)[0, 0]
+    assert found.rest == pytest.approx(end, rel=1e-6)
+    assert np.abs(np.array(error[last + 1 :]) - end).max() == pytest.approx(
+        found.simulated, rel=1e-6
+    )
+    assert found.freq.size >= 4  # the modes left out of the plant are among them
+
+
+@pytest.mark.parametrize("kind", ["ZV", "ZVD", "EI"])
+def test_a_shaper_takes_out_of_each_mode_what_its_formula_says(kind):
+    """Amplitudes with and without the shaper are in the ratio of `InputShaper.residual`."""
+    plain = residual_vibration(loop(), MOVE)
+    shaper = input_shaper(plain.freq[0], damping=plain.damping[0], kind=kind)
+    shaped = residual_vibration(loop(), shaper.shaped(MOVE))
+    assert shaped.predicted == pytest.approx(shaped.simulated, rel=1e-6)
+    assert shaped.predicted < 0.4 * plain.predicted
+    for freq, zeta, before in zip(plain.freq, plain.damping, plain.amplitude, strict=True):
+        i = int(np.argmin(np.abs(shaped.freq - freq)))
+        ratio = shaped.amplitude[i] / before
+        # both are counted from the end of their move: each decays over the shaper's duration
+        wanted = float(shaper.residual(freq, zeta)[0])
+        assert abs(ratio - wanted) < 0.01 + 0.1 * wanted  # impulses fall between samples
+
+
+def test_bad_input_is_refused():
+    """What is needed is said."""
+    with pytest.raises(ModelError, match="move must be"):
+        residual_vibration(loop(), 1.0)
+    with pytest.raises(LabelError, match="die:y"):
+        residual_vibration(loop(), MOVE, channel="die:y")
+    with pytest.raises(ModelError, match="wait"):
+        residual_vibration(loop(), MOVE, wait=-1.0)
+    slow = fx.testbeds.three_masses(rate=None)
+    law = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
+    with pytest.raises(ModelError, match="continuous"):
+        residual_vibration(fx.close_loop(slow, law), MOVE)
