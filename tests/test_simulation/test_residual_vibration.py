@@ -63,7 +63,10 @@ def test_a_shaper_takes_out_of_each_mode_what_its_formula_says(kind):
     shaped = residual_vibration(loop(), shaper.shaped(MOVE))
     assert shaped.predicted == pytest.approx(shaped.simulated, rel=1e-6)
     assert shaped.predicted < 0.4 * plain.predicted
-    for freq, zeta, before in zip(plain.freq, plain.damping, plain.amplitude, strict=True):
+    every = zip(plain.freq, plain.damping, plain.amplitude, strict=True)
+    loud = [one for one in every if one[2] > 0.05 * plain.amplitude[0]]
+    assert len(loud) >= 2
+    for freq, zeta, before in loud:
         i = int(np.argmin(np.abs(shaped.freq - freq)))
         ratio = shaped.amplitude[i] / before
         # both are counted from the end of their move: each decays over the shaper's duration

@@ -143,7 +143,7 @@ def residual_vibration(
     last = int(np.ceil(move.duration / machine.dt - 1e-9))
     seconds = modes.shown(move.duration) if wait is None else positive(wait, "wait")
     after = max(int(seconds / machine.dt), 1)
-    time = np.arange(last + 1 + after) * machine.dt
+    time: FloatArray = np.arange(last + 1 + after, dtype=np.float64) * machine.dt
     inputs = known_inputs(machine, named_references(machine, given), None, time, 0)[0]
     amounts, rest = modes.left(inputs[: last + 1], inputs[-1])
     steps = np.exp(np.outer(np.arange(after), modes.logs))
@@ -165,11 +165,12 @@ class _Modes:
 
     def __init__(self, loop: ClosedLoop, channel: str) -> None:
         self.system = loop.system.select([channel], loop.machine.w)
-        values, left, right = la.eig(self.system.A, left=True)
-        lasting = np.abs(values) > _GONE
-        self.values, self.right = values[lasting], right[:, lasting]
-        rows = left[:, lasting].conj().T
-        # repeated modes: rows and columns of one eigenvalue are not yet each other's duals
+        values, right = la.eig(self.system.A)
+        same, left = la.eig(self.system.A.T)
+        self.values = values[np.abs(values) > _GONE]
+        self.right = right[:, np.abs(values) > _GONE]
+        rows = left[:, np.abs(same) > _GONE].T
+        # rows of one space, in any order: duals of the columns
         self.rows = np.linalg.solve(rows @ self.right, rows)
         self.logs = np.log(self.values)
 
