@@ -78,6 +78,23 @@ def test_a_wrong_motion_is_refused(seed):
         fx.solve_modes(model, count=3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_motion_that_a_held_machine_resists_is_noted(seed):
+    """No slide is missed there, so that nothing else would say that the vector has no effect."""
+    rng = np.random.default_rng(seed)
+    model, free = machine(seed)
+    K = model.K + 1e6 * np.outer(np.eye(7)[2], np.eye(7)[2])  # a spring on the slide
+    vectors = np.column_stack([rng.standard_normal(7), free[:, 0]])
+    held = fx.FEModel(model.M, K, dofs=model.dofs, joint_motions=vectors)
+    (line,) = (row for row in fx.check(held).lines if row[1] == "joint motions")
+    assert line[0] == "note" and "mend the entries" in line[3]
+    for i, v in enumerate(vectors.T, 1):
+        hertz = np.sqrt(v @ K @ v / (v @ model.M @ v)) / (2 * np.pi)
+        assert f"{i} (as if rigid at {hertz:.4g} Hz)" in line[2]
+    slide = fx.FEModel(model.M, model.K, dofs=model.dofs, joint_motions=free)
+    assert not any(row[1] == "joint motions" for row in fx.check(slide).lines)
+
+
 def large(spring, n=800):
     """Two lines of nodes in the plane: one on springs, the other guided by it along x."""
     line = sp.diags_array(

@@ -141,6 +141,7 @@ def block():
     y += [((X - 0.05, Y - 0.02, Z), "z"), ((0.05, Y, 0.04), "y")]
     ports = fx.Ports(
         u=[fx.Actuator(f"u{i}", at=p, direction=d) for i, (p, d) in enumerate(u)],
+        z=[fx.Poi("body", at=(X / 2, Y / 2, Z), axes=("x", "y", "z", "rx", "ry", "rz"))],
         y=[fx.Sensor(f"y{i}", at=p, direction=d) for i, (p, d) in enumerate(y)],
     )
     modes = fx.solve_modes(body, count=40, damping=fx.ModalDamping(0.005))
@@ -161,11 +162,6 @@ def joint_peaks(plant, design):
     return [1 / np.linalg.svd(eye - L, compute_uv=False)[:, -1].min() for L in (C @ P, P @ C)]
 
 
-@pytest.mark.xfail(
-    reason="in the axes that the sensors of a block alone give, six loops that each hold |S| below "
-    "1.7 are unstable together at every bandwidth down to 0.5 Hz",
-    raises=fx.errors.SolverError,
-)
 @pytest.mark.long
 def test_six_axes_hold_the_peak_together():
     """Each axis alone reaches 400 Hz and more, and the modes couple them: 40 dB at u together."""
@@ -201,10 +197,10 @@ def test_what_ended_the_search_is_said():
 
 
 def test_slopes_of_the_joint_distances():
-    """By differences of the laws, at u, at y and in each axis, with more channels than axes."""
+    """By differences of the laws, at u, at y and in each axis, with more actuators than axes."""
     rng, n, k = np.random.default_rng(4), 5, 2
-    G = rng.standard_normal((3, 4, n)) + 1j * rng.standard_normal((3, 4, n))
-    before, after = rng.standard_normal((4, k)), rng.standard_normal((k, 3))
+    G = rng.standard_normal((2, 4, n)) + 1j * rng.standard_normal((2, 4, n))
+    before, after = rng.standard_normal((4, k)), rng.standard_normal((k, 2))
     frf = Frf(np.arange(1.0, n + 1), G)
     one = JointPlant(frf, before, after, ("a", "b"), 0).coupling(frf.freq)
     C, D = (rng.standard_normal((n, k)) + 1j * rng.standard_normal((n, k)) for _ in range(2))
@@ -212,7 +208,7 @@ def test_slopes_of_the_joint_distances():
     L = np.moveaxis(G, -1, 0) @ before @ (C[:, :, None] * after)
     shown = np.linalg.norm(np.linalg.pinv(after), axis=1)  # each output in its own unit
     own = L / shown[:, None] * shown
-    least = np.linalg.svd(np.eye(3) + own, compute_uv=False)[:, -1]
+    least = np.linalg.svd(np.eye(2) + own, compute_uv=False)[:, -1]
     assert one.distances(C)[1] == pytest.approx(least)
     change = (one.distances(C + 1e-6 * D) - one.distances(C - 1e-6 * D)) / 2e-6
     for place, slope in enumerate(change):

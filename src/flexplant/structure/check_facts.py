@@ -17,7 +17,7 @@ from ..tolerances import SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel
-from .rigid import FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
+from .rigid import ASIDE, FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
@@ -51,6 +51,8 @@ class Facts:
     digits: int | None
     swapped: bool
     damping: dict[str, Any]
+    #: frequency [Hz] by Rayleigh's quotient of each joint motion that the structure resists
+    resisted: dict[int, float]
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
         """Return the labels of some rows (from 0)."""
@@ -151,7 +153,21 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         digits=digits,
         swapped=swapped,
         damping={} if D is None else _damping_facts(D, motions, proven),
+        resisted={} if model is None else _resisted(model),
     )
+
+
+def _resisted(model: FEModel) -> dict[int, float]:
+    """Return the frequency [Hz] of each joint motion (from 1) that is not a free motion."""
+    if model.joint_motions is None:
+        return {}
+    given, free = model.joint_motions, model.rigid_body
+    left = given - free @ (free.T @ model.inertia(given))
+    size = np.einsum("ij,ij->j", given, model.inertia(given))
+    beyond = np.einsum("ij,ij->j", left, model.inertia(left)) > ASIDE**2 * size
+    energy = np.einsum("ij,ij->j", given, np.asarray(model.K @ given))
+    hertz = np.sqrt(np.maximum(energy, 0.0) / divisor(size)) / (2.0 * np.pi)
+    return {i + 1: float(hertz[i]) for i in np.flatnonzero(beyond).tolist()}
 
 
 def _skew(matrix: Any) -> tuple[float, int, int]:

@@ -428,6 +428,14 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
         if partly
         else "",
     )
+    if found.resisted:
+        each = [f"{i} (as if rigid at {hertz:.4g} Hz)" for i, hertz in found.resisted.items()]
+        yield (
+            "note",
+            "joint motions",
+            f"the structure resists {some_names(each)}",
+            "correct for slides that springs hold; mend the entries of those that should be free",
+        )
     if not extra:
         yield ("ok", "mechanisms", "none", "")
     elif odd is None:

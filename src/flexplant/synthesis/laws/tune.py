@@ -59,7 +59,8 @@ def tune_loops(
     ----------
     plant, before, after, rate, delay, hold : as for `design_loops`
     peak : float
-        Bound on |S|, at u, at y and of each axis; 2 is a modulus margin of 6 dB.
+        Bound on |S|, at u, of each axis, and at y where there are as many sensors as axes; 2 is a
+        modulus margin of 6 dB.
     rigid : int, optional
         Rigid-body modes; unless given as many as axes, of a model those that it has. 0 on springs
         whose modes lie within the lines.
@@ -230,7 +231,10 @@ class JointPlant:
     @property
     def places(self) -> tuple[str, ...]:
         """Where |S| counts: at u and at y where these have one unit, and in each axis."""
-        sides = {"u": self.plant.inputs, "y": self.plant.outputs}
+        # sensors that see one axis twice differ at modes between them, whatever its law is
+        sides = {"u": self.plant.inputs}
+        if len(self.plant.outputs) == len(self.axes):
+            sides["y"] = self.plant.outputs
         units = self.plant.channel_units if isinstance(self.plant, Frf) else self.plant.units
         alike = [f"at {s}" for s, names in sides.items() if len({units.get(n) for n in names}) < 2]
         return (*alike, *(f"of {name}" for name in self.axes))
