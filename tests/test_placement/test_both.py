@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant import DofSet, load
 from flexplant.errors import AssumptionError, InfeasibleError, ModelError
 from flexplant.lti import StateSpace
@@ -265,3 +266,12 @@ def test_what_there_is_no_choice_of_is_said(make, tmp_path):
         place_sensors(plant, sensors, 3, checkpoint=tmp_path / "nowhere" / "search.jsonl")
     curve = pareto_curve(plant, sensors, [4, 40], PoiVariance("die"), rng=0)
     assert curve.amounts.tolist() == [4.0]
+
+
+def test_sensors_of_the_plant_that_are_no_candidates_are_named():
+    """The choice says that it is without them; candidates by name are not left out."""
+    plant = fx.testbeds.three_masses()
+    more = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2)]
+    found = fx.place_sensors(plant, [*more, "y2"], 1)
+    assert found.left_out == ("y1",) and "without the plant's own y1" in repr(found)
+    assert fx.place_sensors(plant, ["y1", "y2"], 1).left_out == ()

@@ -225,3 +225,14 @@ def test_refusals():
     direct = given.system.replace(D=given.system.D + np.array([[1.0, 0, 0], [0, 0, 0], [0, 0, 0]]))
     with pytest.raises(AssumptionError, match="at once"):
         design_lmi(fx.StandardPlant.from_statespace(direct, u=["f"], y=["s"]), minimize=H2())
+
+
+def test_a_labelled_system_names_its_u_and_y():
+    """As design_hinf: the same controller as of the plant made by hand, and the same refusals."""
+    lag = fx.lti.tf([1.0], [1.0, 1.0])
+    lag = fx.plant.mixed_sensitivity(lag, S=fx.lti.low_pass_filter(0.1), KS=0.1)
+    made = design_lmi(lag, minimize=Hinf())
+    named = design_lmi(lag.system, minimize=Hinf(), u=lag.u, y=lag.y)
+    assert named.gamma == pytest.approx(made.gamma, rel=1e-9)
+    with pytest.raises(ModelError, match="names its u and y"):
+        design_lmi(lag, minimize=Hinf(), u=lag.u, y=lag.y)

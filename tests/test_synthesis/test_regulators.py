@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import flexplant as fx
+from flexplant.errors import AssumptionError
 from flexplant.synthesis import lqe, lqg, lqi, lqr, place
 
 
@@ -96,3 +97,25 @@ def test_a_flexible_machine_in_si_units():
     K = lqg(g, Q=1e16 * g.C.T @ g.C, R=[[1.0]], W=B @ B.T * 1e-2, V=[[1e-20]])
     assert fx.loop.report_loops((g, K)).is_stable
     assert fx.synthesis.margins((g, K)).disks[0][1].alpha > 0.05
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e6])
+@pytest.mark.parametrize("rate", [None, 1e4])
+def test_an_integral_that_no_constant_input_holds_is_refused_for_that(unit, rate):
+    """Displacements of random structures are integrated, their velocities are not, in any unit."""
+    rng = np.random.default_rng(5)
+    for _ in range(6):
+        n = int(rng.integers(1, 5))
+        F = rng.standard_normal((n, n))
+        stiffness, force = 1e4 * (F @ F.T + np.eye(n)), rng.standard_normal((n, 1))
+        A = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -0.1 * np.eye(n)]])
+        B, see = np.vstack([np.zeros((n, 1)), force]), rng.standard_normal((1, n))
+        C = unit * np.block([[see, np.zeros((1, n))], [np.zeros((1, n)), see]])
+        g = fx.StateSpace(A, B, C, 0, outputs=["x", "v"])
+        g = fx.lti.discretized(g, rate) if rate else g
+        Q, R = np.diag([1.0] * 2 * n + [unit**-2]), [[1.0]]
+        assert np.all(np.isfinite(lqi(g, Q=Q, R=R, outputs=["x"]).gain))
+        with pytest.raises(AssumptionError, match="v cannot be integrated"):
+            lqi(g, Q=Q, R=R, outputs=["v"])
+        with pytest.raises(AssumptionError, match="2 outputs are integrated"):
+            lqi(g, Q=np.eye(2 * n + 2), R=R)

@@ -164,7 +164,7 @@ def descriptor(
     b, c = real_array(B, "B", (n, None)), real_array(C, "C", (None, n))
     d = np.zeros((len(c), b.shape[1])) + real_array(D, "D")
     # rows and columns are brought to even sizes first: the rank of E must not hang on units
-    left, right = _even(np.abs(e) + np.abs(a))
+    left, right = even_factors(np.abs(e) + np.abs(a))
     a, e, b, c = left[:, None] * a * right, left[:, None] * e * right, left[:, None] * b, c * right
     U, sizes, Vh = np.linalg.svd(e)
     r = int(np.sum(sizes > RANK * n * sizes.max(initial=0.0)))
@@ -183,9 +183,9 @@ def descriptor(
     return StateSpace(a / sizes[slow, None], b / sizes[slow, None], c, d, dt)
 
 
-def _even(sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def even_factors(sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return factors for rows and columns that bring the largest entries near 1."""
-    left, right = np.ones(len(sizes)), np.ones(len(sizes))
+    left, right = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
     for _ in range(3):  # two rounds bring alternating maxima within a factor of two
         scaled = left[:, None] * sizes * right
         rows = scaled.max(axis=1, initial=0.0)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
-from ..errors import AssumptionError, CertificateError, counted
+from ..errors import AssumptionError, CertificateError, counted, some_names
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
 from ..store import Value
 from ..tolerances import SAME, SETTLED, divisor
@@ -195,6 +195,9 @@ class Placement(Value):
         Unit of the square root of the value, where it is a mean square of a motion.
     unjudged : str
         What is said of such a motion where the plant has no evaluation model.
+    left_out : tuple of str
+        Sensors or actuators of the plant that were not among the candidates: none of them is part
+        of the choice, and the value is that without them.
 
     Examples
     --------
@@ -215,6 +218,7 @@ class Placement(Value):
     stopped: str = ""
     unit: str = ""
     unjudged: str = ""
+    left_out: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         ends = [steps[-1] for steps in self.history]
@@ -232,8 +236,15 @@ class Placement(Value):
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
             f"{counted(self.evaluations, 'evaluation')}"
             f"{', ' if self.stopped else ''}{self.stopped}"
-            f"{', ' if self.unjudged else ''}{self.unjudged}>"
+            f"{', ' if self.unjudged else ''}{self.unjudged}{self._without}>"
         )
+
+    @property
+    def _without(self) -> str:
+        """What is said of the plant's own sensors and actuators that were no candidates."""
+        if not self.left_out:
+            return ""
+        return f", without the plant's own {some_names(self.left_out)}: not among the candidates"
 
     @property
     def sensors(self) -> tuple[str, ...]:

@@ -59,7 +59,8 @@ def place_sensors(
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, assembled from a structure; its own sensors are not used.
+        Sampled, assembled from a structure. Its own sensors are used where they are candidates;
+        the answer names those that are not (`Placement.left_out`).
     candidates : sequence of Sensor
         Each may be chosen once; a name stands for one of the plant's own.
     count : int
@@ -247,8 +248,11 @@ def _solution(
         )
     layouts.confirm(found.chosen, found.value)
     chosen = tuple(ports[i] for i in found.chosen)
+    known = {port.name for port in ports}
+    own = [port.name for side in layouts.side for port in getattr(plant.ports, side)]
     return Placement(
         chosen=tuple(port.name for port in chosen),
+        left_out=tuple(name for name in own if name not in known),
         criterion=repr(layouts.criterion),
         ports=chosen,
         side=layouts.side,

@@ -8,9 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray, complex_array
-from ..errors import ModelError, counted
+from ..errors import AssumptionError, ModelError, counted, some_names
+from ..lti.conversions import even_factors
 from ..lti.riccati import RiccatiSolution, control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..tolerances import RANK
 
 #: poles that were asked for and those that came may differ by this part of the largest: those of
 #: a multiplicity m are found to the root m of the rounding
@@ -82,8 +84,11 @@ def lqi(
 
     Raises
     ------
+    AssumptionError
+        When outputs have a zero at rest, or are more than the inputs: some of their integrals
+        cannot be stabilised.
     ShapeError, ModelError, SolverError
-        As `lqr`. A zero at rest between u and y makes an integral that cannot be stabilised.
+        As `lqr`.
 
     Examples
     --------
@@ -93,7 +98,35 @@ def lqi(
     >>> fx.synthesis.lqi(lag, Q=np.diag([0.0, 1.0]), R=[[1.0]]).gain.round(3)
     array([[ 0.732, -1.   ]])
     """
-    return lqr(_with_integrals(as_statespace(sys), outputs), Q=Q, R=R)
+    g = as_statespace(sys)
+    seen = g if outputs is None else g.select(outputs)
+    _require_answer_at_rest(seen)
+    return lqr(_with_integrals(g, outputs), Q=Q, R=R)
+
+
+def _require_answer_at_rest(g: StateSpace) -> None:
+    """Refuse outputs that constant inputs do not reach: ``[A - z I, B; C, D]`` is singular."""
+    n, m, p = g.n_states, len(g.inputs), len(g.outputs)
+    if p > m:
+        raise AssumptionError(
+            f"{counted(p, 'output')} are integrated and there are {counted(m, 'input')}: constant "
+            "inputs hold as many outputs as there are inputs. Name these, outputs=['y1']."
+        )
+    M = np.block([[g.A - np.eye(n) if g.dt else g.A, g.B], [g.C, g.D]])
+    left, right = even_factors(np.abs(M))
+    U, sizes, _ = np.linalg.svd(left[:, None] * M * right)
+    limit = RANK * (n + p) * sizes[0] if sizes.size else 0.0
+    reached = np.linalg.svd((left[:, None] * M * right)[:n], compute_uv=False)
+    if sizes[n + p - 1] > limit or np.any(reached <= limit):  # a mode that u misses is lqr's to say
+        return
+    lost = np.abs(U[n:, -1])
+    names = [name for name, size in zip(g.outputs, lost, strict=True) if size > 0.1 * lost.max()]
+    raise AssumptionError(
+        f"{some_names(names)} cannot be integrated: constant inputs do not reach "
+        f"{'it' if len(names) == 1 else 'one combination of these'} (a zero at rest, as velocities "
+        "and accelerations have), so that its integral cannot be stabilised. Leave it out of "
+        "outputs=, or integrate a displacement."
+    )
 
 
 def _with_integrals(g: StateSpace, outputs: Iterable[str] | None) -> StateSpace:

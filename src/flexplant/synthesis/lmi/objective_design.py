@@ -15,13 +15,13 @@ from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
-from ...plant import AnyPlant, StandardPlant, plant_of
+from ...plant import AnyPlant, StandardPlant
 from ...tolerances import TINY
 from ..controller import AGREEMENT, Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
-from ..preparation import prepared, require_stabilisable
+from ..preparation import posed, prepared, require_stabilisable
 from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
@@ -43,6 +43,8 @@ def design_lmi(
     subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
     back_off: float = 0.03,
     max_states: int = 20,
+    u: Sequence[str] | None = None,
+    y: Sequence[str] | None = None,
 ) -> Controller:
     """Return a controller that keeps several norms below bounds and makes one of them small.
 
@@ -65,6 +67,8 @@ def design_lmi(
         more where no controller keeps the bounds there: the certificate says how much.
     max_states : int
         Larger problems are refused: the time grows with the sixth power.
+    u, y : sequence of str, optional
+        As for `design_hinf`.
 
     Returns
     -------
@@ -100,7 +104,7 @@ def design_lmi(
     >>> found.gamma < 1
     True
     """
-    given = plant_of(plant)
+    given = posed(plant, u, y, "synthesis by LMIs")
     _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
