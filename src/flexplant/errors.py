@@ -20,11 +20,13 @@ level INFO (``logging.basicConfig(level="INFO")`` shows it).
 """
 
 import logging
+import re
 import sys
 import warnings
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -130,12 +132,21 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [form.format(*row).rstrip() for row in zip(*columns, strict=True)]
 
 
+def plain_repr(value: Any) -> str:
+    """Return the repr of a value, which is the same in each process: without addresses."""
+    if isinstance(value, BuiltinFunctionType | FunctionType | MethodType):
+        return f"{value.__module__}.{value.__qualname__}"
+    if isinstance(value, set | frozenset):
+        return f"{{{', '.join(sorted(map(plain_repr, value)))}}}"
+    return re.sub(r" at 0x[0-9A-Fa-f]+", "", repr(value))
+
+
 def short(value: Any) -> str:
     """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
     if isinstance(value, np.ndarray) and value.size > 6:
         return f"an array of shape {value.shape}"
     try:
-        text = " ".join(repr(value).split())
+        text = " ".join(plain_repr(value).split())
     except ValueError:  # Python writes no integer of more than 4300 digits
         text = f"a {type(value).__name__} that is too long to write"
     return text if len(text) <= 80 else text[:77] + "..."

@@ -321,13 +321,19 @@ class Progress:
     """
 
     def __init__(
-        self, total: int | None, description: str, *, progress: bool | None = None, advice: str = ""
+        self,
+        total: int | None,
+        description: str,
+        *,
+        progress: bool | None = None,
+        advice: str = "",
+        even: bool = True,
     ) -> None:
         self.bar: Any = None
         self._begin = monotonic()
         #: items counted, those of them that were known before, when the last was counted [s], and
-        #: whether items show how much is done
-        self.done, self._known, self._last, self._counts = 0, 0, 0.0, True
+        #: whether they take about equally long, so that they show how much is done
+        self.done, self._known, self._last, self._counts = 0, 0, 0.0, even
         #: seconds in all that were last promised, 0 before; and whether advice was given
         self._promised, self._advised = 0.0, not advice
         self.description, self.advice = description, advice

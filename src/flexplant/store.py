@@ -22,7 +22,7 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 import numpy as np
 import scipy.sparse as sp
 
-from .errors import FlexplantError, unknown_attribute
+from .errors import FlexplantError, plain_repr, unknown_attribute
 
 _HEADER = "__flexplant__"
 
@@ -144,8 +144,8 @@ def _field_text(value: Any) -> str:
             listed[3:-1] = [f"... {len(listed) - 4} more ..."]
         return f"[{', '.join(listed)}]"
     if isinstance(value, MappingProxyType):
-        return repr(dict(value))
-    text = repr(value)
+        return plain_repr(dict(value))
+    text = plain_repr(value)
     long = isinstance(value, Value) and len(text) > 80
     return f"<{type(value).__name__} ...>" if long else text
 

@@ -2,21 +2,28 @@
 
 import http.server
 import json
+import os
 import queue
 import re
 import shutil
 import subprocess
+import sys
 import threading
 import urllib.parse
 from collections import Counter
+from types import SimpleNamespace
 from xml.etree import ElementTree as ET
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
-from flexplant.plot.html_page import neighbours
+from flexplant.plot._axes import Device
+from flexplant.plot.coinciding_curves import widen_hidden
+from flexplant.plot.html_report import _ports_table
+from flexplant.plot.node_lines import neighbours
 from flexplant.words import with_unit
 from stages import RATE, ports, reduced, some_modes
 
@@ -148,6 +155,95 @@ def test_the_same_values_give_the_same_file(design, tmp_path):
     parts = [one for one in design if not isinstance(one, fx.ClosedLoop)]
     first, second = (fx.plot.report(tmp_path / name, *parts).read_bytes() for name in "ab")
     assert first == second
+
+
+IN_A_PROCESS = """
+import sys
+import numpy as np
+import flexplant as fx
+from flexplant.placement import SensorMap
+
+def drawn():
+    return 1
+
+parts = {"filter": fx.lti.low_pass_filter(10.0), "law": fx.workbench.LoopLimits(peak=2.0)}
+seeds = {"drawn": drawn, "lambda": lambda: 1, "rng": np.random.default_rng(3),
+         "object": object(), "set": {"a", "b", "c", "d"}, "sum": np.linalg.norm}
+fx.plot.report(sys.argv[1], parts, seeds=seeds)
+"""
+
+
+@pytest.mark.long
+def test_two_processes_write_the_same_file(tmp_path):
+    """To the byte, also of functions, objects and sets, whose reprs hold addresses or an order."""
+    for number in ("1", "2"):
+        env = {**os.environ, "PYTHONHASHSEED": number}
+        command = [sys.executable, "-c", IN_A_PROCESS, str(tmp_path / number)]
+        subprocess.run(command, env=env, check=True, timeout=120)
+    first, second = ((tmp_path / number).read_text(encoding="utf-8") for number in "12")
+    assert first == second
+    assert "__main__.drawn" in first and " at 0x" not in first
+
+
+def test_ports_stand_with_their_places_and_true_directions():
+    """A label has its direction, a weighted sum those of its parts, a force on the mass its own."""
+    at = {"1:x": 0.5, "2:x": -0.5}
+    found = fx.Ports(
+        u=[fx.Actuator("label", "3:x"), fx.Actuator("point", (0.1, 0.2, 0.0), direction="y")],
+        y=[fx.Sensor("sum", at=at, asd=1e-9), fx.Sensor("mixed", at={"1:x": 1.0, "2:rz": 0.25})],
+        z=[fx.Poi("die", (0.0, 0.0, 0.0), axes=("z", "rx")), fx.Poi("gap", at)],
+        w=[fx.plant.RigidForce("cable", "rz", asd=1e-3)],
+    )
+    wanted = {
+        "label": ("3:x", "x"), "point": ("(0.1, 0.2, 0)", "y"), "cable": ("", "rz"),
+        "sum": ("0.5 of 1:x -0.5 of 2:x", "x"), "mixed": ("1 of 1:x +0.25 of 2:rz", "x rz"),
+        "die": ("(0, 0, 0)", "z rx"), "gap": ("0.5 of 1:x -0.5 of 2:x", "x"),
+    }  # fmt: skip
+    plant = SimpleNamespace(assembled=SimpleNamespace(ports=found), units={})
+    rows = {cells[0]: cells for cells in table_rows(_ports_table(plant))}
+    for name, (place, along) in wanted.items():
+        assert rows[name][2:4] == [place, along]
+    point = np.zeros(3)
+    devices = {port.name: Device.of(port, point) for port in (*found.u, *found.y, *found.z)}
+    assert [devices[n].direction for n in ("label", "point", "sum", "mixed", "die", "gap")] == [
+        "x", "y", "x", "", "", "",
+    ]  # fmt: skip
+
+
+def table_rows(html):
+    return [[words(cell) for cell in row] for row in ET.fromstring(html).iter("tr")]
+
+
+@pytest.mark.slow
+def test_each_test_and_certificate_says_good_or_bad(text):
+    tree = tree_of(text)
+    (said,) = [one for one in tree.iter("section") if one.get("id") == "certificates"]
+    head, *rows = [[words(cell) for cell in row] for row in said.iter("tr")]
+    assert head == ["value", "checked", "figure", "limit", "verdict", "route"]
+    for _, checked, figure, limit, verdict, _ in rows:
+        assert (verdict == "no limit") == (limit == ""), checked
+        if limit:
+            least = float(re.search(r"[-+.\de]+", limit.split()[2])[0])
+            kept = float(figure) >= least if "at least" in limit else float(figure) <= least
+            assert verdict == ("good" if kept else "bad"), checked
+    (tests,) = re.findall(r"NIS [\d.]+, 1 expected +p \S+ +at least 0.01 +(good|bad)", text)
+    assert tests
+
+
+def test_curves_on_one_another_are_all_seen():
+    """The lower of curves that coincide is wider, by as much as each one above it shows."""
+    x, rng = np.linspace(0.0, 1.0, 300), np.random.default_rng(1)
+    ax = plt.figure().add_subplot()
+    y = np.sin(7 * x)
+    grids = [x, x, np.sort(rng.uniform(0.0, 1.0, 500)), x]
+    for k, own in enumerate(grids):
+        ax.plot(own, np.interp(own, x, y) + (0.5 if k == 3 else 0.0), label=f"u{k}", linewidth=1.0)
+    ax.plot(x, y, linewidth=1.0)  # without a name, as limits are
+    widen_hidden(ax)
+    widths = [line.get_linewidth() for line in ax.get_lines()]
+    assert widths[0] > widths[1] + 1.0 > widths[2] + 2.0
+    assert widths[2:] == [1.0, 1.0, 1.0]
+    plt.close("all")
 
 
 def test_an_unstable_loop_is_reported_as_such(tmp_path):

@@ -1,5 +1,7 @@
 """Mode shapes on plates, solids and beams: the surface, the motion, and the motion over time."""
 
+from itertools import pairwise
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -95,3 +97,56 @@ def test_the_ports_of_a_solid_where_they_are():
     assert {"push", "side", "die"} <= {text.get_text().strip() for text in ax.texts}
     with pytest.raises(ModelError, match="three dimensions"):
         fx.plot.layout(modes.dofs, ax=plt.subplots()[1])
+
+
+def portal_frame(count=6, seed=0):
+    """Four legs and four beams of a machine frame: an FEModel, and its joined node numbers."""
+    corners = [(0, 0), (1.2, 0), (1.2, 0.8), (0, 0.8)]
+    legs = [((*c, 0.0), (*c, 0.7)) for c in corners]
+    beams = [
+        ((*a, 0.7), (*b, 0.7)) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+    ]
+    numbers, pairs = {}, set()
+    rng = np.random.default_rng(seed)
+    free = iter(rng.permutation(np.arange(1, 1000)).tolist())
+    for a, b in legs + beams:
+        on = [tuple(np.round(p, 9)) for p in np.linspace(a, b, count)]
+        ids = [numbers.setdefault(p, next(free)) if p not in numbers else numbers[p] for p in on]
+        pairs |= {tuple(sorted(pair)) for pair in pairwise(ids)}
+    ids = np.array(list(numbers.values()))
+    n, place = ids.size, {node: i for i, node in enumerate(ids.tolist())}
+    K = np.zeros((3 * n, 3 * n))
+    for a, b in pairs:
+        rows = np.array([3 * place[a], 3 * place[b]])
+        stiff = rng.uniform(1e6, 2e6, 3)
+        for axis in range(3):
+            at = np.ix_(rows + axis, rows + axis)
+            K[at] += stiff[axis] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    dofs = fx.DofSet(np.repeat(ids, 3), list("xyz") * n, np.repeat(list(numbers), 3, axis=0))
+    return fx.FEModel(np.eye(3 * n), K, dofs=dofs), {tuple(map(int, pair)) for pair in pairs}
+
+
+def drawn_pairs(modes, joined=None):
+    skin = surface_of(modes.dofs, joined)
+    assert not len(skin.triangles)
+    nodes = np.unique(modes.dofs.nodes)
+    return {tuple(sorted(map(int, nodes[edge]))) for edge in skin.edges}
+
+
+def test_a_frame_is_drawn_as_its_members():
+    """Lines between near nodes, between those that K joins, or between those of the elements."""
+    model, pairs = portal_frame()
+    modes = fx.solve_modes(model, count=12)
+    assert drawn_pairs(modes) == pairs
+    assert drawn_pairs(modes, model) == pairs
+    assert drawn_pairs(modes, np.array(sorted(pairs))[:, ::-1]) == pairs
+    coarse, few = portal_frame(count=2)  # nodes at the corners alone form a box
+    assert drawn_pairs(fx.solve_modes(coarse, count=8), coarse) == few
+    ax = fx.plot.mode_shape(modes, 8, joined=model)
+    _, moved = ax.collections[:2]
+    assert len(ax.collections) == 2
+    assert len(np.unique(moved.get_colors(), axis=0)) > 3, "coloured by the displacement"
+    assert fx.plot.layout(model.dofs).name == "3d"
+    for wrong in (np.array([[1, 2000]]), np.array([1, 2, 3])):
+        with pytest.raises(ModelError, match="node numbers at both ends"):
+            fx.plot.mode_shape(modes, 8, joined=wrong)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, between, real_array
-from ..errors import ModelError, ShapeError, counted, short
+from ..errors import ModelError, ShapeError, aligned, counted, short
 from ..loop import ClosedLoop
 from ..plant import AnyPlant
 from ..store import Value
@@ -114,13 +114,30 @@ class ConsistencyReport(Value):
     moved: MovedModes | None = None
 
     def __repr__(self) -> str:
-        nees = "".join(f", NEES {name} {m:.3g}" for name, (m, _, _) in self.nees.items())
-        return (
-            f"<ConsistencyReport at {100 * self.level:g} %: NIS {self.nis:.4g} "
-            f"(p {self.nis_p:.2g}), Ljung-Box p {self.whiteness_p:.2g}, "
-            f"periodogram p {self.periodogram_p:.2g}{nees};\n"
-            f"  {self.text}{self._off()}>"
-        )
+        lines = aligned(["test", "found", "limit", "verdict"], self.tests)
+        said = "agrees" if self.holds else "does not agree"
+        first = f"<ConsistencyReport at {100 * self.level:g} %: the record {said} with the model."
+        table = [f"  {line}" for line in lines]
+        return "\n".join([first, *table, f"  {self.text}{self._off()}>"])
+
+    @property
+    def tests(self) -> tuple[tuple[str, str, str, str], ...]:
+        """Each test in words: its name, what was found, its limit, and whether that is good."""
+        least = 1.0 - self.level ** (1.0 / _TESTS)
+        named = {
+            f"NIS {self.nis:.4g}, 1 expected": self.nis_p,
+            "white (Ljung-Box)": self.whiteness_p,
+            "flat spectrum (periodogram)": self.periodogram_p,
+        }
+        found = [
+            (name, f"p {p:.2g}", f"at least {least:.2g}", _word(p >= least))
+            for name, p in named.items()
+        ]
+        return tuple(found) + tuple(
+            (f"NEES of {name}, 1 expected", f"{mean:.3g}", f"{low:.3g} to {high:.3g} holds 1",
+             _word(low <= 1.0 <= high))
+            for name, (mean, low, high) in self.nees.items()
+        )  # fmt: skip
 
     def _off(self) -> str:
         """Return the modes around which the power is not the predicted one, in words."""
@@ -128,7 +145,7 @@ class ConsistencyReport(Value):
         off = [f"mode {n} {r:.3g}" for n, (r, p) in self.spectra.items() if p < allowed]
         if not off or self.holds:
             return ""
-        return f"\n  Power of the innovations around modes beside the predicted: {', '.join(off)}."
+        return f"\n  Power of the innovations around modes, predicted 1: {', '.join(off)}."
 
     @property
     def cause(self) -> Cause:
@@ -139,6 +156,10 @@ class ConsistencyReport(Value):
     def holds(self) -> bool:
         """Whether no test rejects the model of the innovations."""
         return self.cause == "none"
+
+
+def _word(holds: bool) -> str:
+    return "good" if holds else "bad"
 
 
 def consistency(

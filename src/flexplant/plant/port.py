@@ -225,12 +225,15 @@ def force_unit(at: Place, direction: str) -> str | None:
 
 def turning(at: Place, direction: str) -> bool | None:
     """Return whether a place moves by rotation; None for a sum of both kinds."""
-    places = list(at) if isinstance(at, Mapping) else [at]
-    kinds = {
-        (place.rpartition(":")[2] if isinstance(place, str) else direction).startswith("r")
-        for place in places
-    } or {direction.startswith("r")}
+    kinds = {one.startswith("r") for one in place_directions(at, direction)}
     return kinds.pop() if len(kinds) == 1 else None
+
+
+def place_directions(at: Place, direction: str) -> tuple[str, ...]:
+    """Return the directions of the motions at a place: a label has its own, a point this one."""
+    places = list(at) if isinstance(at, Mapping) else [at]
+    found = (one.rpartition(":")[2] if isinstance(one, str) else direction for one in places)
+    return tuple(dict.fromkeys(found)) or (direction,)
 
 
 #: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises

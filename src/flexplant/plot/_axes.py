@@ -20,8 +20,10 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import FlexplantError, ModelError, short
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
+from ..plant.port import place_directions
 from ..tolerances import TINY
 from ..words import in_unit
+from .coinciding_curves import widen_hidden
 
 #: number of points along a line that a legend must not cover
 _DENSE = 500
@@ -257,6 +259,7 @@ class _Decades(LogFormatter):
 
 def finish(ax: Axes, *, x: str, y: str, title: str = "", given: bool | None = None) -> Axes:
     """Label the axes, with units, and draw a light grid; `given` or new ones get a legend too."""
+    widen_hidden(ax)
     if given is not None:
         legend(ax, given=given)
     ax.set(xlabel=x, ylabel=y)
@@ -316,6 +319,15 @@ PORTS: Mapping[str, Style] = {
 _ARROW = 0.07
 
 
+def port_directions(port: Any) -> tuple[str, ...]:
+    """Return the directions along which a port acts or measures; the axes of a POI."""
+    at, axes = getattr(port, "at", None), getattr(port, "axes", None)
+    if axes is not None and not isinstance(at, Mapping):
+        return tuple(axes)
+    own = getattr(port, "direction", None) or "".join(axes or ())
+    return () if not own and at is None else place_directions(at, own)
+
+
 class Device(NamedTuple):
     """A port in a view of a structure: its name, x to rz or "" of its direction, its place [m]."""
 
@@ -325,10 +337,9 @@ class Device(NamedTuple):
 
     @classmethod
     def of(cls, port: Any, place: FloatArray) -> Device:
-        """Return the device of a port at a place; of a POI no direction."""
-        own = getattr(port, "direction", None)
-        label = port.at.rpartition(":")[2] if isinstance(port.at, str) else None
-        return cls(port.name, "" if hasattr(port, "axes") else label or own or "", place)
+        """Return the device of a port at a place; without a direction of a POI or of several."""
+        along = () if hasattr(port, "axes") else port_directions(port)
+        return cls(port.name, along[0] if len(along) == 1 else "", place)
 
     @property
     def along(self) -> FloatArray | None:

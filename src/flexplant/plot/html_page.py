@@ -21,6 +21,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 from ..arrays import FloatArray, IntArray
 from ..modes import Modes
 from ..tolerances import divisor
+from .node_lines import neighbours
 
 
 class Chapter(NamedTuple):
@@ -266,8 +267,6 @@ def _axis_scale(axis: Any, limits: tuple[float, float]) -> list[Any] | None:
 
 #: largest number of nodes and modes that are drawn
 _NODES, _MODES = 1200, 24
-#: neighbours of a node among which its lines are searched
-_NEIGHBOURS = 27
 _SELECTED = ' selected="selected"'
 
 
@@ -344,27 +343,3 @@ def _thinned(xyz: FloatArray) -> IntArray:
         chosen = np.sort(np.unique(place, axis=0, return_index=True)[1])
         cells = int(0.7 * cells)
     return chosen
-
-
-def neighbours(xyz: FloatArray) -> IntArray:
-    """Return the pairs (m, 2) of nodes without another node between them (a Gabriel graph)."""
-    # a pair is joined when the sphere with it as diameter holds no third node: the lines of a
-    # regular mesh without its diagonals, whatever its ratio of sides
-    from scipy.spatial import cKDTree
-
-    count = min(len(xyz), _NEIGHBOURS)
-    if count < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    tree: Any = cKDTree(xyz)
-    distance, near = tree.query(xyz, k=count)
-    i = np.repeat(np.arange(len(xyz)), count)
-    pairs = np.column_stack([i, near.ravel()])[distance.ravel() > 0]
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    a, b = xyz[pairs[:, 0]], xyz[pairs[:, 1]]
-    radius = 0.5 * np.linalg.norm(b - a, axis=1)
-    closest, _ = tree.query((a + b) / 2, k=min(3, len(xyz)))
-    # the pair itself is at the radius; a third node inside or on the sphere is nearer or as near
-    # nodes of a regular mesh lie on the sphere: rounding must not decide
-    inside = np.atleast_2d(closest)[:, : min(3, len(xyz))] < radius[:, None] * (1.0 - 1e-6)
-    on = np.sum(closest <= radius[:, None] * (1.0 + 1e-6), axis=1) > 2
-    return np.asarray(pairs[~inside.any(axis=1) & ~on], dtype=np.int64)

@@ -31,8 +31,18 @@ from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ..store import Value, written
 from ..synthesis import Controller
 from ..updating import Localisation, UpdateResult
+from ..updating.judgement.goodness import CHANCE
 from ..words import with_unit
-from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
+from ._axes import (
+    STYLES,
+    bottom_only,
+    decibel,
+    finish,
+    name_panel,
+    panel_axes,
+    port_directions,
+    readable,
+)
 from .bode_diagrams import bode, singular_values
 from .errors import budget, error_map
 from .estimation import lag_report
@@ -84,7 +94,8 @@ def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
 
 def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str:
     """Return a value: its name, its repr, tables and pictures."""
-    parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
+    own = value._repr_html_()
+    parts = [f"<h3>{escape(name)}</h3>", own]
     loop = next(iter(design.of(ClosedLoop).values()), None)
     if isinstance(value, Response) and value.seed is not None and loop is not None:
         parts.append("<h4>Compared with the model of the loop</h4>")
@@ -98,12 +109,14 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
         html_or_why(partial(gallery.picture, draw, said))
         for said, draw in _pictures(name, value, design)
     ]
+    if len(drawn) == 1 and len(parts) == 2:  # side by side: no half of the page stays empty
+        parts[1:] = [f'<div class="pictures">{drawn[0]}<div>{own}</div></div>']
+    elif drawn:
+        parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
     if isinstance(value, AnyPlant):
         shown = html_or_why(lambda: value.check()._repr_html_())
-        shown = f"<details><summary>Standard assumptions</summary>{shown}</details>"
-        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value.machine))}{shown}</div>")
-    if drawn:
-        parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
+        parts.append(html_or_why(lambda: _ports_table(value.machine)))
+        parts.append(f"<details><summary>Standard assumptions</summary>{shown}</details>")
     tick("report")
     return "".join(parts)
 
@@ -188,25 +201,37 @@ def _ports_table(plant: StandardPlant) -> str:
     rows = []
     for side, kind in kinds.items():
         for port in getattr(ports, side):
-            at = getattr(port, "at", "")
-            point = isinstance(at, tuple | list | np.ndarray) and not isinstance(at[0], str)
-            where = ", ".join(f"{x:g}" for x in at) if point else str(at)
+            where = _place_text(getattr(port, "at", ""))
             own = plant.units.get(port.name)
             unit, asd = f"{own}/√Hz" if own else units.get(side, ""), getattr(port, "asd", 0.0)
             density = with_unit(asd, unit) if asd else ""
-            along = getattr(port, "direction", None) or " ".join(getattr(port, "axes", ()))
-            rows.append([port.name, kind, where, str(along), density])
+            rows.append([port.name, kind, where, " ".join(port_directions(port)), density])
     return table(["channel", "kind", "place [m]", "along", "noise density"], rows)
+
+
+def _place_text(at: Any) -> str:
+    """Return a place in words: a label, a point, or a weighted sum of such."""
+    if isinstance(at, Mapping):
+        parts = (f"{weight:+g} of {_place_text(one)}" for one, weight in at.items())
+        return " ".join(parts).removeprefix("+")
+    return at if isinstance(at, str) else f"({', '.join(f'{x:g}' for x in at)})"
 
 
 def certificates(design: Design) -> Chapter | None:
     """Return the section of all checks."""
     rows = [
-        [name, *check.row] for name, value in design.named.items() for check in _checks_of(value)
+        [name, check.what.replace("_", " "), *check.row[1:3], _VERDICTS[check.holds], check.route]
+        for name, value in design.named.items()
+        for check in _checks_of(value)
     ]
     if not rows:
         return None
-    return Chapter("Certificates", table(["value", "checked", "figure", "limit", "route"], rows))
+    head = ["value", "checked", "figure", "limit", "verdict", "route"]
+    return Chapter("Certificates", table(head, rows))
+
+
+#: words for whether a figure keeps its limit; without a limit it only informs
+_VERDICTS = {True: "good", False: "bad", None: "no limit"}
 
 
 def _checks_of(value: Any) -> Iterator[Verified]:
@@ -221,8 +246,10 @@ def _checks_of(value: Any) -> Iterator[Verified]:
         if value.left_out is not None:
             yield from value.left_out.certificate.checks
     if isinstance(value, UpdateResult) and value.chi2 is not None:
-        yield Verified("chi-square of the fit", value.chi2, "residuals over their covariance")
-        yield Verified("degrees of freedom", float(value.dof))
+        what = f"p-value of chi-square {value.chi2:.4g}, {value.dof} expected"
+        yield Verified(
+            what, value.p_value or 0.0, "residuals over their covariance", CHANCE, at_least=True
+        )
     if isinstance(value, Placement):
         what = f"value [{value.unit}]" if value.unit else "value"
         yield Verified(what, value.value, "lower bound of all choices", value.bound, at_least=True)
@@ -481,7 +508,7 @@ def report(
     design, gallery = Design(parts), Gallery()
     runs = design.of(Response).items()
     noisy = {name: run.seed for name, run in runs if run.seed is not None}
-    with Progress(len(design.named) + 2, "report") as bar:
+    with Progress(len(design.named) + 2, "report", even=False) as bar:
         found = [result(design, gallery, channel)]
         bar.advance()
         found += [loops_section(design, gallery, channel)]

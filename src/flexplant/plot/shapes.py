@@ -19,6 +19,7 @@ from ..errors import ModelError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
+from ..structure.model import FEModel
 from ..tolerances import TYPED, divisor
 from ..words import in_unit, instance
 from ._axes import (
@@ -34,6 +35,7 @@ from ._axes import (
     plan,
     solid_axes,
 )
+from .node_lines import joined_lines, neighbours
 
 _COLOURS = "viridis"
 #: number of triangles that are drawn quickly; those of a coarse mesh are divided for smooth colours
@@ -47,12 +49,15 @@ def mode_shape(
     scale: float = 0.15,
     phase: float = 0.0,
     color: str | None = None,
+    joined: FEModel | IntArray | None = None,
     ax: Any = None,
 ) -> Any:
-    """Draw a mode of a plate, a solid or a beam in three dimensions (paper, Figs. 5 and 6).
+    """Draw a mode of a plate, a solid or a frame in three dimensions (paper, Figs. 5 and 6).
 
-    The surface is found from the nodes: that of a solid has two sides. Its colour is the size of
-    the displacement, in all directions together; dashed lines are the edges at rest.
+    The surface is found from the nodes: that of a solid has two sides. A structure whose nodes form
+    no surface is drawn as lines between nodes that are near, or between those that are `joined`.
+    The colour is the size of the displacement, in all directions together; dashed lines are the
+    edges at rest.
 
     Parameters
     ----------
@@ -65,7 +70,11 @@ def mode_shape(
     phase : float [rad]
         Phase of the motion ``Re(phi exp(i phase))``: 0 is the largest displacement.
     color : str, optional
-        One colour for the surface.
+        One colour for the surface or the lines.
+    joined : FEModel or (m, 2) array of int, optional
+        Draws lines in place of a surface, as suits a frame of beams: between nodes that the
+        stiffness matrix of a model joins, or between the nodes with these numbers, such as those
+        at the ends of each element in the file of the model.
     ax : Axes3D, optional
 
     Raises
@@ -84,19 +93,21 @@ def mode_shape(
     >>> ax.name
     '3d'
     """
-    return _Moving(modes, number, scale, color, ax).at(phase)
+    return _Moving(modes, number, scale, color, joined, ax).at(phase)
 
 
 class _Moving:
     """A mode on axes, at any phase of its motion."""
 
-    def __init__(self, modes: Modes, number: int, scale: float, color: str | None, ax: Any) -> None:
+    def __init__(
+        self, modes: Modes, number: int, scale: float, color: str | None, joined: Any, ax: Any
+    ) -> None:
         instance(modes, Modes, "modes", "Pass what solve_modes returned, or model.modes().")
         if not 1 <= number <= modes.omega.size:
             raise ModelError(
                 f"mode {number} does not exist: modes are numbered 1 to {modes.omega.size}."
             )
-        self.skin = surface_of(modes.dofs)
+        self.skin = surface_of(modes.dofs, joined)
         motion = real_motion(self.skin.motion(np.asarray(modes.phi)[:, number - 1]))
         size = float(np.max(np.linalg.norm(motion, axis=1)))
         if not size:
@@ -119,20 +130,25 @@ class _Moving:
         skin, rest = self.skin, self.skin.xyz / self.factor
         self.ax.computed_zorder = False  # the shape at rest never hides the moving one
         still = Line3DCollection(rest[skin.edges], colors=GREY, linewidths=0.8, linestyles="--")
-        lines = Line3DCollection(rest[skin.edges], colors=BLACK, linewidths=1.2)
+        shades = ScalarMappable(Normalize(0.0, 1.0), _COLOURS)
+        is_frame = not len(skin.triangles)
+        look: Any = {"colors": color or BLACK, "linewidths": 2.0 if is_frame else 1.2}
+        if is_frame and color is None:
+            look["colors"] = shades.to_rgba(self.size[skin.edges].mean(axis=1))
+        lines = Line3DCollection(rest[skin.edges], **look)
         self.ax.add_collection3d(still)
         if not skin.is_solid:  # its rear edges would lie on its face
             self.ax.add_collection3d(lines)
         still.set_zorder(1)
         lines.set_zorder(3)
         faces = None
-        if len(skin.triangles):
+        if color is None:
+            label = "displacement, largest 1 [-]"
+            self.ax.figure.colorbar(shades, ax=self.ax, label=label, shrink=0.6, pad=0.1)
+        if not is_frame:
             colours: Any = color
             if color is None:
-                shades = ScalarMappable(Normalize(0.0, 1.0), _COLOURS)
                 colours = shades.to_rgba(self._divided(self.size[:, None]).mean(axis=(1, 2)))
-                label = "displacement, largest 1 [-]"
-                self.ax.figure.colorbar(shades, ax=self.ax, label=label, shrink=0.6, pad=0.1)
             edge = colours if color is None else GREY
             faces = Poly3DCollection(
                 self._divided(rest), facecolors=colours, edgecolors=edge, linewidths=0.3
@@ -179,7 +195,7 @@ MOST = 30_000
 #: length of edges relative to the distance between nodes above which they do not belong to the
 #: surface
 _REACH = 2.5
-#: least fraction of the hull that a surface has; with less the nodes are too irregular
+#: least fraction of the nodes that a surface holds; with less the nodes are those of a frame
 _WHOLE = 0.6
 #: cosine of the angle between faces, below which their edge is one of the body
 _EDGE = 0.8
@@ -209,8 +225,8 @@ class Surface(NamedTuple):
         return moved
 
 
-def surface_of(dofs: DofSet) -> Surface:
-    """Return the surface of a structure, by Delaunay's triangulation of its nodes."""
+def surface_of(dofs: DofSet, joined: Any = None) -> Surface:
+    """Return the surface of a structure, by Delaunay's triangulation of its nodes, or its lines."""
     # edges much longer than the distance between nodes are left out: holes and notches stay open
     # where they are wider than two elements, half an element of their corners is filled
     numbers, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
@@ -223,15 +239,30 @@ def surface_of(dofs: DofSet) -> Surface:
     moves = dofs.kinds < 3
     rows[node[moves], dofs.kinds[moves]] = np.flatnonzero(moves)
     xyz = np.asarray(dofs.xyz[first])
+    no_faces = np.zeros((0, 3), dtype=np.int64)
+    if joined is not None:
+        return Surface(xyz, rows, no_faces, joined_lines(joined, numbers))
     rank = _dimension(xyz)
     if rank < 2 or numbers.size < rank + 1:
         # along x, of equal ones along y, then z
         order = np.argsort(xyz @ np.array([1.0, 1e-3, 1e-6]))
         chain = np.column_stack([order[:-1], order[1:]])
-        return Surface(xyz, rows, np.zeros((0, 3), dtype=np.int64), chain)
+        return Surface(xyz, rows, no_faces, chain)
     flat = _flat_axes(xyz) if rank == 2 else xyz
     triangles = _surface(flat)
+    if not len(triangles):
+        return Surface(xyz, rows, no_faces, _members(xyz))
     return Surface(xyz, rows, triangles, _outline(xyz, triangles))
+
+
+def _members(xyz: FloatArray) -> IntArray:
+    """Return the lines (m, 2) of a frame: between near nodes without another between them."""
+    from scipy.spatial import cKDTree
+
+    pairs = neighbours(xyz)
+    near = np.asarray(cKDTree(xyz).query(xyz, k=2)[0])[:, 1]
+    length = np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1)
+    return np.asarray(pairs[length <= _REACH * near[pairs].max(axis=1)])
 
 
 def _dimension(xyz: FloatArray) -> int:
@@ -249,7 +280,10 @@ def _flat_axes(xyz: FloatArray) -> FloatArray:
 
 
 def _surface(points: FloatArray) -> IntArray:
-    """Return triangles of points (n, 2), or the outer faces of the tetrahedra between (n, 3)."""
+    """Return triangles of points (n, 2), or the outer faces of the tetrahedra between (n, 3).
+
+    There are none where most nodes lie on no face: those of a frame.
+    """
     from scipy.spatial import Delaunay, cKDTree
 
     scaled = points / _spacings(points)
@@ -259,8 +293,9 @@ def _surface(points: FloatArray) -> IntArray:
     longest = np.sqrt(np.max(np.sum(sides**2, axis=-1), axis=(1, 2)))
     near = np.asarray(cKDTree(scaled).query(scaled, k=2)[0])[:, 1]
     kept = simplices[longest <= _REACH * near[simplices].max(axis=1)]
-    if np.unique(kept).size > _WHOLE * len(points):
-        simplices = kept
+    if np.unique(kept).size <= _WHOLE * len(points):
+        return np.zeros((0, 3), dtype=np.int64)
+    simplices = kept
     if points.shape[1] == 2:
         return simplices
     faces = np.vstack([np.delete(simplices, k, axis=1) for k in range(4)])
@@ -339,7 +374,7 @@ def layout(
     >>> ax.get_aspect()
     1.0
     """
-    if np.ptp(dofs.xyz[:, 2]) > 0 and (skin := surface_of(dofs)).is_solid:
+    if np.ptp(dofs.xyz[:, 2]) > 0 and _dimension((skin := surface_of(dofs)).xyz) == 3:
         return _solid(skin, dofs, ports, desired, marked or {}, ax)
     ax = axes(ax, figsize=(6.0, 6.0))
     factor = plan(ax, dofs.xyz)
@@ -384,8 +419,9 @@ def _solid(
     factor = in_unit(skin.extent, "m")[0]
     rest = skin.xyz / factor
     ax.computed_zorder = False  # points inside and behind stay visible
-    faces = Poly3DCollection(rest[skin.triangles], facecolors=LIGHT, alpha=0.2, zorder=1)
-    ax.add_collection3d(faces)
+    if len(skin.triangles):
+        faces = Poly3DCollection(rest[skin.triangles], facecolors=LIGHT, alpha=0.2, zorder=1)
+        ax.add_collection3d(faces)
     ax.add_collection3d(Line3DCollection(rest[skin.edges], colors=GREY, linewidths=0.8, zorder=2))
     wanted = list(desired)
     if wanted:
