@@ -321,7 +321,8 @@ _ARROW = 0.07
 
 def port_directions(port: Any) -> tuple[str, ...]:
     """Return the directions along which a port acts or measures; the axes of a POI."""
-    at, axes = getattr(port, "at", None), getattr(port, "axes", None)
+    at: Any = getattr(port, "at", None)
+    axes = getattr(port, "axes", None)
     if axes is not None and not isinstance(at, Mapping):
         return tuple(axes)
     own = getattr(port, "direction", None) or "".join(axes or ())

@@ -38,14 +38,19 @@ def widen_hidden(ax: Axes) -> None:
 
 def _is_named_curve(line: Line2D) -> bool:
     named = not str(line.get_label()).startswith("_")
-    return named and line.get_linestyle() not in ("None", "", " ") and len(line.get_xydata()) > 2
+    return (
+        named
+        and line.get_linestyle() not in ("None", "", " ")
+        and len(np.asarray(line.get_xydata())) > 2
+    )
 
 
 def _on_paper(ax: Axes, line: Line2D) -> FloatArray:
     """Return points [pixels] in equal steps along the part of a curve that is in the picture."""
     _ = ax.get_xlim(), ax.get_ylim()  # brings the limits up to date, which the transform does not
     with np.errstate(invalid="ignore", divide="ignore"):
-        points = ax.transData.transform(np.asarray(line.get_xydata(), dtype=float))
+        drawn = ax.transData.transform(np.asarray(line.get_xydata(), dtype=float))
+    points: FloatArray = np.asarray(drawn, dtype=float)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 2:
         return points

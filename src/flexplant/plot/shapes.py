@@ -292,10 +292,9 @@ def _surface(points: FloatArray) -> IntArray:
     sides = corners[:, :, None, :] - corners[:, None, :, :]
     longest = np.sqrt(np.max(np.sum(sides**2, axis=-1), axis=(1, 2)))
     near = np.asarray(cKDTree(scaled).query(scaled, k=2)[0])[:, 1]
-    kept = simplices[longest <= _REACH * near[simplices].max(axis=1)]
-    if np.unique(kept).size <= _WHOLE * len(points):
+    simplices = np.asarray(simplices[longest <= _REACH * near[simplices].max(axis=1)])
+    if np.unique(simplices).size <= _WHOLE * len(points):
         return np.zeros((0, 3), dtype=np.int64)
-    simplices = kept
     if points.shape[1] == 2:
         return simplices
     faces = np.vstack([np.delete(simplices, k, axis=1) for k in range(4)])
