@@ -12,6 +12,7 @@ from matplotlib import image
 from PIL import Image
 
 import flexplant as fx
+from flexplant.documentation import keep
 from oracles_plant import machine
 from oracles_structure import elastic_receptance, plate_matrices, undamped
 from oracles_structure import poles as dense_poles
@@ -260,6 +261,9 @@ def test_the_pictures(examples, result, paper, tmp_path):
     for path in figures:
         drawn_well(path)
     check_the_readmes_picture(drawn)
+    # the site shows these runs
+    keep(EXAMPLES / "wafer_stage.py", stage.table(result), [drawn])
+    keep(EXAMPLES / "paper_plate.py", plate.table(paper), figures)
 
 
 def test_the_readme_says_what_the_run_says(result):
@@ -323,7 +327,9 @@ def test_the_guarantee_holds_on_machines_drawn_anew(later, tmp_path):
     text = example.table(found)
     assert "every machine is stable" in text
     assert "stage_hinf.c" in text
-    assert example.picture(found, tmp_path).stat().st_size > 20_000
+    drawn = example.picture(found, tmp_path)
+    assert drawn.stat().st_size > 20_000
+    keep(EXAMPLES / "robust_control.py", text, [drawn])
 
 
 def test_each_order_buys_what_the_example_says(later, tmp_path):
@@ -340,7 +346,9 @@ def test_each_order_buys_what_the_example_says(later, tmp_path):
     assert errors[1] < 0.5 * errors[0] and errors[2] < 1.1 * errors[1]
     text = example.table(result)
     assert "best servo, feedforward" in text and "move 2: rms" in text
-    assert example.picture(result, tmp_path).stat().st_size > 20_000
+    drawn = example.picture(result, tmp_path)
+    assert drawn.stat().st_size > 20_000
+    keep(EXAMPLES / "feedforward.py", text, [drawn])
 
 
 def test_the_story_of_placement(later, tmp_path):
@@ -367,7 +375,9 @@ def test_the_story_of_placement(later, tmp_path):
     assert np.all(result["worth"].without > result["worth"].value)
     text = example.table(result)
     assert "at the die" in text and "pm" in text and "e-2" not in text
-    assert all(path.stat().st_size > 15_000 for path in example.pictures(result, tmp_path))
+    drawn = example.pictures(result, tmp_path)
+    assert all(path.stat().st_size > 15_000 for path in drawn)
+    keep(EXAMPLES / "placement.py", text, drawn)
 
 
 KNOBS = {"peak", "disturbance", "effort", "noise"}

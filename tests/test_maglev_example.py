@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import flexplant as fx
+from flexplant.documentation import keep
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -103,5 +104,6 @@ def test_the_tables_and_the_picture(maglev, found, text, tmp_path):
     assert max(map(len, text.splitlines())) < 200
     from matplotlib import image
 
-    pixels = image.imread(maglev.picture(found, tmp_path))[:, :, :3]
-    assert pixels.std() > 0.05
+    drawn = maglev.picture(found, tmp_path)
+    assert image.imread(drawn)[:, :, :3].std() > 0.05
+    keep(EXAMPLES / "maglev.py", text, [drawn])  # the site shows this run

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
+from flexplant.documentation import keep
 from shared_data import BUNDLED, ELSEWHERE
 
 FILE = Path(__file__).parents[1] / "examples" / "measured_frf.py"
@@ -101,3 +102,4 @@ def test_table_and_pictures(example, result, tmp_path):
     ]
     for path in drawn:
         assert np.ptp(image.imread(path)[..., :3]) > 0.5
+    keep(FILE, text, drawn)  # the site shows this run

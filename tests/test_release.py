@@ -31,6 +31,7 @@ LICENCES = {
     "ansys-mapdl-reader": "MIT",
     "mkl": "Intel",
     "pdoc": "MIT-0|Public Domain",
+    "latex2mathml": "MIT",
     "panel": "BSD",
 }
 #: a licence that asks nothing of those who use this package but to be named

@@ -68,7 +68,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - control six axes: `examples/maglev.py`; a stage that scans below sensors on its frame:
   `examples/scanning_stage.py`
 - shape loops by hand in a browser, on measured responses: `examples/workbench.py`
-- a machine of which no body is free: `examples/gantry.py`; follow set-points:
+- from the files of a project to C code: `examples/gantry.py`; follow set-points:
   `examples/feedforward.py`
 - design by mixed sensitivity, on textbook plants: `examples/textbook.py`
 - guarantee robustness: `examples/robust_control.py`
@@ -176,10 +176,11 @@ to 300 000 DOFs eigsh with a factor of CHOLMOD or PARDISO is 1.4 to 1.8 times fa
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy
 (MIT), matplotlib (its own, of BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e
 '.[ansys]'``: ``hdf5`` is h5py and ``workbench`` panel (BSD-3), ``uff`` pyuff and ``ansys``
-ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc (MIT-0). What these need in turn has
-licences of the same kinds. slycot (GPL-2) and other peers are used in tests only. Sources are cited
-by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its text says 0.1 % modal
-damping while its printed eigenvalues have 1 %; `examples/paper_plate.py` shows both.
+ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc (MIT-0) and latex2mathml (MIT). What
+these need in turn has licences of the same kinds. slycot (GPL-2) and other peers are used in tests
+only. Sources are cited by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its
+text says 0.1 % modal damping while its printed eigenvalues have 1 %; `examples/paper_plate.py`
+shows both.
 """
 
 from importlib import import_module as _import_module

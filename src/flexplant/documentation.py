@@ -1,42 +1,58 @@
-"""The documentation as a site: ``python -m flexplant.documentation site`` (extra ``docs``: pdoc).
+"""The documentation as a site: ``python -m flexplant.documentation site`` (extra ``docs``).
 
-Every room is a page, its docstring first and then what it exports; every example of the repository
-is one, its cells as text and code with the pictures that were drawn; README is the front. Links are
-checked when all is written: one that leads nowhere is an error.
+pdoc writes a page for every room: its docstring first, then what it exports. The pages of
+``flexplant/pages``, the examples and the README are added to these. An example's page shows what
+the example prints and draws: it is run once, and again when its source has changed. With
+``--no-runs`` only what is there already is shown.
 """
 
 from __future__ import annotations
 
+import hashlib
 import inspect
+import os
 import re
 import shutil
+import subprocess
 import sys
+import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from html.parser import HTMLParser
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
+from importlib.metadata import requires
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from .errors import CertificateError, FlexplantError, SolverError, counted
+from .errors import FlexplantError, SolverError, counted
+from .rooms import versions
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLES = _ROOT / "examples"
-#: pages that are no rooms; only sources and what can be raised are read there
+_PAGES = Path(__file__).parent / "pages"
+#: modules that get a page without being rooms
 _MORE = ("bibliography", "errors", "algorithms")
+#: examples that the gallery shows first
+_FIRST = ("wafer_stage", "gantry")
+#: texts of the folder `pages`, in the order in which they are listed
+_TEXTS = ("how_it_works", "my_matrices", "only_an_frf", "refused", "from_matlab")
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
+_HOME = "@root@/"  # stands for the way from a page to the folder of the site
 
-_PAGE = """{% extends "default/module.html.jinja2" %}
+_TEMPLATE = """{% extends "default/module.html.jinja2" %}
 {% block title %}{{ module.modulename }}{% endblock %}
 {% block module_list_link %}
-{% set root = "../" * module.modulename.count(".") %}
-<a class="pdoc-button module-list-button" href="{{ root }}flexplant.html">Start</a>
-{% if "examples" in all_modules %}
-<a class="pdoc-button module-list-button" href="{{ root }}examples.html">Examples</a>
-{% endif %}
+<ul class="ways">
+{% for name, title in ways.items() if name in all_modules %}
+<li><a href="@root@/{{ name }}.html">{{ title }}</a></li>
+{% endfor %}
+</ul>
 {% endblock %}
+{% defaultmacro module_name() %}
+{% if module.modulename.startswith("flexplant") %}<h1>{{ module.modulename }}</h1>{% endif %}
+{% enddefaultmacro %}
 {% block nav_submodules %}
 {% if module.modulename == "flexplant" %}{{ super() | replace("Submodules", "Rooms") }}{% endif %}
 {% endblock %}
@@ -54,62 +70,81 @@ _PAGE = """{% extends "default/module.html.jinja2" %}
 """
 _STYLE = """
 main.pdoc img { max-width: 100%; height: auto; }
-main.pdoc .docstring table { display: block; overflow-x: auto; font-size: 0.9em; }
+main.pdoc table { display: block; overflow-x: auto; font-size: 0.9em; }
 main.pdoc pre { overflow-x: auto; font-size: 0.78rem; }
-.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; }
+main.pdoc p code, main.pdoc h1, main.pdoc h2, main.pdoc h3 { overflow-wrap: anywhere; }
+.pdoc-code.signature { overflow-x: auto; }
+math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", math; font-size: 1.1em; }
+.formula { overflow-x: auto; padding: 0.5rem 0; }
+nav.pdoc ul.ways { list-style: none; padding: 0; margin: 0.5rem 0; }
+.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(15rem, 100%), 1fr));
+  gap: 1rem; }
 .gallery > a { border: 1px solid var(--accent2); border-radius: 4px; padding: 0.6rem; }
-.gallery img { display: block; width: 100%; height: 10rem; object-fit: cover;
-  object-position: top left; margin-bottom: 0.4rem; }
+main.pdoc .gallery img, main.pdoc .gallery pre { display: block; width: 100%; height: 10rem;
+  margin: 0 0 0.4rem; object-fit: cover; object-position: top left; overflow: hidden;
+  font-size: 0.5rem; }
 """
 
 
-class Links(NamedTuple):
-    """What a written site holds."""
+class Shown(NamedTuple):
+    """What an example prints, and the pictures that it draws."""
 
-    pages: int
-    links: int
-    pictures: int
-    broken: tuple[str, ...]
+    printed: str
+    pictures: tuple[Path, ...]
 
 
-class _Page(HTMLParser):
-    """The places and the references of one page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.places: set[str] = set()
-        self.references: list[str] = []
-        self.pictures = 0
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Collect ids, links, pictures and scripts."""
-        for name, value in attrs:
-            if name == "id" and value:
-                self.places.add(value)
-            if name in ("href", "src") and value:
-                self.references.append(value)
-        self.pictures += tag == "img"
+# ---- examples are run, and their output is kept by their source
 
 
-def check_links(folder: Path) -> Links:
-    """Return what the pages of a folder hold, and which of their links lead nowhere."""
-    found = (path.resolve() for path in folder.resolve().rglob("*.html"))
-    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in found}
-    broken, links = [], 0
-    for path, page in pages.items():
-        for reference in page.references:
-            if re.match(r"[a-z]+:", reference):
-                continue  # other places in the net, and data in the page
-            links += 1
-            file, _, place = reference.partition("#")
-            target = (path.parent / file).resolve() if file else path
-            known = pages.get(target)
-            there = known is not None or target.exists()
-            if not there or (place and (known is None or place not in known.places)):
-                broken.append(f"{path.relative_to(folder.resolve())}: {reference}")
-    pictures = sum(page.pictures for page in pages.values())
-    return Links(len(pages), links, pictures, tuple(dict.fromkeys(broken)))
+def _kept(story: Path) -> Path:
+    source = hashlib.sha256(story.read_bytes()).hexdigest()
+    return _EXAMPLES / "out" / "shown" / f"{story.stem}-{source[:16]}"
+
+
+def keep(story: Path, printed: str, pictures: Iterable[Path]) -> None:
+    """Keep what a run of an example printed and drew, for its page."""
+    folder = _kept(story)
+    for older in folder.parent.glob(f"{story.stem}-*"):
+        shutil.rmtree(older)
+    folder.mkdir(parents=True)
+    for path in pictures:
+        shutil.copyfile(path, folder / path.name)
+    (folder / "printed.txt").write_text(printed.rstrip() + "\n", encoding="utf-8")
+
+
+def _run(story: Path) -> None:
+    """Run an example in a copy of its folder, and keep what it prints and draws."""
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / "examples"
+        shutil.copytree(_EXAMPLES, copy, ignore=shutil.ignore_patterns("out", "*.png", "__*"))
+        if story.stem.startswith("test_"):
+            command = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
+        else:
+            command = []
+        answer = subprocess.run(
+            [sys.executable, *command, str(copy / story.name), *_ARGUMENTS.get(story.stem, ())],
+            capture_output=True,
+            text=True,
+            env=os.environ | {"MPLBACKEND": "Agg"},
+        )
+        if answer.returncode:
+            raise SolverError(f"examples/{story.name} fails: {answer.stderr[-2000:]}")
+        printed = answer.stdout.replace(str(copy), "examples")
+        keep(story, printed, sorted(copy.rglob("out/**/*.png")))
+
+
+_ARGUMENTS = {"workbench": ("--no-browser",)}
+
+
+def _shown(story: Path) -> Shown | None:
+    folder = _kept(story)
+    if not folder.exists():
+        return None
+    printed = (folder / "printed.txt").read_text(encoding="utf-8")
+    return Shown(printed, tuple(sorted(folder.glob("*.png"))))
+
+
+# ---- texts
 
 
 def rooms() -> dict[str, ModuleType]:
@@ -128,7 +163,7 @@ def _page_names(name: str, room: ModuleType) -> list[str]:
 
 
 class _Site:
-    """One run: what is where, and the page that is being written."""
+    """The rooms, where each name is, the examples, and the formulas found so far."""
 
     def __init__(self) -> None:
         self.rooms = rooms()
@@ -137,48 +172,67 @@ class _Site:
         for room, names in self.names.items():
             for name in names:
                 self.where.setdefault(name, room)
-        self.stories = sorted(_EXAMPLES.glob("*.py")) if _EXAMPLES.is_dir() else []
-        self.page, self.root = "flexplant", ""
-        self.searched: set[str] | None = None  # pages, while the search index is written
-
-    def at(self, page: str) -> None:
-        """Say which page is written: links are relative to it."""
-        self.page, self.root = page, "../" * page.count(".")
+        stories = _EXAMPLES.glob("*.py") if _EXAMPLES.is_dir() else ()
+        self.stories = sorted(stories, key=lambda p: (p.stem not in _FIRST, p.stem != _FIRST[0], p))
+        self.formulas: dict[str, str] = {}
+        self.searched: set[str] | None = None  # full texts, while the search index is written
 
     def markdown(self, text: str) -> str:
-        """Return a docstring with what pdoc does not know: tables, literal blocks, links."""
-        text = re.sub(r"^(\S[^\n]*? : )([^\n]*:[^\n]*)$", _protected, text, flags=re.MULTILINE)
+        """Return a docstring or page with what pdoc does not know: formulas, literals, links."""
+        if self.searched is not None and text not in self.searched:
+            text = text.partition("\n\n")[0]  # of a function its first paragraph is searched
+        elif self.searched is not None:
+            text = text.partition("\n### What it prints")[0]  # of an example its introduction
+        parts = re.split(r"(^ *```.*?^ *```)", text, flags=re.MULTILINE | re.DOTALL)
+        parts[::2] = [self._prose(part) for part in parts[::2]]
+        return "".join(parts)
+
+    def _prose(self, text: str) -> str:
         text = re.sub(
-            r"^( *)\.\. math::((?:.+\n| *\n(?=\1 +))+)", _formula, text, flags=re.MULTILINE
-        )
-        text = re.sub(r"::$", ":", text, flags=re.MULTILINE)
-        rule = r"^ *=+(?: +=+)+ *\n"
-        text = re.sub(
-            rf"({rule}(?:[^\n]*\n)*?{rule}(?:(?:[^\n=]+[^\n]*\n)+?{rule})?)",
-            lambda m: f"```text\n{inspect.cleandoc(m[0])}\n```\n",
+            r"^(\S[^\n]*? : )([^\n]*:[^\n]*)$",
+            lambda m: m[1] + m[2].replace(":", _COLON),
             text,
             flags=re.MULTILINE,
         )
-        text = re.sub(r"\[(\w+)\]_", rf"[\1]({self.root}flexplant/bibliography.html#\1)", text)
-        parts = re.split(r"(^ *```.*?^ *```)", text, flags=re.MULTILINE | re.DOTALL)
-        parts[::2] = [re.sub(r"(?<!`)`([\w./]+)(\(\))?`(?!`)", self.linked, p) for p in parts[::2]]
-        return "".join(parts)
+        rst = r"^( *)\.\. math::(?P<latex>(?:.+\n| *\n(?=\1 +))+)"
+        text = re.sub(rst, self._formula, text, flags=re.MULTILINE)
+        text = re.sub(r"^\$\$(?P<latex>[^$]+)\$\$", self._formula, text, flags=re.MULTILINE)
+        text = re.sub(r"(?<!`)\$([^$`\n]+)\$", lambda m: self._mark(m[1], "inline"), text)
+        text = re.sub(r"::$", ":", text, flags=re.MULTILINE)
+        text = re.sub(r"\[(\w+)\]_", rf"[\1]({_HOME}flexplant/bibliography.html#\1)", text)
+        return re.sub(r"(?<!`)`([\w./]+)(\(\))?`(?!`)", self._linked, text)
 
-    def linked(self, match: re.Match[str]) -> str:
-        """Return a name in single quotes as a link, where it is on another page."""
+    def _formula(self, match: re.Match[str]) -> str:
+        return f"\n\n{self._mark(match['latex'], 'block')}\n\n"
+
+    def _mark(self, latex: str, display: str) -> str:
+        """Return a word that stands for a formula until the page is written."""
+        from latex2mathml.converter import convert
+
+        mark = f"formula{len(self.formulas)}x"
+        self.formulas[mark] = convert(" ".join(latex.split()), display=display)
+        if display == "block":
+            self.formulas[mark] = f'<div class="formula">{self.formulas[mark]}</div>'
+        return mark
+
+    def _linked(self, match: re.Match[str]) -> str:
+        """Return a name in single quotes as a link to its page."""
         name = match[1]
         if name.startswith("examples/"):
             known = name.endswith(".py") and _ROOT / name in self.stories
-            return f"[{match[0]}]({self.root}{name[:-3]}.html)" if known else match[0]
+            return f"[{match[0]}]({_HOME}{name[:-3]}.html)" if known else match[0]
         short = name.removeprefix("fx.").removeprefix("flexplant.").split(".")
         room = short.pop(0) if short[0] in self.rooms else self.where.get(short[0])
-        if room is None or self.page == f"flexplant.{room}":
-            return match[0]
-        if short and short[0] not in self.names[room]:
+        if room is None or (short and short[0] not in self.names[room]):
             return match[0]
         # to the class of a member: pdoc would take ".member" in a link for a name of its own
         place = f"#{short[0]}" if short else ""
-        return f"[{match[0]}]({self.root}flexplant/{room}.html{place})"
+        return f"[{match[0]}]({_HOME}flexplant/{room}.html{place})"
+
+    def finished(self, page: str, html: str) -> str:
+        """Return a page with its formulas, and links that lead from where it is."""
+        html = re.sub(r"formula\d+x", lambda m: self.formulas[m[0]], html)
+        return html.replace(_HOME, "../" * page.count(".")).replace(_COLON, ":")
 
     def bibliography(self) -> str:
         """Return the sources as a list with a place for each key."""
@@ -189,7 +243,7 @@ class _Site:
         return "\n".join([head.replace("``[Guyan1965]_``", "``[Guyan1965]``"), *lines])
 
     def front(self) -> str:
-        """Return README, then what the package says of itself, then the rooms."""
+        """Return README, then the rooms, then what the package says of itself."""
         readme = _ROOT / "README.md"
         text = readme.read_text(encoding="utf-8").partition("\n")[2] if readme.exists() else ""
         text = text.replace("](examples/", "](pictures/").replace("](examples)", "](examples.html)")
@@ -200,62 +254,59 @@ class _Site:
         )
         return f"{text}\n## The rooms\n\n{room}\n\n## In one page\n\n{own}\n"
 
-    def pictures(self, story: Path, folder: Path) -> list[str]:
-        """Copy what a story has drawn; return the names of the copies."""
-        source = story.read_text(encoding="utf-8")
-        quoted = {story.stem, *re.findall(r'"(\w+)(?:\.png)?"', source)}
-        quoted |= {f"{a}{b}" for a in re.findall(r'f"(\w+)\{\w+\}\.png"', source) for b in quoted}
-        drawn = sorted((_EXAMPLES / "out").glob("*.png"))
-        kept = [p for p in _EXAMPLES.glob("*.png") if not (_EXAMPLES / "out" / p.name).exists()]
-        found = [path for path in (*drawn, *kept) if path.stem in quoted]
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in found:
-            shutil.copyfile(path, folder / path.name)
-        return [path.name for path in found]
-
-    def story(self, path: Path, drawn: list[str]) -> str:
-        """Return a story as text: its docstring, its pictures, its cells."""
-        head, *cells = re.split(r"^# %% ?", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        said = inspect.cleandoc(head.strip().strip('"'))
-        title, _, rest = said.partition("\n")
-        shown = [f"![{name}](../pictures/{name})" for name in drawn]
-        missing = f"``python examples/{path.name}`` draws its pictures."
-        text = [f"## {title}", re.sub(r"::$", ":", rest, flags=re.MULTILINE)]
-        text += shown or ([missing] if ".png" in "".join(cells) else [])
-        for cell in cells:
-            title, _, code = cell.partition("\n")
-            text += [f"### {title}", f"```python\n{code.strip()}\n```"]
-        return "\n\n".join(text)
-
-    def gallery(self, drawn: dict[str, list[str]]) -> str:
-        """Return the page that leads to the stories."""
-        text = ["Each is a script, run by ``python examples/<name>.py`` from the clone.", ""]
-        text.append('<div class="gallery">')
-        for path in self.stories:
-            title = path.read_text(encoding="utf-8").strip('"').partition("\n")[0]
-            first = drawn[path.stem][:1]
-            image = f'<img src="pictures/{first[0]}" alt="{path.stem}"/>' if first else ""
-            text.append(f'<a href="examples/{path.stem}.html">{image}{title}</a>')
-        return "\n".join([*text, "</div>"])
+    def versions(self) -> str:
+        """Return the versions that this site was made with, and those that are required."""
+        least = "\n".join(f"| {line} |" for line in requires("flexplant") or ())
+        made = "\n".join(f"| {name} | {text} |" for name, text in versions().items())
+        return (
+            f"## Versions\n\nWhat the examples of this site ran with:\n\n| package | version |\n"
+            f"|---|---|\n{made}\n\nWhat flexplant requires:\n\n| requirement |\n|---|\n{least}\n"
+        )
 
 
-def _protected(match: re.Match[str]) -> str:
-    return match[1] + match[2].replace(":", _COLON)
+def _story(path: Path, shown: Shown | None) -> str:
+    """Return a story as text: its docstring, its pictures, what it prints, its cells."""
+    head, *cells = re.split(r"^# %% ?", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    title, _, rest = inspect.cleandoc(head.strip().strip('"')).partition("\n")
+    text = [f"## {title}", rest]
+    if shown is None:
+        text.append(f"``python examples/{path.name}`` prints its tables and draws its pictures.")
+    else:
+        text += [f"![{one.stem}]({_HOME}pictures/{one.name})" for one in shown.pictures]
+        if shown.printed.strip():
+            text += ["### What it prints", f"```text\n{shown.printed.strip()}\n```"]
+    for cell in cells:
+        title, _, code = cell.partition("\n")
+        text += [f"### {title}", f"```python\n{code.strip()}\n```"]
+    return "\n\n".join(text)
 
 
-def _public(text: str, pages: dict[str, Any]) -> str:
-    """Return a page without the modules behind the rooms, and types without quotes."""
+def _gallery(stories: dict[Path, Shown | None]) -> str:
+    """Return the page that leads to the stories, each with a thumbnail."""
+    text = [
+        "## Examples",
+        "",
+        "Each is a script, run by ``python examples/<name>.py`` from the clone.",
+        "",
+    ]
+    text.append('<div class="gallery">')
+    for path, shown in stories.items():
+        title = path.read_text(encoding="utf-8").strip('"').partition("\n")[0]
+        image = ""
+        if shown and shown.pictures:
+            image = f'<img src="pictures/{shown.pictures[0].name}" alt="{path.stem}"/>'
+        elif shown:
+            lines = shown.printed.replace("&", "&amp;").replace("<", "&lt;").splitlines()
+            image = f"<pre>{'&#10;'.join(filter(None, lines[:24]))}</pre>"
+        text.append(f'<a href="examples/{path.stem}.html">{image}{title}</a>')
+    return "\n".join([*text, "</div>"])
 
-    def short(match: re.Match[str]) -> str:
-        return match[0] if match[1] in pages else match[2]
 
-    text = re.sub(r"\b(flexplant(?:\.[a-z_0-9]+)+)\.([A-Z]\w*)", short, text)
-    quoted = r"(<span class=\\?\"s\d\\?\">)(?:'|&#39;)([A-Z][\w\[\], .|]*)(?:'|&#39;)(</span>)"
-    return re.sub(quoted, r"\2", text)
+# ---- the site by pdoc
 
 
 class _AsWritten:
-    """A type that is shown as it stands in the source."""
+    """A type that is shown as it stands in the source, not what its aliases stand for."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -264,47 +315,8 @@ class _AsWritten:
         return self.text
 
 
-def _as_written(space: Any) -> None:
-    """Show types below a page of pdoc as they are written, not what their aliases stand for."""
-    for one in space.own_members:
-        if one.kind == "class":
-            _as_written(one)
-        elif one.kind == "function":
-            raw = getattr(getattr(one.obj, "__func__", one.obj), "__annotations__", {})
-            said = {n: _AsWritten(text) for n, text in raw.items() if isinstance(text, str)}
-            given = one.signature
-            one.signature = given.replace(
-                parameters=[
-                    p.replace(annotation=said.get(p.name, p.annotation))
-                    for p in given.parameters.values()
-                ],
-                return_annotation=said.get("return", given.return_annotation),
-            )
-
-
-def _formula(match: re.Match[str]) -> str:
-    """Return a formula in one line, which Markdown leaves as it is: no lists, no lost backslash."""
-    kept = re.sub(r"(?=[\\`*_{}\[\]()#+.!-])", r"\\", " ".join(match[2].split()))
-    return f"{match[1]}$${kept}$$\n"
-
-
-@contextmanager
-def _exporting(site: _Site) -> Iterator[None]:
-    """Let pdoc see the public names of the rooms, for this run."""
-    given = {"flexplant": sorted(site.rooms)} | {
-        f"flexplant.{name}": names for name, names in site.names.items()
-    }
-    modules = {name: import_module(name) for name in given}
-    before = {name: vars(module).get("__all__") for name, module in modules.items()}
-    for name, module in modules.items():
-        vars(module)["__all__"] = given[name]
-    try:
-        yield
-    finally:
-        for name, old in before.items():
-            vars(modules[name]).pop("__all__")
-            if old is not None:
-                vars(modules[name])["__all__"] = old
+def _as_written(kind: Any, *_: Any) -> Any:
+    return _AsWritten(kind) if isinstance(kind, str) else kind
 
 
 def _page(name: str, text: str) -> Any:
@@ -316,68 +328,78 @@ def _page(name: str, text: str) -> Any:
     return Module(module)
 
 
-def write_site(folder: str | Path) -> Links:
+def _pages(site: _Site, stories: dict[Path, Shown | None]) -> dict[str, Any]:
+    """Return all pages: the front, the rooms, those of this folder, and the examples."""
+    from pdoc.doc import Module
+
+    for name, names in {"": sorted(site.rooms), **site.names}.items():
+        # pdoc shows what __all__ lists; this process writes the site and ends
+        vars(import_module(f"flexplant.{name}".rstrip(".")))["__all__"] = names
+    pages = {"flexplant": Module.from_name("flexplant")}
+    pages |= {f"flexplant.{n}": Module.from_name(f"flexplant.{n}") for n in site.rooms}
+    list(map(attrgetter("own_members"), pages.values()))  # pdoc reads stubs' docstrings here
+    pages["flexplant"].docstring = site.front()
+    verbs = pages["flexplant.algorithms"]
+    verbs.docstring = re.sub(r"^\*\*(\w+)\.\*\* ", r"## \1\n\n", verbs.docstring, flags=re.M)
+    pages["flexplant.bibliography"].docstring = site.bibliography()
+    texts = {name: (_PAGES / f"{name}.md").read_text(encoding="utf-8") for name in _TEXTS}
+    texts["versions"] = site.versions()
+    if stories:
+        texts["examples"] = _gallery(stories)
+        texts |= {f"examples.{path.stem}": _story(path, one) for path, one in stories.items()}
+    return pages | {name: _page(name, text) for name, text in texts.items()}
+
+
+def write_site(folder: str | Path, *, runs: bool = True) -> int:
     """Write the documentation as static pages, `folder` / index.html the first; count them."""
     try:
         import jinja2
+        import latex2mathml.converter  # noqa: F401
         from pdoc import doc, docstrings, render
     except ImportError as error:
         raise SolverError(
-            "the documentation is written by pdoc, which is not installed. "
-            "Install it by: python -m pip install 'flexplant[docs]'"
+            "the documentation is written by pdoc and latex2mathml, which are not installed. "
+            "Install them by: python -m pip install 'flexplant[docs]'"
         ) from error
     folder, site = Path(folder), _Site()
-    texts: Any = docstrings  # whose function is replaced for this run
-    convert = texts.convert
+    if runs:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(_run, [path for path in site.stories if _shown(path) is None]))
+    stories = {path: _shown(path) for path in site.stories}
+    (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    drawn = [one for shown in stories.values() if shown for one in shown.pictures]
+    for path in (*_EXAMPLES.glob("*.png"), *drawn):
+        shutil.copyfile(path, folder / "pictures" / path.name)
 
-    def converted(text: str, docformat: str, source: Path | None) -> str:
-        if site.searched is not None and text not in site.searched:
-            text = text.partition("\n\n")[0]  # of what a room exports the first lines are enough
-        return str(convert(site.markdown(text), docformat, source)).replace(_COLON, ":")
-
-    render.configure(docformat="numpy", show_source=False, math=True)
-    ours = jinja2.DictLoader({"module.html.jinja2": _PAGE, "custom.css": _STYLE})
+    # pdoc has no setting for these two
+    convert = docstrings.convert
+    vars(docstrings)["convert"] = lambda text, *how: convert(site.markdown(text), *how)
+    vars(doc)["safe_eval_type"] = _as_written
+    render.configure(docformat="numpy", show_source=False)
+    ours = jinja2.DictLoader({"module.html.jinja2": _TEMPLATE, "custom.css": _STYLE})
     render.env.loader = jinja2.ChoiceLoader([ours, *filter(None, [render.env.loader])])
-    drawn = {path.stem: site.pictures(path, folder / "pictures") for path in site.stories}
-    with _exporting(site), warnings.catch_warnings():
-        # annotations that pdoc cannot evaluate it shows as they are written
+    with warnings.catch_warnings():
+        # annotations that pdoc cannot evaluate are shown as they are written
         warnings.filterwarnings("ignore", "Error parsing type annotation", UserWarning)
-        pages: dict[str, Any] = {"flexplant": doc.Module.from_name("flexplant")}
-        pages |= {f"flexplant.{n}": doc.Module.from_name(f"flexplant.{n}") for n in site.rooms}
-        for page in pages.values():
-            _as_written(page)
-        pages["flexplant"].docstring = site.front()
-        verbs = pages["flexplant.algorithms"]
-        verbs.docstring = re.sub(r"^\*\*(\w+)\.\*\* ", r"## \1\n\n", verbs.docstring, flags=re.M)
-        pages["flexplant.bibliography"].docstring = site.bibliography()
-        if site.stories:
-            pages["examples"] = _page("examples", site.gallery(drawn))
-        for path in site.stories:
-            name = f"examples.{path.stem}"
-            pages[name] = _page(name, site.story(path, drawn[path.stem]))
-        texts.convert = converted
-        try:
-            for name, page in pages.items():
-                site.at(name)
-                file = folder / f"{name.replace('.', '/')}.html"
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(_public(render.html_module(page, pages), pages), encoding="utf-8")
-            site.searched = {page.docstring for page in pages.values()}
-            index = _public(render.search_index(pages), pages)
-            (folder / "search.js").write_text(index, encoding="utf-8")
-        finally:
-            texts.convert = convert
+        pages = _pages(site, stories)
+        titles = {name: pages[name].docstring.partition("\n")[0].strip("# ") for name in _TEXTS}
+        ways = {"flexplant": "Start", "examples": "Examples", **titles, "versions": "Versions"}
+        render.env.globals["ways"] = ways
+        for name, page in pages.items():
+            file = folder / f"{name.replace('.', '/')}.html"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            html = site.finished(name, render.html_module(page, pages))
+            file.write_text(html, encoding="utf-8")
+        site.searched = {page.docstring for page in pages.values()}
+        index = re.sub(r"formula\d+x", "", render.search_index(pages))
+        index = site.finished("", index)
+        (folder / "search.js").write_text(index, encoding="utf-8")
     moved = '<!doctype html><meta http-equiv="refresh" content="0; url=flexplant.html"/>'
     (folder / "index.html").write_text(moved, encoding="utf-8")
-    found = check_links(folder)
-    if found.broken:
-        raise CertificateError("links that lead nowhere: " + "; ".join(found.broken[:20]))
-    return found
+    return len(pages)
 
 
 if __name__ == "__main__":
-    written = write_site(sys.argv[1] if len(sys.argv) > 1 else "site")
-    sys.stdout.write(
-        f"{counted(written.pages, 'page')}, {written.links} links that lead somewhere, "
-        f"{counted(written.pictures, 'picture')}\n"
-    )
+    words = [word for word in sys.argv[1:] if word != "--no-runs"]
+    written = write_site(words[0] if words else "site", runs="--no-runs" not in sys.argv)
+    sys.stdout.write(f"{counted(written, 'page')}: open index.html\n")

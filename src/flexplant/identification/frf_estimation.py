@@ -112,12 +112,14 @@ def estimate_frf(
 ) -> Frf:
     r"""Return the FRFs from inputs to outputs, with coherence and variance per line.
 
-    ====================  ==========================================================
-    ``H1Estimator(...)`` S_yu S_uu^-1: noise on the outputs, open loop ``H2Estimator(...)`` S_yy
-    S_uy^-1: noise on the inputs ``HvEstimator(...)`` total least squares: noise on both
-    ``Periodic(...)`` Y U^-1 of mean periods: no leakage, noise on both with ``reference=r`` S_yr
-    S_ur^-1: under feedback (joint input-output) `impact_frf` hammer blows, found in the record
-    ====================  ==========================================================
+    | method | estimate |
+    |---|---|
+    | ``H1Estimator(...)`` | S_yu S_uu^-1: noise on the outputs, open loop |
+    | ``H2Estimator(...)`` | S_yy S_uy^-1: noise on the inputs |
+    | ``HvEstimator(...)`` | total least squares: noise on both |
+    | ``Periodic(...)`` | Y U^-1 of mean periods: no leakage, noise on both |
+    | with ``reference=r`` | S_yr S_ur^-1: under feedback (joint input-output) |
+    | `impact_frf` | hammer blows, found in the record |
 
     A levitated machine is measured under feedback, where noise returns to the inputs and H1 is
     biased towards ``-1/K``. References r that are not correlated with the noise give the process
