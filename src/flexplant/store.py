@@ -115,6 +115,11 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         """Return what notebooks show: the repr, laid out."""
         return as_html(repr(self))
 
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, str]:
+        """Return what Jupyter shows: the repr, laid out, and the picture of kinds that have one."""
+        picture = import_module(f"{__package__}.plot.notebook").picture_of(self)
+        return {"text/plain": repr(self), "text/html": self._repr_html_() + picture}
+
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one."""
         return replace(self, **changes)  # type: ignore[type-var]

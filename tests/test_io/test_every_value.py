@@ -396,6 +396,7 @@ def test_goes_through_a_file(name, tmp_path):
     assert repr(found) == repr(value)
     in_notebook = "".join(ET.fromstring(value._repr_html_()).itertext())  # well-formed, complete
     assert re.sub(r"\W", "", in_notebook) == re.sub(r"\W", "", repr(value))
+    assert repr(value).count("\n") < 15 and not re.search(r"mappingproxy\(|array\(\[", repr(value))
     same(value, pickle.loads(pickle.dumps(value)), name)
 
 

@@ -258,7 +258,7 @@ class CountLimits(Constraint):
         return LinearRows.counted(row, self.at_least, self.at_most)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Budget(Constraint):
     """An upper limit on the total cost of the chosen candidates.
 

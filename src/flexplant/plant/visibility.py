@@ -48,7 +48,7 @@ WEAK = 0.01
 _VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ModeVisibility(Value):
     """How well w excites, u reaches, y and z see an elastic mode.
 

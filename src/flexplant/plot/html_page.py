@@ -303,6 +303,16 @@ def moving_shapes(modes: Modes) -> str:
     )
 
 
+def moving_frame(modes: Modes, height: int = 520) -> str:
+    """Return a frame of some height [px] with a page of its own, in which the modes move."""
+    shapes = moving_shapes(modes)
+    style, script = _resource("report.css"), _resource("shapes.js")
+    page = f"<style>{style}</style><main>{shapes}</main><script>{script}</script>"
+    size = f"width:100%;max-width:44em;height:{height}px;border:0"
+    frame = f'<iframe srcdoc="{escape(page)}" title="moving mode shape" style="{size}"></iframe>'
+    return frame if shapes else ""
+
+
 def _mode_name(modes: Modes, k: int) -> str:
     if k < modes.n_rigid:
         return f"{k + 1}: rigid-body"

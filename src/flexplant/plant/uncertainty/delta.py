@@ -21,7 +21,7 @@ from ..remade import rebuilt
 from .channels import EvenUnits, Opened, with_parts
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MachineParts(Value):
     """What a machine is assembled from, which Deltas change: modes, gains of ports, and delay.
 

@@ -12,7 +12,7 @@ from .kind import Uncertainty
 from .mode_delta import FrequencyDelta, stated_by_mode
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Frequencies(Uncertainty):
     """Frequencies of modes, off by a share of them: `mode6:freq` on the stiffness omega^2.
 

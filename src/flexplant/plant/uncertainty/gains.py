@@ -75,7 +75,7 @@ def _with_gain(plant: Partition, system: StateSpace, delta: GainDelta) -> StateS
     return with_channels(system, 0, [delta.name], left, right)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gains(Uncertainty):
     """Gains of actuators and sensors, off by a share of them: `u1:gain`.
 

@@ -149,7 +149,7 @@ def require_matrices(plant: Partition) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Parameters(Uncertainty):
     """Parameters of the model, each known within an amount: they move all modes and shapes.
 

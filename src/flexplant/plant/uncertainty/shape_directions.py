@@ -116,7 +116,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
     return found
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Shapes(Uncertainty):
     """Shapes of modes: `mode6:shape1` on what drives the mode and what is seen of it.
 
