@@ -150,7 +150,7 @@ def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     design = machine().replace(evaluation=modes(1e-2, 9 + more))
     known = judged(design, plant(count=9 + more))
     assert known.causes == ("truncation",)
-    assert f"the plant is right, they are coloured by the {more} modes left out" in known.text
+    assert f"the plant is correct, they are coloured by the {more} modes left out" in known.text
     assert "its predicted errors hold" in known.text
 
 
@@ -167,7 +167,9 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
     judge = observer.plant.replace(evaluation=modes(3e-3, 40).select(whole))
     known = consistency(observer.replace(plant=judge), estimate)
     assert known.causes == ("folding",)
-    assert "the plant is right" in known.text and "(4456 Hz in the evaluation model)" in known.text
+    assert (
+        "the plant is correct" in known.text and "(4456 Hz in the evaluation model)" in known.text
+    )
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def test_noises_of_process_and_sensors_may_be_correlated(lag):
     model = observer().model
     S = np.zeros_like(model.C2.T)
     S[:, 0] = 0.7 * observer().plant.noise_factor[:, 0] * np.sqrt(model.R[0, 0])
-    with pytest.raises(ModelError, match="root is no factor"):
+    with pytest.raises(ModelError, match="root is not a factor"):
         model.replace(S=S)
     model = model.replace(S=S, root=None)
     solved = filter_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)

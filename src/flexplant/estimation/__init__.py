@@ -1,11 +1,11 @@
 """Estimation: the motion at a point of interest from sensors elsewhere.
 
-- `design_kalman(plant)`: the stationary filter of the POIs; the modes that the plant lacks of its
-  evaluation model count as noise.
-- `KalmanEstimator.rms(channel)`: the predicted error; ``rms(channel, on=other_plant)``: elsewhere.
+- `design_kalman(plant)`: the stationary filter of the POIs; modes of the evaluation model that are
+truncated in the plant count as noise. - `KalmanEstimator.rms(channel)`: the predicted error;
+``rms(channel, on=other_plant)``: the error on another plant.
 - `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
   moving POI); ``step(y, u)`` runs sample by sample.
-- `consistency`, `estimate_noise`: whether a record contradicts the filter, and what would not.
+- `consistency`, `estimate_noise`: a test of the filter with a record, and noise levels from it.
 - `design_static`: the estimate from the sensors of one instant.
 
 >>> import flexplant as fx
@@ -18,13 +18,12 @@
 >>> round(static.rms("die:x") / observer.rms("die:x"), 1)
 25.9
 
-**How good is a predicted error?** As good as the evaluation model, errors of its mesh included:
-``modes.extrapolated(coarser)`` takes these out, and ``observer.interval`` says where the error lies
-on the machines that a measurement allows. On
-a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error of z on finer meshes within 6 %, that of
-rotations within 23 %; on one of 0.5 m x 0.3 m they predict z 65 % too large, since other shapes mix
-in modes of almost one frequency above 10 kHz. There 12 x 12 elements are within 5 % for z, beside
-24 x 24.
+**How accurate is a predicted error?** As accurate as the evaluation model, including errors of its
+mesh: ``modes.extrapolated(coarser)`` corrects these, and ``observer.interval`` gives the interval
+of the error on machines that agree with a measurement. On a plate of 0.6 m x 0.6 m 8 x 8 elements
+predict the error of z on finer meshes within 6 %, that of rotations within 23 %; on one of 0.5 m x
+0.3 m they predict z 65 % too large, since other shapes mix in modes of almost one frequency above
+10 kHz. There 12 x 12 elements are within 5 % for z, compared with 24 x 24.
 
 Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 (`KalmanEstimator.to_filterpy`).

@@ -1,4 +1,4 @@
-"""Causes of innovations that are not those of the model: outliers, offsets, modes left out."""
+"""Causes of inconsistent innovations: outliers, offsets, truncated modes."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from .mode_changes import ModeChange, explained_by_change, peak_band
 Cause = Literal[
     "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"
 ]
-#: a peak this close to a mode, relative, may belong to it: that of the innovations lies beyond the
-#: machine's mode, seen from the model's
+#: relative distance up to which a peak may belong to a mode: the peak of the innovations lies
+#: beyond the machine's mode, as seen from the model's
 _NEAR = 0.12
-#: the same beside a higher peak of another cause: what a machine drifts by
+#: the same next to a higher peak of another cause: typical drift of a machine
 _DRIFTED = 0.03
-#: largest part of the samples that are outliers, and how many a short record may have
+#: largest fraction of outliers, and their number allowed in a short record
 _RARE, _FEW = 0.01, 20
-#: samples of one burst of motion that follow each other, and part of all that makes them one
+#: number of consecutive samples of one burst of motion, and fraction of all that makes them one
 _APART, _BURST = 5, 0.5
-#: samples after an outlier that it is followed for at most
+#: largest number of samples over which the effect of an outlier is followed
 _FOLLOWED = 2000
-#: a peak this close to one of another spectrum, relative, is the same
+#: relative distance up to which peaks of two spectra are the same
 _AGAIN = 2e-3
-#: peaks that are examined, at most
+#: largest number of examined peaks
 _PEAKS = 12
-#: lines next to 0 that an offset is compared with
+#: number of lines next to 0 with which an offset is compared
 _LOWEST = 8
 
 
 class LikelyCause(NamedTuple):
-    """A likely cause, and in words."""
+    """A likely cause and its text."""
 
     cause: Cause
     text: str
-    #: the mode that is elsewhere, where this is the cause and it can be found
+    #: the changed mode, if this is the cause and it can be found
     change: ModeChange | None = None
 
 
 class Outliers(NamedTuple):
-    """Samples (k, sensor) that are off, by how much, and the innovations without them."""
+    """Outliers (k, sensor), their sizes, and the innovations without them."""
 
     places: list[tuple[int, int]]
     sizes: list[float]
@@ -58,15 +58,15 @@ class Outliers(NamedTuple):
 def outliers(
     observer: KalmanEstimator, white: FloatArray, normal: FloatArray, alpha: float
 ) -> Outliers | None:
-    """Return single samples of sensors that are off, or None."""
-    # one is found by an innovation beyond what chance makes of Gaussian ones of their own size
-    # (median); its effect on all later ones, the filter's response to one sample, is taken away
-    # before the next is looked for. Many in a row are no outliers but a motion of the machine
+    """Return single outliers of sensors, or None."""
+    # an outlier is an innovation that is too large for Gaussian ones of the same median; its effect
+    # on all later ones, the filter's response to one sample, is removed before the next search.
+    # Many consecutive ones are a motion of the machine and not outliers
     from scipy.stats import norm
 
     count = int(np.isfinite(normal).sum())
     spread = np.nanmedian(np.abs(normal), axis=0) / norm.ppf(0.75)
-    # the median of n samples is known within 1.2 / sqrt(n): twice that on top
+    # the median of n samples is known within 1.2 / sqrt(n); twice this is added
     limit = norm.isf(0.5 * alpha / count) * (1.0 + 2.4 / np.sqrt(len(normal)))
     bound = limit * np.maximum(spread, TINY)
     if not np.any(np.abs(normal) > bound):
@@ -107,7 +107,7 @@ def outliers(
 
 
 def outlier_text(found: Outliers, observer: KalmanEstimator, time: FloatArray) -> str:
-    """Return the outliers in words."""
+    """Return a text of the outliers."""
     units = observer.plant.units
     listed = [
         f"{with_unit(size, units.get(observer.sensors[i]))} of {observer.sensors[i]} at "
@@ -116,14 +116,14 @@ def outlier_text(found: Outliers, observer: KalmanEstimator, time: FloatArray) -
     ]
     more = len(found.places) - len(listed)
     return (
-        f"{counted(len(found.places), 'single sample')} beyond what noise makes: "
+        f"{counted(len(found.places), 'single sample')} too large for noise: "
         f"{', '.join(listed)}{f' and {more} more' if more else ''}: outliers. Leave them out: "
         "observer.estimate(records, gate=6)."
     )
 
 
 class Offset(NamedTuple):
-    """Mean of the whitened innovations, and the verdict in words."""
+    """Mean of the whitened innovations, and text of the verdict."""
 
     mean: FloatArray
     text: str
@@ -157,13 +157,13 @@ def offset(observer: KalmanEstimator, white: FloatArray, alpha: float) -> Offset
         named = f"a sensor has an offset ({' or '.join(each)})"
     return Offset(
         mean,
-        f"the innovations have a mean, {np.sqrt(mean @ mean):.3g} of their deviation: {named}, or "
-        "a constant force acts that the records lack. Take it off the record.",
+        f"the innovations have a mean, {np.sqrt(mean @ mean):.3g} of their deviation: {named}, "
+        "or a constant force acts that is not in the records. Subtract it from the record.",
     )
 
 
 def settling(observer: KalmanEstimator) -> int:
-    """Return after how many samples an error of the filter has faded to a thousandth."""
+    """Return the number of samples in which an error of the filter decays to a thousandth."""
     radius = observer.certificate["spectral radius"]
     return int(np.ceil(np.log(1e-3) / np.log(radius))) if 0 < radius < 1 else 1
 
@@ -175,7 +175,7 @@ class SampledModes(NamedTuple):
     freq: FloatArray
 
     def named(self, i: int) -> str:
-        """Return a mode in words."""
+        """Return a text of a mode."""
         return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
 
 
@@ -191,19 +191,19 @@ def sampled_modes(plant: AnyPlant) -> SampledModes:
 
 
 def folded(freq: FloatArray, rate: float) -> FloatArray:
-    """Return where frequencies appear when sampled."""
+    """Return the apparent frequencies after sampling."""
     return np.asarray(np.abs(freq - rate * np.round(freq / rate)))
 
 
 class Examined(NamedTuple):
-    """Peaks [cycles per sample] where no change was found before, and how far modes may be."""
+    """Peaks [cycles per sample] without a change so far, and possible distance of modes."""
 
     tried: FloatArray
     reach: float
 
     @classmethod
     def of(cls, tried: list[float], whole: AnyPlant | None) -> Examined:
-        """Return the peaks; modes left out that are known may make others near kept modes."""
+        """Return the peaks; known truncated modes may cause others near kept modes."""
         return cls(np.array(tried), _NEAR if whole is None else _DRIFTED)
 
 
@@ -217,12 +217,12 @@ def peak_verdicts(
     before: Examined,
 ) -> list[LikelyCause]:
     """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands."""
-    # `whole` is the evaluation plant with the numbers of the modes left out, or None. Of the
-    # highest peak any cause, of the others only whether a kept mode has changed
+    # `whole` is the evaluation plant with the numbers of truncated modes, or None. The highest peak
+    # gets any cause, the others only a changed kept mode
     plant, rate = observer.plant, 1.0 / observer.plant.dt
     kept = sampled_modes(plant)
     seen = folded(kept.freq, rate)
-    if not plant.modal_blocks.size:  # its modes cannot be changed one by one
+    if not plant.modal_blocks.size:  # its modes cannot be changed separately
         highest = max(peaks, key=lambda one: one.height)
         near = _modes_near(seen, highest.freq * rate, _NEAR)
         if near.size:
@@ -232,7 +232,7 @@ def peak_verdicts(
     for rank, peak in enumerate(sorted(peaks, key=lambda one: -one.height)[:_PEAKS]):
         at = peak.freq * rate
         near = _modes_near(seen, at, before.reach if rank or before.tried.size else _NEAR)
-        if whole is not None:  # a mode left out may be nearer
+        if whole is not None:  # a truncated mode may be closer
             others = folded(left_modes(*whole).freq, rate)
             near = near[np.abs(seen[near] - at) <= np.min(np.abs(others - at), initial=np.inf)]
         if handled.intersection(near.tolist()):
@@ -260,7 +260,7 @@ def peak_verdicts(
 
 
 def _modes_near(seen: FloatArray, at: float, reach: float) -> IntArray:
-    """Return the modes that a peak may belong to, the nearest first."""
+    """Return the modes to which a peak may belong, the closest first."""
     near = np.flatnonzero(np.abs(seen - at) <= reach * np.maximum(seen, TINY))
     return near[np.argsort(np.abs(seen[near] - at))]
 
@@ -287,14 +287,17 @@ def _other_cause(
     found = None if whole is None else _left_out_mode(observer, left_modes(*whole), at)
     if found is not None:
         return LikelyCause(found.cause, f"{_phrase(highest, rate)}: {found.text}")
-    # modes left out above those of the plant make peaks among these too: their compliance lacks
+    # truncated modes above those of the plant cause peaks among these too, since their compliance
+    # is missing
     above = [one for one in peaks if one.freq * rate > top]
     shown = max(above, key=lambda one: one.height, default=highest)
     nyquist = f"{0.5 * rate:.5g} Hz"
     where = "above all modes of the plant" if above else "where the plant has no mode"
     if near.size and shown is highest:
         where = f"which no change of {kept.named(int(near[0]))} in the plant) explains"
-    lacks = "or a disturbance that the plant lacks. Keep more modes, or add the disturbance."
+    lacks = (
+        "or a disturbance that is missing in the plant. Keep more modes, or add the disturbance."
+    )
     if above:
         out = f"a mode left out (above {nyquist} it appears folded)"
         return LikelyCause("truncation", f"{_phrase(shown, rate)}, {where}: {out}, {lacks}")
@@ -327,7 +330,7 @@ def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> 
     i = int(np.argmin(np.abs(seen - at)))
     if abs(seen[i] - at) > _NEAR * at:
         return None
-    name = f"{left.named(i)} in the evaluation model), which the plant leaves out"
+    name = f"{left.named(i)} in the evaluation model), which is truncated in the plant"
     cure = (
         "give the plant an evaluation model, so that it counts as noise"
         if observer.left_out is None
@@ -342,7 +345,7 @@ def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> 
 def known_verdict(
     observer: KalmanEstimator, left: SampledModes, parts: InnovationParts, freq: FloatArray
 ) -> LikelyCause:
-    """Return the verdict of innovations that are those of the evaluation plant."""
+    """Return the verdict for innovations that agree with the evaluation plant."""
     rate = 1.0 / observer.plant.dt
     at = float(freq[np.argmax(parts.pooled.sum(axis=0))]) * rate
     i = int(np.argmin(np.abs(folded(left.freq, rate) - at)))
@@ -353,7 +356,7 @@ def known_verdict(
     )
     return LikelyCause(
         "folding" if left.freq[i] > 0.5 * rate else "truncation",
-        "the innovations are those of the evaluation model: the plant is right, they are coloured "
+        "the innovations agree with the evaluation model: the plant is correct, they are coloured "
         f"by the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
         f"{left.named(i)} in the evaluation model)). {end}",
     )

@@ -1,4 +1,4 @@
-"""Is the model of an estimator true? NIS, NEES and whiteness, with the likely cause in words."""
+"""Consistency tests of an estimator: NIS, NEES and whiteness, with the likely cause."""
 
 from __future__ import annotations
 
@@ -51,18 +51,19 @@ from .mode_changes import ModeChange, MovedModes, moved_modes
 
 #: fewest samples for a verdict
 _FEWEST = 200
-#: tests that share the level
+#: number of tests that share the level
 _TESTS = 5
-#: samples that are compared with an evaluation plant, whose response is computed at each line
+#: largest number of samples compared with an evaluation plant, since its response is computed at
+#: each line
 _COMPARED = 32768
-#: p-value below which innovations are not those of the evaluation plant; small, since they have
-#: failed as those of the plant already
+#: p-value below which innovations do not agree with the evaluation plant; small, since they already
+#: failed the test with the plant
 _AGREES = 1e-4
-#: steps of the fit of two noise levels, and what keeps it regular where one of them is not seen
+#: number of steps of the fit of two noise levels, and regularisation if one of them has no effect
 _SCORING, _RIDGE = 40, 1e-9
-#: modes that are fitted one after the other until no peak is left, at most
+#: largest number of modes that are fitted one after the other until no peak remains
 _MOVED = 6
-#: the band of a mode, in half-widths and in lines to each side: nearly all of its power
+#: band of a mode in half-widths and in lines to each side, with nearly all of its power
 _HALF_WIDTHS, _BESIDE = 3.0, 2
 
 
@@ -73,31 +74,31 @@ class ConsistencyReport(Value):
     Parameters
     ----------
     nis : float
-        Mean normalised innovation squared per sensor, 1 for a right model.
+        Mean normalised innovation squared per sensor, 1 for a correct model.
     nis_p, whiteness_p, periodogram_p : float
-        Probabilities of values as far off with a right model: of the NIS (chi-square), of the
-        Ljung-Box statistic, of the cumulative periodogram.
+        P-values of the NIS (chi-square), of the Ljung-Box statistic, and of the cumulative
+        periodogram.
     sensor_ratios : mapping {sensor: float}
-        Deviation of each innovation beside the predicted one.
+        Ratio of the deviation of each innovation to the predicted one.
     nees : mapping {channel: (mean, low, high)}
-        Mean normalised squared error of the estimates with its confidence interval, where the
-        true motions were given; 1 when the predicted deviations are right.
+        Mean normalised squared error of the estimates with its confidence interval, if the true
+        motions were given; 1 if the predicted deviations are correct.
     peaks : tuple of (float, float)
-        Frequencies [Hz] at which the innovations exceed the density that the best levels of
-        process and sensor noise explain, and how much, the most significant first.
+        Frequencies [Hz] at which the innovations exceed the density explained by the best levels of
+        process and sensor noise, and ratios to it, the most significant first.
     causes : tuple of str
         The likely causes: "none", or of "outliers", "offset", "noise level", "noise ratio",
         "frequency", "truncation", "folding".
     text : str
-        The verdict in words.
+        Text of the verdict.
     level : float
-        Of all tests together.
+        Confidence level of all tests together.
     spectra : mapping {mode: (float, float)}
-        Power of the innovations around each mode of the plant beside the predicted one, and the
-        probability of one as far off with a right model.
+        Ratio of the power of the innovations around each mode of the plant to the predicted one,
+        and its p-value.
     moved : MovedModes, optional
-        The modes that are elsewhere on the machine, by how much and with which deviation, where
-        this is a cause: ``model.calibrated(found.moved.measured)`` is the machine's model.
+        Modes with a different frequency on the machine, with change and deviation, if this is a
+        cause: ``model.calibrated(found.moved.measured)`` is the machine's model.
     """
 
     nis: float
@@ -140,7 +141,7 @@ class ConsistencyReport(Value):
         )  # fmt: skip
 
     def _off(self) -> str:
-        """Return the modes around which the power is not the predicted one, in words."""
+        """Return a text of modes around which the power differs from the predicted one."""
         allowed = (1.0 - self.level) / max(len(self.spectra), 1)
         off = [f"mode {n} {r:.3g}" for n, (r, p) in self.spectra.items() if p < allowed]
         if not off or self.holds:
@@ -169,45 +170,41 @@ def consistency(
     truth: Any = None,
     level: float = 0.95,
 ) -> ConsistencyReport:
-    """Return whether a record agrees with the model of its estimator, and if not, why.
+    """Return whether a record agrees with the model of its estimator, with the likely causes.
 
-    With a right model the whitened innovations are white noise of unit variance. Five tests share
+    With a correct model the whitened innovations are white noise of unit variance. Five tests share
     the level (each at ``level^(1/5)``): the mean of their squares (NIS, chi-square), their
     correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett), their
-    largest one and their mean. The likely causes follow from what fails:
+    largest one and their mean. - a mean that exceeds the density at the lowest lines: the *offset*
+    of a sensor.
 
-    - single samples of a sensor beyond what noise makes, whose effect on the filter is that of one
-      sample: *outliers*;
-    - a mean beside the density at the lowest lines: the *offset* of a sensor.
+    The effect of these is removed, and the rest has one more cause:
 
-    What these make is taken away, the rest has one more cause:
-
-    - coloured as on the evaluation model, where there is one: the plant is right and its
-      *truncation*, or the *folding* of modes above half the rate, is what shows;
+    - coloured as on the evaluation model, if there is one: the plant is correct and its
+    *truncation*, or the *folding* of modes above half the rate, is visible;
     - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
-    - coloured, but no more than other levels of process and sensor noise explain (two levels,
-      fitted to the spectrum): the *noise ratio*;
-    - a peak beyond that, which the change of a mode near it explains better than one more mode
-      (the model's own mode is missing then, and the direction is its own): the *frequency* or
-      damping of that mode. Frequency and damping of all such modes are fitted to the record by
+    - coloured, but explained by other levels of process and sensor noise (two levels, fitted to the
+    spectrum): the *noise ratio*; - another peak, which the change of a neighbouring mode explains
+    better than an additional mode: the *frequency* or damping of that mode. Frequency and damping
+    of all such modes are fitted to the record by
       maximum likelihood, the commands counted, so that a closed loop does not bias them (`moved`);
-    - any other peak: *truncation*, where it lies above all modes or a mode left out is known there;
-      *folding*, where the plant has modes above it, or the mode left out lies above half the rate;
-      or a disturbance that the plant lacks.
+    - any other peak: *truncation*, if it lies above all modes or a truncated mode is known there;
+    *folding*, if the plant has modes above it, or the truncated mode lies above half the rate; or a
+    disturbance that is missing in the plant.
 
     Parameters
     ----------
     observer : KalmanEstimator or ClosedLoop
-        That made the estimate; or a loop that ran on the machine: the record is judged by the
+        Estimator of the estimate; or a loop that ran on the machine: the record is judged by the
         Kalman filter of its plant.
     estimate : Estimate, Response or mapping {channel: (N,) array}
-        Of `observer.estimate(records)`; samples that its gate left out are missing ones. Or the
-        records themselves: all sensors and commands.
+        Result of `observer.estimate(records)`, where gated samples count as missing; or the records
+        themselves: all sensors and commands.
     truth : mapping {channel: (N,) array}, optional
-        True motions at POIs, of a simulation or a reference instrument, for the NEES; its interval
-        allows for the correlation of the errors over time.
+        True motions at POIs, from a simulation or a reference instrument, for the NEES; its
+        interval takes the correlation of the errors over time into account.
     level : float
-        Share of records at which a right model passes.
+        Probability with which a correct model passes.
 
     Returns
     -------
@@ -254,7 +251,7 @@ def consistency(
             "a longer record."
         )
     normal = (estimate.innovations / estimate.innovation_deviations).T
-    known = bool(estimate.record.size)  # else the commands are not
+    known = bool(estimate.record.size)  # else the commands are not known
     u = estimate.record[:, len(estimate.sensors) :] if known else np.zeros((len(white), 0))
     raw = _tested(observer, white, normal, None, alpha, u)
     said, rest = [], raw
@@ -267,7 +264,7 @@ def consistency(
     constant = offset(observer, settled, alpha)
     if constant is not None:
         said.append(LikelyCause("offset", constant.text))
-        white = settled - constant.mean  # what an offset does at first is no constant
+        white = settled - constant.mean  # the initial effect of an offset is not constant
     whole = _evaluation_plant(observer)
     if said or whole is not None:
         rest = _tested(observer, white, normal, whole, alpha, u)
@@ -305,7 +302,7 @@ def _moved_modes(
     alpha: float,
     before: Examined,
 ) -> tuple[MovedModes | None, list[LikelyCause]]:
-    """Return the modes that are elsewhere, more where these hid them, and what is left."""
+    """Return the changed modes, including hidden ones, and the remainder."""
     record = np.array(estimate.record)
     p = len(estimate.sensors)
     missing = [] if single is None else single.places
@@ -318,7 +315,7 @@ def _moved_modes(
     while changes:
         found, machine, seen = moved_modes(observer, clean, changes, skip)
         kept = [one for one, start in zip(found.changes, changes, strict=True) if one.near(start)]
-        if len(kept) < len(changes):  # it went on to another peak than the one found
+        if len(kept) < len(changes):  # the fit moved to another peak
             changes = kept
             continue
         white = seen.whitened.T.copy()
@@ -344,7 +341,7 @@ def _moved_modes(
 
 
 def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float, float]]:
-    """Return the power of innovations around each mode beside the predicted one, and its p."""
+    """Return the power of innovations around each mode relative to the predicted one, and p."""
     plant, lines = observer.plant, facts.lines.freq
     if not plant.modal_blocks.size:
         return {}
@@ -364,7 +361,7 @@ def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float,
 
 
 class _Facts(NamedTuple):
-    """Tests of innovations against their filter's model, and beside the best levels of noise."""
+    """Tests of innovations against the model of their filter, and with the best noise levels."""
 
     nis: Statistic
     box: Statistic
@@ -412,7 +409,7 @@ def _tested(
     box = ljung_box(white, min(100, count // 20))
     last = white if whole is None else white[-_COMPARED:]
     lines = lines_of(last)
-    # those of missing samples are as lost as their innovations
+    # commands of missing samples are ignored like their innovations
     commands = np.where(np.isnan(last).any(axis=1, keepdims=True), np.nan, u[-len(last) :])
     pooled = lines.pooled
     if whole is None:
@@ -438,7 +435,7 @@ def _evaluation_plant(observer: KalmanEstimator) -> AnyPlant | None:
 def _verdicts(
     observer: KalmanEstimator, facts: _Facts, whole: AnyPlant | None, names: Any, before: Examined
 ) -> list[LikelyCause]:
-    """Return the likely causes and the verdicts in words."""
+    """Return the likely causes and the text of the verdicts."""
     if facts.white and facts.nis.p_value >= facts.alpha:
         return [LikelyCause("none", "the innovations are white and of the predicted size.")]
     numbers = None

@@ -1,4 +1,4 @@
-"""The error of an observer on any sampled plant, in closed form, and tables of it on machines.
+"""The error of an observer on any sampled plant, in closed form, and over machines.
 
 The model of its design is not used.
 """
@@ -29,40 +29,40 @@ from ..tolerances import ROUNDING, SAME, TINY, TYPED, divisor
 from ..words import sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
-#: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
-#: what may be off below it is stated
+#: largest relative difference of a variance by two routes, half a per cent of an rms, which is
+#: better than the knowledge of any machine
 _AGREEMENT = 1e-2
-#: a rigid-body motion may enter the error by this part of the motion itself
+#: largest fraction of a rigid-body motion that may enter the error
 _SEEN = 1e-7
-#: a mode is taken apart where the estimate misses less of its motion: else it keeps 12 of 16 digits
+#: missed fraction of a mode below which it is treated separately: otherwise it keeps 12 of 16
+#: digits
 _FOLLOWED = 1e-2
-#: modulus of a sampled pole from which a mode counts as undamped
+#: modulus of a sampled pole above which a mode counts as undamped
 ON_CIRCLE = 1.0 - ROUNDING
-#: ``1 - |lambda|^2`` up to which it counts as hardly damped: it rings for 1e8 samples
+#: ``1 - |lambda|^2`` below which it counts as hardly damped: it rings for 1e8 samples
 _HARDLY = 2e-8
-#: share of a variance from which such modes are named
+#: fraction of a variance above which such modes are named
 _MOST = 0.5
-#: channels that a print shows
+#: number of channels in a repr
 _SHOWN = 4
 
 
 class Variances(NamedTuple):
-    """Variances (n_poi,) of the error, and how far they may be off: the dual's, and rounding."""
+    """Variances (n_poi,) of the error, and their uncertainty: by the dual, and by rounding."""
 
     values: FloatArray
     difference: float
 
 
 def error_variances(plant: AnyPlant, observer: StateSpace) -> Variances:
-    """Return the variances of ``z - hat`` at the sample instants, u at rest or known exactly.
+    """Return the variances of ``z - hat`` at the sample instants, with u zero or known exactly.
 
-    ``x[k+1] = A x[k] + w[k]``, ``y = C2 x + v``; the observer reads y. A rigid-body motion x_r
-    has no variance, nor has an undamped mode (poles on the unit circle); the observer follows them
-    with the states V x_r,
-    ``A_o V - V A_rr = -B_y C2_r``, so that the rest ``x' = x - V x_r`` is stable and has a
-    Stein equation of its own. Damped modes that it follows are taken apart in the same way, such as
-    those of a suspension. The elastic states are solved mode by mode, O(n^2) of them. The dual
-    equation, from the output back to the noises, gives the same variances by another way.
+    ``x[k+1] = A x[k] + w[k]``, ``y = C2 x + v``; the observer reads y. A rigid-body motion x_r has
+    no variance, nor has an undamped mode (poles on the unit circle); the observer follows them with
+    the states V x_r, ``A_o V - V A_rr = -B_y C2_r``, so that the rest ``x' = x - V x_r`` is stable
+    and has a separate Stein equation. Damped modes that it follows, such as those of a suspension,
+    are treated in the same way. The elastic states are solved mode by mode, O(n^2) of them. The
+    dual equation, from the output back to the noises, gives the same variances by another way.
     """
     if not np.isclose(plant.dt, observer.dt, rtol=SAME, atol=0.0):
         raise ModelError(
@@ -72,7 +72,7 @@ def error_variances(plant: AnyPlant, observer: StateSpace) -> Variances:
     joint, missed = _apart(_joint(plant, observer))
     primal, dual = _two_ways(joint)
     size = divisor(primal)
-    # both have the same poles: how far rounding moves their damping shows in neither
+    # both have the same poles, so that neither shows the effect of rounding on their damping
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
     difference = difference_of(dual, primal) + float(np.max(rounded / size, initial=0.0))
     if not difference <= _AGREEMENT:
@@ -102,7 +102,7 @@ def _two_ways(joint: _Joint) -> tuple[FloatArray, FloatArray]:
 
 
 class _Missed(NamedTuple):
-    """Modes that the observer follows: poles (f,), what it misses (nz, f), ``1 - |lambda|^2``."""
+    """Modes that the observer follows: poles (f,), missed parts (nz, f), ``1 - |lambda|^2``."""
 
     poles: ComplexArray
     variances: FloatArray
@@ -110,7 +110,7 @@ class _Missed(NamedTuple):
 
 
 def _note_hardly_damped(plant: AnyPlant, missed: _Missed, total: FloatArray) -> None:
-    """Warn when most of a variance is what little is missed of motions with next to no damping."""
+    """Warn when most of a variance comes from the missed part of nearly undamped motions."""
     slow = missed.gap < _HARDLY
     shares = np.sum(missed.variances[:, slow], axis=1) / total
     if not np.any(shares > _MOST):
@@ -120,9 +120,9 @@ def _note_hardly_damped(plant: AnyPlant, missed: _Missed, total: FloatArray) -> 
     listed = ", ".join(f"{value:.3g}" for value in freq[:6]) + (", ..." if freq.size > 6 else "")
     warn(
         f"{np.max(shares):.0%} of the variance of the estimation error of {', '.join(named)} is "
-        f"from modes at {listed} Hz that have next to no damping: under white disturbances they "
-        "move so far that the least difference between the filter's model and this plant counts. "
-        "Damp them, as they are in the machine: fx.plant.GroundSpring(..., damping=) for a "
+        f"from modes at {listed} Hz with almost no damping: white disturbances move them so far "
+        "that the smallest difference between the filter's model and this plant matters. Give "
+        "them the damping of the machine: fx.plant.GroundSpring(..., damping=) for a "
         "suspension, fx.ModalDamping for the structure."
     )
 
@@ -188,12 +188,11 @@ def _joint(plant: AnyPlant, observer: StateSpace) -> _Joint:
 
 
 def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
-    """Return the same error in states beside what follows the plant's modes, and what is missed."""
-    # a mode T_j of eigenvalue lambda_j moves the observer by V_j,
-    # `(lambda_j - A_o) V_j = B_y C2 T_j`. A suspension moves up to 1e5 times as far as the estimate
-    # errs, whose variance is then a difference of large squares; beside `[T_j; V_j]` nothing
-    # cancels but amplitudes. V_j need not be exact: what still couples the modes to the other
-    # states stays in A
+    """Return the same error in states relative to the plant's modes, and the missed part."""
+    # a mode T_j of eigenvalue lambda_j moves the observer by V_j, `(lambda_j - A_o) V_j = B_y C2
+    # T_j`. A suspension moves up to 1e5 times as far as the estimate errs, whose variance is then a
+    # difference of large squares; relative to `[T_j; V_j]` only amplitudes cancel. V_j need not be
+    # exact: the remaining coupling of the modes to the other states stays in A
     n = joint.n_elastic
     own, keep = joint.A[n:, n:], joint.E[:, n:]
     modes = joint.any_modal
@@ -217,7 +216,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     motion: FloatArray = np.hstack([shapes.real, shapes.imag[:, values[chosen].imag > 0]])
     if not motion.size:
         return joint, left_over
-    # as many states of the plant stand for the modes; F is how the others follow these
+    # the same number of states of the plant represents the modes; F gives the others from these
     rows = la.qr(motion[:n].T, mode="r", pivoting=True)[1][: motion.shape[1]]
     F = np.asarray(np.linalg.solve(motion[rows].T, motion.T).T)
     F[rows] = 0.0
@@ -229,7 +228,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
 
 
 def moving_parts(plant: AnyPlant) -> tuple[IntArray, IntArray]:
-    """Return the states of modes on the unit circle, and all others that noise reaches."""
+    """Return the states of modes on the unit circle, and all others affected by noise."""
     g, factor = plant.system, plant.noise_factor
     states = plant.modal_states.reshape(-1, 2)
     blocks = g.A[states[:, :, None], states[:, None, :]]
@@ -292,7 +291,7 @@ def _primal(joint: _Joint) -> FloatArray:
 
 
 def _observer_state_sizes(joint: _Joint) -> FloatArray:
-    """Return the sizes of the observer's states by the sensor noise alone, powers of two."""
+    """Return the sizes of the observer's states from the sensor noise only, powers of two."""
     # of all states alike, also of those that the POIs do not see: the dual's are their inverses
     A, noise = joint.A[joint.n_elastic :, joint.n_elastic :], joint.noise[joint.n_elastic :]
     return scale_of(accumulated(A, noise @ noise.T))
@@ -332,9 +331,9 @@ def _dual_dense(joint: _Joint, row: FloatArray) -> float:
 
 def loop_variances(plant: AnyPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:
     """Return the variances (nz,) of ``z - hat`` in a closed loop, at the sample instants."""
-    # what u does to a machine that is not the estimator's model enters the error, although the
-    # estimator reads u: the Stein equation of the whole loop, `X = A X A' + G G'`, each noise twice
-    # (`loop.budget`)
+    # the effect of u on a machine that differs from the estimator's model enters the error,
+    # although the estimator reads u: the Stein equation of the whole loop, `X = A X A' + G G'`,
+    # each noise twice (`loop.budget`)
     same_pois(plant, loop.plant)
     channels = poi_channels(plant)
     hats = estimates(channels)
@@ -358,31 +357,31 @@ def loop_variances(plant: AnyPlant, estimator: StateSpace, loop: ClosedLoop) -> 
 
 
 class PoiEstimator(Value):
-    """What estimators of the motions at the POIs have in common: intervals of their errors."""
+    """Common base of estimators of motions at the POIs: intervals of their errors."""
 
     system: StateSpace
     plant: AnyPlant
 
     def interval(self, channel: str, level: float = LEVEL) -> FigureInterval:
-        """Return where the rms error lies on a share of the machines measured as this one.
+        """Return the interval of the rms error over machines with the same measurement.
 
         Parameters
         ----------
         channel : str
             A POI's motion under any of its names, as for `rms`.
         level : float
-            Share of the machines, between 0 and 1.
+            Fraction of the machines, between 0 and 1.
 
         Returns
         -------
         FigureInterval
-            ``(low, high, sentence)`` [m or rad]; low and high are None where something is missing
-            for an interval: the sentence says what.
+            ``(low, high, sentence)`` [m or rad]; low and high are None if the interval does not
+            exist; the sentence gives the reason.
 
         Raises
         ------
         LabelError, ModelError
-            When it is no motion of a POI, or the level is out of range.
+            When the channel is not a motion of a POI, or the level is out of range.
         """
         row = row_of(poi_channels(self.plant), channel)
         unit = self.plant.units.get(poi_channels(self.plant)[row], "")
@@ -390,7 +389,7 @@ class PoiEstimator(Value):
 
     @cached_property
     def _on_machines(self) -> FloatArray:
-        """Rms errors (n, n_poi) on each machine that the measurement allows."""
+        """RMS errors (n, n_poi) on each machine that agrees with the measurement."""
         known = self.plant.machine.machines
         plants = [] if known is None else known.plants
         return np.sqrt([
@@ -399,7 +398,7 @@ class PoiEstimator(Value):
 
 
 class PoiFilter(PoiEstimator):
-    """What stationary filters of the motions at the POIs have in common."""
+    """Common base of stationary filters of the motions at the POIs."""
 
     variances: FloatArray
 
@@ -410,7 +409,7 @@ class PoiFilter(PoiEstimator):
 
     @property
     def rms_text(self) -> str:
-        """The predicted rms errors in words, with their intervals or what is missing for them."""
+        """Text of the predicted rms errors, with their intervals or the reason without them."""
         channels, units = poi_channels(self.plant), self.plant.units
         if not self.plant.dt or self.plant.machine.machines is None:
             return sizes_of({name: self.rms(name) for name in channels}, units)
@@ -433,9 +432,9 @@ class PoiFilter(PoiEstimator):
         channel : str
             A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
         on : StandardPlant or ClosedLoop, optional
-            A plant that it runs on, sampled, with other modes or noises, u at rest; or a
-            closed loop around such a plant, where u moves what the filter does not know. In closed
-            form, exact. None: the predicted error.
+            Sampled plant with other modes or noises, with u = 0; or a closed loop around such a
+            plant, where u also excites the differences to the filter's model. The result is exact,
+            in closed form. None: the predicted error.
 
         Returns
         -------
@@ -444,10 +443,10 @@ class PoiFilter(PoiEstimator):
         Raises
         ------
         LabelError
-            When it is no motion of a POI, or the other plant lacks a channel.
+            When the channel is not a motion of a POI, or is missing in the other plant.
         ModelError
-            When the other plant is not sampled alike, its noise is not known, or a loop has the
-            estimates of another filter.
+            When the other plant has another sampling time, its noise is not known, or a loop has
+            the estimates of another filter.
         AssumptionError
             When the error would contain a rigid-body motion of the other plant, or the loop is not
             stable.

@@ -1,4 +1,4 @@
-"""What an estimator made of a record: estimates, their deviations, and the innovations.
+"""Result of an estimator for a record: estimates, their deviations, and innovations.
 
 Those that use later measurements are from the adjoint pass back through the record.
 """
@@ -27,7 +27,7 @@ from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_ro
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import STATIONARY, Moment, Start, Walk, stationary_start
 
-#: part of a sensor's samples above which those beyond a gate are no outliers
+#: fraction of a sensor's samples above which gated samples are not outliers
 _MOST = 0.1
 
 
@@ -35,40 +35,39 @@ _MOST = 0.1
 class Estimate(Value, Mapping[str, FloatArray]):
     """Estimated motions over a record, by name, with their deviations and the innovations.
 
-    ``result["die:hat"]`` (N,) is an estimate, ``result["y1:innovation"]`` what the sensor y1 showed
-    beyond the prediction. A Mapping: `dict(result)` feeds a data frame.
+    ``result["die:hat"]`` (N,) is an estimate, ``result["y1:innovation"]`` the measurement of y1
+    minus its prediction. A Mapping: `dict(result)` feeds a data frame.
 
     Parameters
     ----------
     time : (N,) array [s]
     names : sequence of str
-        Of the estimates.
+        Names of the estimates.
     data : (nz, N) array [m or rad]
         The estimates; NaN while the measurements do not determine one yet.
     deviations : (nz, N) array [m or rad]
-        Standard deviations of their errors, on the filter's own model: modes left out count as
-        white noise. Infinite while nothing determines an estimate yet.
+        Standard deviations of their errors, on the filter's model, where truncated modes count as
+        white noise. Infinite as long as an estimate is not determined.
     sensors : sequence of str
     innovations : (ny, N) array
-        Measurements less their prediction, in the sensors' units; NaN where one is missing, or
-        nothing predicts it yet.
+        Measurements minus their prediction, in the sensors' units; NaN where one is missing or not
+        predicted yet.
     innovation_deviations : (ny, N) array
         Their standard deviations.
     whitened : (ny, N) array
-        ``W e`` with ``W' W`` the inverse of their covariance: white noise of unit variance when
-        the model is right.
+        ``W e`` with ``W' W`` the inverse of their covariance: white noise of unit variance if the
+        model is correct.
     lag : Predictor, Filter, FixedLag or Smoother
-        When the estimates are known.
+        Type of the estimates.
     state : (n,) array
-        x[N|N-1], from which `estimate(..., start=)` goes on with the next record.
+        State x[N|N-1], from which `estimate(..., start=)` continues with the next record.
     units : mapping {channel: unit}
     gate : float
-        Deviations beyond which an innovation made its sample a missing one; infinite without a
-        gate.
+        Number of deviations above which a sample counted as missing; infinite without a gate.
     gated : (ny, N) array of bool
-        Which samples these are; (ny, 0) without a gate.
+        Gated samples; (ny, 0) without a gate.
     record : (N, ny + nu) array
-        The measurements and the commands it was made from.
+        Measurements and commands of the record.
     channels : sequence of str
         The POI channels that are estimated, such as `die:z`.
 
@@ -98,7 +97,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     record: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     channels: Sequence[str] = ()
 
-    # values are compared by identity; Mapping's == would compare arrays
+    # compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
@@ -113,7 +112,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         )
 
     def _gated(self) -> str:
-        """Return in words how many samples the gate made missing, and how many chance would."""
+        """Return a text of the number of gated samples, and of the number expected by chance."""
         if not np.isfinite(self.gate):
             return ""
         listed = [
@@ -139,14 +138,15 @@ class Estimate(Value, Mapping[str, FloatArray]):
         return len(self.names) + len(self.sensors)
 
     def warn_of_gate(self) -> None:
-        """Warn of a sensor that the gate silences: what it leaves out then are not outliers."""
+        """Warn of a sensor with too many gated samples, which are then not outliers."""
         share = self.gated.mean(axis=1) if self.gated.size else np.zeros(len(self.sensors))
         worst = int(np.argmax(share))
         if share[worst] > max(_MOST, 10 * erfc(self.gate / np.sqrt(2.0))):
             warn(
                 f"the gate of {self.gate:g} deviations leaves out {share[worst]:.0%} of the "
-                f"samples of {self.sensors[worst]}: not outliers, but a model or noise densities "
-                "that are not the machine's, or a sensor with an offset. Judge the record without "
+                f"samples of {self.sensors[worst]}: these are not outliers, but the model or "
+                "noise densities do not match the machine, or a sensor has an offset. Judge the "
+                "record without "
                 "a gate: flexplant.estimation.consistency."
             )
 
@@ -192,7 +192,10 @@ def estimated(
     """Return the estimate of a record by the filter of a model, stationary covariance P, gain K."""
     # `place` gives the rows of POIs that move, for a number of samples
     instance(
-        lag, Predictor | Filter | FixedLag | Smoother, "lag", "Say when: Filter() or Smoother()."
+        lag,
+        Predictor | Filter | FixedLag | Smoother,
+        "lag",
+        "Choose for example Filter() or Smoother().",
     )
     record = recorded(records, model)
     steady, sight, d, s = in_unit_states(model, P, K)
@@ -233,7 +236,7 @@ def estimated(
 
 
 def _across(columns: FloatArray) -> FloatArray:
-    """Return the transpose as a read-only array of its own, which a value takes without a copy."""
+    """Return the transpose as a separate read-only array, which a value stores without a copy."""
     rows = columns.base
     if rows is None or rows.strides != columns.strides[::-1]:
         rows = np.array(columns.T, order="C")
@@ -388,7 +391,7 @@ def lagged(passage: Walk, sight: Sight, lag: int) -> tuple[FloatArray, FloatArra
 
 
 def _information(steady: Steady, lag: int) -> FloatArray:
-    """Return what `lag` measurements say, ``sum_j F'^j C2' S^-1 C2 F^j`` over j < lag."""
+    """Return the information of `lag` measurements, ``sum_j F'^j C2' S^-1 C2 F^j`` over j < lag."""
     C = steady.gains.W @ steady.model.C2
     part, total = C, np.zeros_like(steady.F)
     for _ in range(lag):
@@ -400,7 +403,7 @@ def _information(steady: Steady, lag: int) -> FloatArray:
 def _smooth_transient(
     passage: Walk, sight: Sight, ks: IntArray, lag: int, hat: FloatArray, variance: FloatArray
 ) -> None:
-    """Fill samples from which the gain is not stationary all through the lag."""
+    """Fill samples for which the gain is not stationary over the whole lag."""
     steady, N = passage.steady, passage.hat.shape[0]
     model, g = steady.model, steady.gains
     last = min(int(ks[-1]) + lag + 1, N)

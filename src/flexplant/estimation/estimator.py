@@ -34,7 +34,7 @@ class KalmanEstimator(PoiFilter):
         hat[k] = C1 x[k|k-1] + D12 u[k] + L_z (y[k] - C2 x[k|k-1] - D22 u[k])
         x[k+1|k] = A x[k|k] + B2 u[k]
 
-    L_z is C1 L where no modes left out are known.
+    L_z is C1 L if no truncated modes are known.
 
     Parameters
     ----------
@@ -42,17 +42,17 @@ class KalmanEstimator(PoiFilter):
         From the sensors and the applied u to the estimates `die:hat`, `die:rx:hat`, ...; states
         x[k|k-1].
     plant : StandardPlant
-        What it was designed on.
+        Plant of the design.
     gain : (n, ny) array
-        L, per sensor.
+        Gain L of each sensor.
     covariance : (n, n) array
-        Of the error of x[k|k], after the measurement, on the filter's own model.
+        Covariance of the error of x[k|k], after the measurement, on the filter's model.
     certificate : Certificate
     variances : (nz,) array [m^2 or rad^2]
-        Predicted, of the errors at the POIs: on the plant with the modes left out where these are
-        known.
+        Predicted variances of the errors at the POIs, on the plant with truncated modes if these
+        are known.
     left_out : LeftOut, optional
-        The modes left out, as noise and static compliance.
+        Truncated modes, as noise and static compliance.
 
     Examples
     --------
@@ -116,31 +116,30 @@ class KalmanEstimator(PoiFilter):
     ) -> Estimate:
         """Return the motions at the POIs from recorded measurements and commands.
 
-        Until its gain is stationary the filter is the time-varying one, and so it is in and after
-        gaps, where the sensors that are there go on to count; then it runs in blocks of samples.
-        It counts as stationary when what is left changes all later estimates and innovations
-        together by less than 1e-6 of their variance. Filter and Predictor run in blocks already
-        while it is not, exactly; FixedLag and Smoother go sample by sample until then, about a
-        millisecond each.
+        The filter is time-varying until its gain is stationary, and in and after gaps, where the
+        available sensors are used; then it runs in blocks of samples. It counts as stationary when
+        the remaining change affects all later estimates and innovations by less than 1e-6 of their
+        variance. Filter and Predictor also run in blocks before, exactly; FixedLag and Smoother run
+        sample by sample until then, about a millisecond each.
 
         Parameters
         ----------
         records : Response, mapping {channel: (N,) array} or data frame
             All sensors and the commands u as the controller gave them (delays are in the filter);
-            NaN and masked entries are missing samples of a sensor. Other channels are left aside.
+            NaN and masked entries are missing samples of a sensor. Other channels are ignored.
         lag : Predictor, Filter, FixedLag or Smoother, optional
-            When the estimates are known; Filter() when not given.
+            Type of the estimates; Filter() by default.
         start : (n,) array, optional
             The state x[0|-1] of the stationary filter: zeros for a machine at rest, or the `state`
-            of the estimate before. None: damped modes are in the stationary motion that the
-            disturbances keep up, rigid-body motions and undamped modes are quite unknown (diffuse,
-            no prior at all), and u was 0 before the record.
+            of the estimate before. None: damped modes are in stationary motion due to the
+            disturbances, rigid-body motions and undamped modes are unknown (diffuse prior), and u
+            was 0 before the record.
         path : (N, 3) array [m] or mapping {name: (N, 3) array}, optional
-            Where a POI is at each sample, when it moves; by name when there are several.
+            Position of a moving POI at each sample; by name for several POIs.
         gate : float, optional
-            Innovations beyond so many of their deviations are outliers: such a sample of a sensor
-            is treated as missing. 5 or 6 leave out next to none by chance (6e-7 or 2e-9 of all).
-            The estimate lists them (`gated`) and says how many there are. None: all samples count.
+            Number of deviations above which an innovation is an outlier: such a sample of a sensor
+            is treated as missing. 5 or 6 leave out almost nothing by chance (6e-7 or 2e-9 of all).
+            The estimate lists them (`gated`). None: all samples count.
 
         Returns
         -------
@@ -152,13 +151,13 @@ class KalmanEstimator(PoiFilter):
         LabelError
             When a sensor or command is not in the records, or a POI on a path is unknown.
         ShapeError
-            When channels differ in length, or `start` is no state.
+            When channels differ in length, or `start` has a wrong length.
         ModelError
-            When `records` hold no channels, infinite values, or times of another rate, `lag` is
-            none, or `gate` is not positive.
+            When `records` hold no channels, infinite values, or times of another rate, `lag` has a
+            wrong type, or `gate` is not positive.
         SolverError
-            When sensors are so quiet that covariances have too few digits; the filter runs
-            all the same, by `system` or `step`.
+            When sensors are so quiet that covariances have too few digits; the filter itself still
+            runs, by `system` or `step`.
 
         Warns
         -----
@@ -204,7 +203,7 @@ class KalmanEstimator(PoiFilter):
         u : (nu,) array
             The commands of the same sample, in the order of `plant.u`.
         state : (n,) array, optional
-            What the call before returned; a machine at rest when not given.
+            Result of the previous call; a machine at rest by default.
 
         Returns
         -------
@@ -214,9 +213,9 @@ class KalmanEstimator(PoiFilter):
         Raises
         ------
         ShapeError
-            When a size is another one.
+            When a size is wrong.
         ModelError
-            When a value is NaN: a missing sample needs another gain, which `estimate` finds.
+            When a value is NaN: a missing sample needs another gain, which `estimate` computes.
         """
         matrix, sizes = self._stepper
         x = np.zeros(sizes[0]) if state is None else state
@@ -234,7 +233,7 @@ class KalmanEstimator(PoiFilter):
         if out[-1] != out[-1]:  # NaN anywhere is NaN everywhere in a product
             raise ModelError(
                 "a measurement, a command or the state is NaN: the stationary gain needs all "
-                "of them. Pass records with NaN to observer.estimate, which goes on without them."
+                "of them. Pass records with NaN to observer.estimate, which continues without them."
             )
         nz = out.size - sizes[0]
         return out[:nz], out[nz:]
@@ -246,10 +245,10 @@ class KalmanEstimator(PoiFilter):
         return np.block([[g.C, g.D], [g.A, g.B]]), (g.n_states, ny, len(g.inputs) - ny)
 
     def report(self, lags: npt.ArrayLike = LAGS) -> LagReport:
-        """Return the rms errors at the POIs by lag, beside the static relation; prints as a table.
+        """Return the rms errors at the POIs by lag, with the static relation; prints as a table.
 
-        Predictor, filter, some lags and the smoother, all stationary: how much is gained by
-        knowing an estimate later. `fx.plot.lag_report` draws it.
+        Predictor, filter, some lags and the smoother, all stationary: it shows the gain from a
+        later estimate. `fx.plot.lag_report` draws it.
 
         Parameters
         ----------
@@ -293,8 +292,8 @@ def moving_sight(
     plant: AnyPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
 ) -> Sight:
     """Return the rows of all POIs at each sample, those on a path at its points."""
-    # each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and
-    # so are the covariances of the modes left out there
+    # each distinct point is a separate POI of the same plant: its rows of C and D are exact, and so
+    # are the covariances of truncated modes there
     pois = {poi.name: poi for poi in plant.assembled.ports.z}
     if not isinstance(path, Mapping):
         path = {only_one("POI", pois, None, "path={name: points}"): path}
@@ -326,7 +325,7 @@ def moving_sight(
 
 
 def _model_at(plant: AnyPlant, found: LeftOut | None, poi: Any, points: FloatArray) -> FilterModel:
-    """Return the model with a further POI at each point, after the plant's own."""
+    """Return the model with an additional POI at each point, after those of the plant."""
     ports = plant.assembled.ports
     more = [poi.replace(name=f"{poi.name}@{i}", at=p.tolist()) for i, p in enumerate(points)]
     wider = ports.replace(z=[*ports.z, *more])

@@ -1,4 +1,4 @@
-"""Which channels of a plant and of a record an estimator uses, and the names of its estimates."""
+"""Channels of a plant and of a record for an estimator, and names of its estimates."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DERIVED = (":error", ":effort")
 
 
 class ChannelError(LabelError, KeyError):
-    """A record or an estimate has no such channel; a KeyError too, as of any Mapping."""
+    """A record or an estimate does not have a channel; also a KeyError, as for any Mapping."""
 
     __str__ = Exception.__str__
 
@@ -38,12 +38,12 @@ def checked_plant(given: AnyPlant | System) -> AnyPlant:
         )
     for side, names in (("POI in z", poi_channels(plant)), ("sensor in y", sensors(plant))):
         if not names:
-            raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
+            raise AssumptionError(f"the plant has no {side}, which an estimator needs.")
     return plant
 
 
 def read_alike(plant: AnyPlant, other: AnyPlant) -> AnyPlant:
-    """Return another plant read through the block of the first, where that has one."""
+    """Return another plant read through the block of the first, if it has one."""
     found: AnyPlant = plant.around(other.machine)
     return found
 
@@ -83,7 +83,7 @@ def estimates(channels: Sequence[str], kind: str = "hat") -> tuple[str, ...]:
 
 
 def row_of(channels: Sequence[str], name: str) -> int:
-    """Return which POI channel a name means: `die`, `die:z`, `die:hat` and `die:error` are one."""
+    """Return the POI channel of a name: `die`, `die:z`, `die:hat` and `die:error` are equal."""
     known: dict[str, int] = {}
     for kind in ("hat", "error"):
         known |= {alias: i for i, alias in enumerate(estimates(channels, kind))}
@@ -101,7 +101,7 @@ def _firsts(channels: Sequence[str]) -> dict[str, int]:
 
 
 class Recorded(NamedTuple):
-    """A record: time (N,), and measurements y with NaN where missing beside commands u.
+    """A record: time (N,), measurements y with NaN where missing, and commands u.
 
     `both` is [y u] (N, ny + nu).
     """
@@ -148,7 +148,7 @@ def recorded(records: Any, model: Any) -> Recorded:
         )
     count, ny = parts[0].size, len(model.sensors)
     if not count:
-        raise ShapeError("the record holds no samples: there is nothing to estimate from.")
+        raise ShapeError("the record is empty: give at least one sample.")
     both = np.empty((count, len(parts)))
     for first in range(0, count, PIECE):  # a piece of all columns stays in the cache
         piece = slice(first, first + PIECE)

@@ -1,4 +1,4 @@
-"""The model that a filter runs on, with its noises, and the errors that a gain has on it."""
+"""The model of a filter with its noises, and the errors of a gain on it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out_modes import LeftOut
 
-#: said where a covariance is followed sample by sample and cannot be
+#: error text where a covariance cannot be followed sample by sample
 FEW_DIGITS = (
-    "the noise of the sensors is so little beside the motion that the covariance of the error, in "
-    "double precision, does not give the filter's gain: deviations of single samples, delayed and "
-    "smoothed estimates cannot be computed. The filter itself is right: run it by observer.system, "
+    "the noise of the sensors is so small compared with the motion that the covariance of the "
+    "error does not give the filter's gain in double precision: deviations of single samples, "
+    "delayed and smoothed estimates cannot be computed. The filter itself is correct: run it by "
+    "observer.system, "
     "observer.step or close_loop; or give the sensors the asd of their data sheet, checking units."
 )
 
@@ -43,17 +44,17 @@ class FilterModel(Value):
     Parameters
     ----------
     A, B, C1, D1, C2, D2 : arrays
-        From the commands u to the motions z at the POIs and to the sensors y.
+        Model from the commands u to the motions z at the POIs and to the sensors y.
     Q : (n, n) array
-        Covariance that the disturbances add to x in one sample.
+        Covariance of the effect of disturbances on x in one sample.
     R : (ny, ny) array
-        Of the sensors: their own noise and that of modes left out.
+        Covariance at the sensors: their noise and that of truncated modes.
     V : (nz, nz) array
-        Of the motions of modes left out at the POIs.
+        Covariance of the motions of truncated modes at the POIs.
     N : (nz, ny) array
-        Between these and the noise of the sensors.
+        Covariance between these and the noise of the sensors.
     S : (n, ny) array
-        Between the noises of process and sensors.
+        Covariance between the noises of process and sensors.
     dt : float [s]
         Sampling time.
     channels, sensors, commands : tuples of str
@@ -91,11 +92,11 @@ class FilterModel(Value):
             return
         joint = np.block([[self.Q, self.S], [self.S.T, self.R]])
         size = np.sqrt(np.abs(joint.diagonal()))
-        # a product that was replaced beside its factor would be two problems in one model
+        # a replaced product with its old factor would be two problems in one model
         if np.any(np.abs(self.root @ self.root.T - joint) > SAME * np.outer(size, size)):
             raise ModelError(
-                "root is no factor of [Q S; S' R]: the noises of the model were changed, and it "
-                "was not. Replace it with them, or pass root=None."
+                "root is not a factor of [Q S; S' R]: the noises of the model were changed, but "
+                "root was not. Replace it with them, or pass root=None."
             )
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
@@ -118,7 +119,7 @@ class FilterModel(Value):
         return np.asarray(self.C2 @ P @ self.C2.T + self.R)
 
     def updated(self, P: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return the covariance of x[k|k] in Joseph's form, which is right for any gain L."""
+        """Return the covariance of x[k|k] in Joseph's form, which is valid for any gain L."""
         left = np.eye(P.shape[0]) - gain @ self.C2
         updated = left @ P @ left.T + gain @ self.R @ gain.T
         return np.asarray(0.5 * (updated + updated.T))
@@ -137,7 +138,7 @@ def weigh(part: FloatArray, spread: FloatArray) -> FloatArray:
 
 
 def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:
-    """Return the model of a sampled plant, with the modes left out as noise where known."""
+    """Return the model of a sampled plant, with known truncated modes as noise."""
     own = plant if found is None else found.plant
     g = own.system
     n = g.n_states
@@ -164,7 +165,7 @@ def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:
 
 
 def check_noises(plant: AnyPlant) -> None:
-    """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
+    """Raise AssumptionError for a sensor without noise, or with direct white noise."""
     _ = plant.noise_factor  # raises where it is not known
     read, own = sensors(plant), plant.sensor_noise.diagonal()
     require_noise({name: own[plant.y.index(name)] for name in read})
@@ -181,7 +182,7 @@ def check_noises(plant: AnyPlant) -> None:
 
 
 class Sight(NamedTuple):
-    """How the POIs see the state and the noise: ``z = C1 x + n + D1 u``, rows c = [C1 N].
+    """Effect of state and noise on the POIs: ``z = C1 x + n + D1 u``, rows c = [C1 N].
 
     The first axis has one entry, or one for each sample where POIs move.
     """
@@ -195,7 +196,7 @@ class Sight(NamedTuple):
         return self if self.c.shape[0] == 1 else Sight(*(part[at] for part in self))
 
     def applied(self, watched: FloatArray, u: FloatArray | None = None) -> FloatArray:
-        """Return ``c watched + D1 u`` (k, nz) for watched [x; b] (k, n + ny), POIs that move."""
+        """Return ``c watched + D1 u`` (k, nz) for watched [x; b] (k, n + ny) of moving POIs."""
         found = np.einsum("kzi,ki->kz", self.c, watched)
         return np.asarray(found if u is None else found + np.einsum("kzi,ki->kz", self.D1, u))
 
@@ -258,7 +259,7 @@ def innovation_root(S: FloatArray) -> FloatArray:
 
 
 def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
-    """Return the gains of a covariance P before the measurement, for the sensors that are there."""
+    """Return the gains of a covariance P before the measurement, for available sensors."""
     M = P @ model.C2.T
     S = model.C2 @ M + model.R
     W = np.zeros_like(S)
@@ -312,14 +313,15 @@ class Steady:
         return solve_stein(self.F.T, H.T @ H)
 
 
-#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this;
-#: where the gain's own rounding counts (`riccati_root`), to half of it of a standard deviation
+#: largest relative difference of the covariances from the Riccati equation and from the gain's
+#: Stein equation; where rounding of the gain matters (`riccati_root`), of twice the standard
+#: deviation
 AGREEMENT, ROUNDED = 1e-6, 1e-2
 
 
-#: what a certificate says of modes left out: how many there are
+#: entry of a certificate: number of truncated modes
 LEFT_OUT = "modes left out"
-#: the route of a residual
+#: route of a residual
 RICCATI = "the Riccati equation, relative, in states of unit variance"
 
 
@@ -329,7 +331,7 @@ def difference_check(difference: float, limit: float = AGREEMENT) -> Verified:
 
 
 def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:
-    """Return how far the POI variances of a gain are from those that a covariance claims.
+    """Return the difference of the POI variances of a gain from those of a covariance.
 
     The error's covariance follows from the gain alone:
     ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
@@ -341,7 +343,7 @@ def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> flo
     gain : (n, ny) array
         L.
     covariance : (n, n) array
-        Claimed, after the measurement.
+        Claimed covariance, after the measurement.
 
     Returns
     -------
@@ -395,7 +397,7 @@ def stable_radius(model: FilterModel, predictor: FloatArray) -> float:
 
 
 def agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
-    """Return the largest relative difference of POI variances from those of the gain."""
+    """Return the largest relative difference of POI variances from those of a gain."""
     difference = difference_of(claim, truth)
     if not difference <= allowed:
         raise CertificateError(

@@ -15,16 +15,17 @@ from ..plant import AnyPlant
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root
 
-#: bands of lines over which the spectrum is averaged to find an excess, beside the narrowest one
+#: bands of lines, relative to the narrowest one, over which the spectrum is averaged to find an
+#: excess
 _WIDTHS = (1, 8, 64)
 #: lines of the spectrum at its finest
 _LINES = 2000
-#: lines times channels that an average needs to be within 12 % of its mean
+#: number of lines times channels for an average within 12 % of its mean
 _STEADY = 64
 
 
 class Statistic(NamedTuple):
-    """A statistic and the probability of a larger one (or one further off) by chance."""
+    """A statistic and its p-value."""
 
     statistic: float
     p_value: float
@@ -39,7 +40,7 @@ class PooledSpectrum(NamedTuple):
 
 
 def level_test(squares: float, count: int) -> Statistic:
-    """Return the mean square of `count` numbers of unit variance, and how unlikely it is."""
+    """Return the mean square of `count` numbers of unit variance, and its p-value."""
     # the sum is chi-square; the probability is of both tails
     from scipy.stats import chi2
 
@@ -84,7 +85,7 @@ def cumulative_periodogram(found: PooledSpectrum) -> Statistic:
 
 
 class ExcessPeak(NamedTuple):
-    """Where a spectrum is above its mean."""
+    """A peak of a spectrum above its mean."""
 
     freq: float
     height: float
@@ -92,7 +93,7 @@ class ExcessPeak(NamedTuple):
 
 
 def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
-    """Return where the spectrum exceeds its mean, the most significant ones first."""
+    """Return the peaks of the spectrum above its mean, the most significant first."""
     # Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
     # bands of three widths is tested at alpha over their number (Bonferroni). Bands that touch are
     # one peak
@@ -114,7 +115,7 @@ def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
             marked[part] = True
             chance[part] = np.minimum(chance[part], p[band])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(int)))
-    # wide enough that the height is not chance
+    # wide enough for a significant height
     lines = max(2 * first + 1, -(-_STEADY // found.channels))
     smooth = np.convolve(density, np.ones(lines) / lines, "same")
     listed = []
@@ -139,7 +140,7 @@ class InnovationLines(NamedTuple):
         return PooledSpectrum(self.freq, np.mean(np.abs(self.X) ** 2, axis=1), self.X.shape[1])
 
     def beside(self, S: ComplexArray) -> PooledSpectrum:
-        """Return ``X* S^-1 X / p``: 1 in the mean where the innovations have the density S."""
+        """Return ``X* S^-1 X / p``: 1 on average if the innovations have the density S."""
         solved = np.linalg.solve(S, self.X[:, :, None])[:, :, 0]
         density = np.sum(self.X.conj() * solved, axis=1).real / self.X.shape[1]
         return PooledSpectrum(self.freq, density, self.X.shape[1])
@@ -193,14 +194,14 @@ def whitening(observer: KalmanEstimator, freq: FloatArray) -> ComplexArray:
 
 
 def steady_gain(observer: KalmanEstimator) -> FloatArray:
-    """Return the whitened innovations (p, p) that constant offsets of the sensors make."""
+    """Return the whitened innovations (p, p) due to constant offsets of the sensors."""
     m, K = observer.model, observer.predictor_gain
     moved = np.linalg.solve(np.eye(len(m.A)) - m.A + K @ m.C2, K)
     return np.asarray(np.linalg.solve(_cholesky(observer), np.eye(K.shape[1]) - m.C2 @ moved))
 
 
 def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
-    """Return the whitened innovations (count, p, p) after one sample of each sensor is 1 off."""
+    """Return the whitened innovations (count, p, p) after a unit error of one sample."""
     m, K = observer.model, observer.predictor_gain
     closed, x = m.A - K @ m.C2, K
     found = np.empty((count, K.shape[1], K.shape[1]))
@@ -218,9 +219,8 @@ def density_of(
 ) -> InnovationParts:
     """Return the density of the whitened innovations of a filter that runs on a plant."""
     # `V (Y Y* + R) V*` with V that of `whitening`, `Y = C (z I - A)^-1 G + H` from the noises of
-    # the plant to its sensors and R the sensors' own. None: on the filter's own model, where modes
-    # left out are white noise of the sensors and the sum of both parts is I. `white`: V, where it
-    # is known
+    # the plant to its sensors and R the sensors' own. None: on the filter's model, where truncated
+    # modes are white noise of the sensors and the sum of both parts is I. `white`: V, if known
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
@@ -241,7 +241,7 @@ def density_of(
 
 
 def expected(observer: KalmanEstimator, plant: AnyPlant, samples: int) -> InnovationParts:
-    """Return the mean of the periodogram of so many samples, at the lines of `lines_of`."""
+    """Return the mean of the periodogram of a number of samples, at the lines of `lines_of`."""
     # the density seen through the record's length (Fejer's kernel): its covariance c_l counts
     # `1 - |l| / N`. A line narrower than 1 / N leaks into its neighbours in just this way
     freq = np.arange(1, samples + 1) / (2.0 * samples)

@@ -1,4 +1,4 @@
-"""The stationary Kalman filter of the POI, a point without a sensor."""
+"""The stationary Kalman filter for a POI, a point without a sensor."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from .filter_models import (
 )
 from .left_out_modes import LeftOut, left_out
 
-#: least part of R that is the sensors' own: of less, six digits and more are lost in covariances
+#: least fraction of R from the sensors: with less, covariances lose six digits and more
 _OWN = 1e-10
 
 
@@ -46,23 +46,23 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
-    "die": ``observer.rms("die")`` is the error that is predicted, ``close_loop(plant, observer,
-    servo)`` runs it in a loop, ``observer.estimate(records)`` on recorded data. The motion of the
-    modes that the plant lacks of its evaluation model counts as noise, and the predicted error is
-    as good as that model (how good: ``help(flexplant.estimation)``; the equations: `algorithms`).
-    Without an evaluation model truncation is not in the predicted error.
+    "die": ``observer.rms("die")`` is the predicted error, ``close_loop(plant, observer, servo)``
+    runs it in a loop, ``observer.estimate(records)`` on recorded data. The motion of truncated
+    modes of the evaluation model counts as noise, and the predicted error is as accurate as that
+    model (see ``help(flexplant.estimation)``; the equations are in `algorithms`). Without an
+    evaluation model the predicted error does not include truncation.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`, also read `through` a
-        static block, decoupled motions say: their noise is then correlated. A system with labels
-        lacks noise densities: the error names what gives them.
+        static block, for example to decoupled motions, whose noise is then correlated. A system
+        with labels has no noise densities: the error says how to add them.
 
     Returns
     -------
     KalmanEstimator
-        With a certificate: the error by two routes.
+        Estimator with a certificate of the error by two routes.
 
     Raises
     ------
@@ -113,8 +113,8 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
 def redesigned(
     observer: KalmanEstimator, change: Callable[[AnyPlant], AnyPlant]
 ) -> KalmanEstimator:
-    """Return the observer of a changed plant, the modes left out and their noise as they are."""
-    # its predicted errors are those of its own model
+    """Return the observer of a changed plant, with the same truncated modes and their noise."""
+    # its predicted errors hold on its own model
     found = observer.left_out
     if found is not None:
         found = found.replace(plant=change(found.plant))
@@ -122,7 +122,7 @@ def redesigned(
 
 
 def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
-    """Return the filter of a plant and of modes left out, with its errors on its own model."""
+    """Return the filter of a plant and truncated modes, with its errors on its own model."""
     model = filter_model(plant, found)
     design = filter_design(model)
     own = plant if found is None else found.plant
@@ -133,7 +133,7 @@ def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
 
 
 class FilterDesign(NamedTuple):
-    """Gains L, K and L_z, covariance after the measurement, POI variances, and what was checked."""
+    """Gains L, K and L_z, covariance after the measurement, POI variances, and checks."""
 
     gain: FloatArray
     K: FloatArray
@@ -147,7 +147,7 @@ class FilterDesign(NamedTuple):
 
     @property
     def certificate(self) -> Certificate:
-        """What was checked."""
+        """Checks of the filter."""
         checks = (
             stability_check(self.radius, sampled=True),
             Verified("residual", self.residual, RICCATI),
@@ -156,7 +156,7 @@ class FilterDesign(NamedTuple):
 
 
 def filter_design(model: FilterModel) -> FilterDesign:
-    """Return the gains of a model whose sensors may have the noise of modes left out as well."""
+    """Return the gains of a model whose sensors may include the noise of truncated modes."""
     G, H = noise_root(model)
     own = np.sum(H[:, ~np.any(G, axis=0)] ** 2, axis=1)
     # R is nearly all noise that moves the states too, the sensors' own part lost in it
@@ -183,7 +183,7 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
 
 
 def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
-    """Return the gains where P itself has too few digits; raise `why` where there are none."""
+    """Return the gains where P has too few digits; raise `why` if they do not exist."""
     G, H = noise_root(model)
     try:
         found = riccati_root(model.A, model.C2, G, H)

@@ -1,6 +1,6 @@
 """How a lag reduces the predicted error at the POIs, and the error of the static relation.
 
-The static relation takes the POI from the sensors as if the machine stood at rest.
+The static relation computes the POI from the sensors for a machine at rest.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .filter_models import Sight, Steady
 LAGS = (1e-4, 1e-3, 1e-2)
 #: points of the curve over the lag
 _POINTS = 60
-#: what the rows without a lag in seconds are called
+#: names of the rows without a lag in seconds
 PREDICTOR, FILTER, SMOOTHER, STATIC = "predictor", "filter", "smoother", "static relation"
 
 
@@ -38,8 +38,8 @@ PREDICTOR, FILTER, SMOOTHER, STATIC = "predictor", "filter", "smoother", "static
 class LagReport(Value):
     """The stationary rms errors of one filter by lag; prints as a table.
 
-    On the filter's own model, where modes left out are white noise; `on_whole` holds the filter's
-    error on the plant with these modes.
+    They hold on the filter's model, where truncated modes are white noise; `on_whole` is the
+    filter's error on the plant with these modes.
 
     Parameters
     ----------
@@ -48,15 +48,16 @@ class LagReport(Value):
     names : sequence of str
         The rows: static relation, predictor, filter, lags such as "1 ms", smoother.
     rms : (n_row, nz) array [m or rad]
-        Of the errors; NaN where there is no static relation.
+        RMS errors; NaN without a static relation.
     lag : (n,) array [s]
-        Of the curve, from 0, which is the filter.
+        Lags of the curve; 0 is the filter.
     curve : (n, nz) array [m or rad]
         The rms by lag.
     on_whole : (nz,) array
-        Of the filter on the plant with the modes left out; equal to its row where none are known.
+        RMS errors of the filter on the plant with truncated modes; equal to its row if these are
+        not known.
     note : str
-        Why there is no static relation, or "".
+        Reason why no static relation exists, or "".
     units : mapping {channel: unit}
 
     Examples
@@ -117,8 +118,8 @@ def lag_errors(
     channels: Sequence[str],
 ) -> LagReport:
     """Return the report of a stationary filter."""
-    # `var(l) = var(filter) - T M_l T'`, M_l what l further samples say of the state, up to
-    # `M = F' M F + C2' S^-1 C2` of the smoother
+    # `var(l) = var(filter) - T M_l T'`, M_l the information of l further samples on the state, up
+    # to `M = F' M F + C2' S^-1 C2` of the smoother
     wanted = positive_array(lags, "lags", (None,), hint="They are times [s]: try 1e-3.")
     counts = {f"{1e3 * s:.4g} ms": round(s / plant.dt) for s in sorted(wanted.tolist())}
     counts = {name: count for name, count in counts.items() if count}
@@ -137,7 +138,7 @@ def lag_errors(
         curve[k] = curve[k - 1] - np.sum((w @ seen.T) ** 2, axis=1)
         w = w @ F.T
     try:
-        alone = design_static(plant.replace(evaluation=None))  # as the other rows
+        alone = design_static(plant.replace(evaluation=None))  # like the other rows
         static, note = np.array([alone.rms(name) for name in channels]), ""
     except FlexplantError as error:
         static, note = np.full(len(channels), np.nan), str(error)
@@ -181,12 +182,12 @@ class Filter(Value):
 
 @dataclass(frozen=True, eq=False)
 class FixedLag(Value):
-    """From the measurements up to some samples after: x[k|k+lag], known that much later.
+    """From the measurements up to some samples after: x[k|k+lag], known with this lag.
 
     Parameters
     ----------
     samples : int
-        The lag, at least 1. At the end of a record what there is.
+        Lag, at least 1; shorter at the end of a record.
 
     References
     ----------
@@ -224,7 +225,7 @@ class Smoother(Value):
     """
 
 
-#: when an estimate is wanted
+#: types of estimates
 Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 
@@ -237,7 +238,7 @@ class StaticEstimator(PoiEstimator):
     system : StateSpace
         From the displacement sensors to `die:hat`, ...; no states.
     plant : StandardPlant
-        Whose motions at rest it uses.
+        Plant whose static motions it uses.
     """
 
     system: StateSpace
@@ -253,13 +254,13 @@ class StaticEstimator(PoiEstimator):
         return self.system.D
 
     def rms(self, channel: str, *, on: AnyPlant | System | None = None) -> float:
-        """Return the predicted rms of the error at sample instants, with u at rest.
+        """Return the predicted rms of the error at sample instants, with u = 0.
 
-        What the disturbances bend, the modes left out among it where they are known, and the
-        sensor noise; free motions have no error. `channel` and
-        `on`, a plant, are as for `KalmanEstimator.rms`; `on` None is its own with the modes left
-        out. AssumptionError also when the plant is continuous (a sample of white sensor noise
-        has no variance then), SolverError when an elastic mode is not damped.
+        It includes the deformation by disturbances (also of known truncated modes) and the sensor
+        noise; free motions have no error. `channel` and `on`, a plant, are as for
+        `KalmanEstimator.rms`; `on` None is its own with the modes left out. AssumptionError also
+        when the plant is continuous (a sample of white sensor noise has no variance then),
+        SolverError when an elastic mode is not damped.
         """
         row = row_of(poi_channels(self.plant), channel)
         require_sampled(self.plant, "an rms is of samples")
@@ -276,8 +277,8 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     ``hat = Z Y^+ y``, Z and Y the motions of POIs and sensors that the actuators make at rest, or
     actuators and disturbances where no actuator moves a POI. Of a free body these are its
     rigid-body motions, and the relation is that of the geometry; of a machine whose bodies are
-    joined by drives and springs they are what its drives move. Usual practice, and the baseline for
-    anything with a flexible model.
+    joined by drives and springs they are what its drives move. It is usual practice, and the
+    baseline for estimators with a flexible model.
 
     Parameters
     ----------
@@ -287,7 +288,8 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     Returns
     -------
     StaticEstimator
-        Exact for the motions at rest. A motion that no force of the plant makes counts as none.
+        Estimator that is exact for static motions. A motion that no force of the plant makes counts
+        as zero.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Modes left out of a filter's model: noise on its sensors and POIs, and a static compliance.
+"""Truncated modes of a filter's model: noise on sensors and POIs, and static compliance.
 
-And which of them the mesh of the evaluation model resolves badly.
+Also a check of how well the mesh of the evaluation model resolves them.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from ..store import Value
 from ..tolerances import TINY, divisor
 from .estimator_channels import read_alike, sensors
 
-#: a mode of the plant is one of the evaluation model's within this relative difference of frequency
+#: relative difference of frequency within which modes of the plant and of the evaluation model are
+#: equal
 _SAME = 0.15
-#: how much another shape weighs beside another frequency when modes are paired
+#: weight of a different shape relative to a different frequency when modes are paired
 _SHAPE = 0.02
 
 
 def beyond_text(plant: AnyPlant, count: int | None) -> str:
-    """Return, in words, whether predicted errors hold the modes left out; their number, if so."""
+    """Return a text on the truncated modes in predicted errors, and their number."""
     if count is None:
         alone = f"{NOT_JUDGED}: truncation is not in these numbers"
         return alone if plant.unjudged else "no modes are left out"
@@ -47,18 +48,18 @@ class LeftOut(Value):
     Parameters
     ----------
     modes : (m,) array of int
-        Numbers of the modes left out, in the evaluation model, from 1.
+        Numbers of the truncated modes in the evaluation model, from 1.
     sensors : (ny, ny) array
-        R_t, their stationary covariance at the sensors.
+        Stationary covariance R_t at the sensors.
     pois : (nz, nz) array
-        V_t, at the POIs.
+        Covariance V_t at the POIs.
     cross : (nz, ny) array
-        N_t, between POIs and sensors.
+        Covariance N_t between POIs and sensors.
     plant : StandardPlant
-        The plant whose motions also follow u by the static compliance of the modes left out.
-        Shapes that stood for them (attachment vectors) are excited by u only.
+        Plant with the static compliance of the truncated modes as response to u. Attachment vectors
+        that represent them are excited by u only.
     whole : StandardPlant, optional
-        The plant that has the modes: from it the same follows for a POI elsewhere.
+        Plant with the modes, from which the same follows for another POI.
 
     Examples
     --------
@@ -83,18 +84,18 @@ class LeftOut(Value):
 
 
 def left_out(plant: AnyPlant, whole: AnyPlant) -> LeftOut | None:
-    """Return what the modes do that a plant lacks of an evaluation plant; None when it lacks none.
+    """Return the effect of modes of an evaluation plant that a plant lacks; None without any.
 
     With the poles lambda of the modes left out, b what white noise of unit intensity drives and c
     what is seen, ``X_ij = - b_i b_j^* / (lambda_i + lambda_j^*)`` is the stationary covariance,
-    ``c X c*`` that of the motions. For modes damped each by itself this is::
+    ``c X c*`` that of the motions. For modes with modal damping this is::
 
         Sig_ij = W_ij (d_i + d_j) / ((om_i^2 - om_j^2)^2 + (d_i + d_j)(d_i om_j^2 + d_j om_i^2))
         R_t = P_y Sig P_y',  N_t = P_z Sig P_y',  V_t = P_z Sig P_z'
 
     with d = 2 zeta omega and ``W_ij = sum_w phi_iw phi_jw asd_w^2 / 2``. A sample has the same
-    covariance. Disturbances with a shape drive a mode with their density at its frequency, and
-    their slow part moves it statically; filters and delays of sensors act at its pole.
+    covariance. Coloured disturbances excite a mode with their density at its frequency, and their
+    slow part moves it statically; filters and delays of sensors act at its pole.
     """
     own, others_own = plant.assembled, whole.assembled
     small, big, ports = own.realisation, others_own.realisation, own.ports
@@ -115,7 +116,7 @@ def left_out(plant: AnyPlant, whole: AnyPlant) -> LeftOut | None:
     stand_ins = np.setdiff1d(np.arange(kept_omega.size), rows)
     flexibility = all_modes.static[others].sum(axis=0) - kept_static[stand_ins].sum(axis=0)
     flexibility[:, np.logical_not(_may_follow(plant, ports))] = 0.0
-    # an acceleration has no static part: what modes answer at once they take back at rest
+    # an acceleration has no static part
     moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
     covariance = _motion_covariance(all_modes, others, whole)
@@ -169,7 +170,7 @@ def _mode_blocks(realisation: ModalRealisation, g: StateSpace) -> _Blocks:
 
 
 def _of_vectors(realisation: ModalRealisation) -> IntArray:
-    """Return which elastic modes are attachment vectors: stand-ins for modes left out."""
+    """Return which elastic modes are attachment vectors that represent truncated modes."""
     r = realisation.n_rigid
     names = realisation.names[2 * r :: 2]
     model = realisation.model
@@ -180,13 +181,13 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
     held = [i for i, name in enumerate(model.coordinates) if name.startswith(STATIC)]
     if held:
         part = np.sum(shapes[held] ** 2, axis=(0, 2)) / size
-    else:  # frequencies of vectors are means of those of modes left out
+    else:  # frequencies of vectors are means of those of truncated modes
         part = np.sqrt(np.abs(np.linalg.det(realisation.pairs[r:])))
     return np.sort(np.argsort(part)[part.size - model.n_vectors :])
 
 
 def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the modes of both that are the same ones, by frequency and by compliance."""
+    """Return the common modes of both, by frequency and compliance."""
     one, two = kept.static[genuine], every.static
     size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
     one, two = ((part / size).reshape(part.shape[0], -1) for part in (one, two))
@@ -199,7 +200,7 @@ def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntAr
 
 
 def _may_follow(plant: AnyPlant, ports: Ports) -> FloatArray:
-    """Return which forces a static compliance may answer (m,)."""
+    """Return the forces (m,) to which a static compliance may respond."""
     # a white disturbance has no value at an instant, and u must not reach y in the sample in which
     # it is computed from y
     late = {port.name: plant.delay + port.latency / plant.dt > 0 for port in ports.u}
@@ -243,7 +244,7 @@ def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
 
 
 def _with_flexibility(plant: AnyPlant, bare: StateSpace, flexibility: FloatArray) -> AnyPlant:
-    """Return a plant whose structure's motions (p, m) also answer forces at once, sampled alike."""
+    """Return a plant with an additional static compliance (p, m), with the same sampling."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
     noisy = [port for port in ports.u if f"{port.name}:disturbance" in ports.input_noises]
@@ -259,8 +260,8 @@ def _with_flexibility(plant: AnyPlant, bare: StateSpace, flexibility: FloatArray
 
 
 def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:
-    """Return the new plant with the old one's noise, less that on some modes (from 0)."""
-    # shapes that stand in for modes left out have none: it is in the noise of the sensors already
+    """Return the new plant with the noise of the old one, except on some modes (from 0)."""
+    # shapes that represent truncated modes have no noise, which the sensors already include
     factor = np.array(plant.noise_factor)
     factor[plant.modal_states.reshape(-1, 2)[modes].reshape(-1)] = 0.0
     return fresh.replace(origin=fresh.assembled.replace(noise_factor=factor))

@@ -1,4 +1,4 @@
-"""Modes of a plant that a record of the machine shows elsewhere: which, and by how much."""
+"""Modes with other frequencies on the machine, found from a record."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ from .innovations import InnovationLines, density_of, whitening
 from .kalman import redesigned
 from .lag_report import Filter
 
-#: lines of a band and evaluations of the search for a mode's change, at most; widths of a new mode
+#: largest numbers of lines of a band and of evaluations in the search for a mode's change; widths
+#: of a new mode
 _BAND, _SEARCH, _WIDTHS = 400, 40, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
-#: steps of the likelihood's maximisation; it ends at a step of so many deviations, which changes
-#: no figure that is printed
+#: number of steps of the maximisation of the likelihood, and step in standard deviations at which
+#: it ends
 _STEPS, _SETTLED = 12, 0.05
-#: part of the largest step within which the derivatives of the innovations are kept
+#: fraction of the largest step within which the derivatives of the innovations are reused
 _LINEAR = 0.3
-#: differences: of a frequency in half-widths of the mode, of the logarithm of damping; both move
-#: the innovations far more than rounding and far less than linearity lasts
+#: finite differences: of a frequency in half-widths of the mode, and of the logarithm of damping;
+#: both are far above rounding and within the linear range
 _WIDTH, _LOG = 0.02, 0.02
-#: a fit ends this close to the peak where it began, relative: peaks are found within some lines
+#: largest relative distance of the end of a fit from its peak: peaks are found within a few lines
 _NEAR = 5e-3
 #: largest step of a search: widths of a mode, and logarithm of damping
 _FAR = 1.0
@@ -47,7 +48,7 @@ class ModeChange(NamedTuple):
     decay: float
 
     def near(self, start: ModeChange) -> bool:
-        """Whether a fit that began at a change ended at the same peak."""
+        """Whether a fit ended at the peak at which it began."""
         return abs(self.frequency - start.frequency) <= max(_NEAR, 0.3 * abs(start.frequency))
 
     @property
@@ -62,7 +63,7 @@ class ModeChange(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MovedModes(Value):
-    """Modes that a record shows elsewhere than the plant has them, by maximum likelihood.
+    """Modes with other poles on the machine than in the plant, by maximum likelihood.
 
     Parameters
     ----------
@@ -71,9 +72,9 @@ class MovedModes(Value):
     expected : (m,) complex array [rad/s]
         Poles of the plant.
     poles : (m,) complex array [rad/s]
-        Of the machine.
+        Poles of the machine.
     covariance : (2 m, 2 m) array
-        Of the logarithms of |pole|, then of the decay rates.
+        Covariance of the logarithms of |pole|, then of the decay rates.
 
     Examples
     --------
@@ -118,7 +119,7 @@ class MovedModes(Value):
 
     @property
     def texts(self) -> list[str]:
-        """Each mode in words."""
+        """Text of each mode."""
         found = []
         for i, n in enumerate(self.modes):
             (df, sf), (z, sz) = self.frequency[n], self.damping[n]
@@ -158,7 +159,7 @@ class MovedModes(Value):
 def moved_modes(
     observer: KalmanEstimator, estimate: Estimate, starts: Sequence[ModeChange], skip: int
 ) -> tuple[MovedModes, KalmanEstimator, Estimate]:
-    """Return where modes are on the machine, and observer and estimate of the changed plant."""
+    """Return the modes of the machine, and observer and estimate of the changed plant."""
     # maximum likelihood of the record by the innovations of the filter of the changed plant, the
     # commands counted, so that feedback does not bias it; Gauss-Newton, the noises known but for
     # one common level: `n/2 log(sum |W e|^2 / n) - n_k log det W`. The first samples are skipped
@@ -197,7 +198,7 @@ def moved_modes(
 
 
 class _Trial(NamedTuple):
-    """Whitened innovations of a changed plant's filter, its log det, and what made them."""
+    """Whitened innovations of a changed plant's filter, its log det, and their filter."""
 
     white: FloatArray
     log_size: float
@@ -235,7 +236,7 @@ class _Likelihood:
         return np.asarray(found[np.arange(len(found)), np.argmax(found.imag, axis=1)])
 
     def at(self, theta: FloatArray) -> _Trial:
-        """Return the innovations with the modes so changed."""
+        """Return the innovations with changed modes."""
         parts = zip(self.modes, *theta.reshape(2, -1).tolist(), strict=True)
         changes = [amount for one in parts for amount in ModeChange(*one).amounts]
         observer = redesigned(
@@ -255,7 +256,7 @@ class PeakBand(NamedTuple):
     X: ComplexArray
     U: ComplexArray
     level: FloatArray
-    #: of the peak, and where the mode near it appears when sampled
+    #: frequencies of the peak, and of the neighbouring mode after sampling
     at: float
     seen: float
 
@@ -278,8 +279,8 @@ def explained_by_change(
     # both are fitted to the lines around by Whittle's likelihood: the mode's change by what the
     # commands and the noises of the changed plant make of the innovations, `V (G - G') U` and the
     # density, the new mode as `h v v* g^2 / ((f - f_0)^2 + g^2)` with any direction v; each
-    # parameter costs half the logarithm of the number of lines. A changed mode is missing where the
-    # model has it, and shows itself in its own direction. `sign` is -1 where its frequency is
+    # parameter costs half the logarithm of the number of lines. A changed mode is missing at its
+    # place in the model, and appears in its own direction. `sign` is -1 where its frequency is
     # folded
     from scipy.optimize import minimize
 
@@ -291,12 +292,12 @@ def explained_by_change(
 
     def change(x: FloatArray) -> ModeChange:
         moved = freq + sign * (band.at - band.seen) * x[0]
-        # a step may pass zero
+        # a step may cross zero
         return ModeChange(mode, float(np.log(max(moved, 1e-3 * freq) / freq)), float(x[1]))
 
     def cost(x: FloatArray) -> float:
         if not -0.5 <= x[0] <= 1.5:
-            return np.inf  # another peak than this one
+            return np.inf  # not this peak
         machine = plant.around(with_changes(plant.machine, change(x).amounts))
         S = density_of(observer, machine, lines, V).both - usual + np.eye(p)[None]
         left = band.X
@@ -344,7 +345,7 @@ def _new_mode(band: PeakBand, width: float) -> float:
 
 
 def _whittle(S: ComplexArray, X: ComplexArray) -> float:
-    """Return ``sum log det S + X* S^-1 X``, infinite where S is no density."""
+    """Return ``sum log det S + X* S^-1 X``, infinite where S is not a density."""
     try:
         root = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:

@@ -23,18 +23,18 @@ from .estimator_channels import checked_plant, read_alike, sensors
 from .innovations import seen_from_states, squared
 from .kalman import design_kalman
 
-#: designs of the filter whose innovations are used, and the change of all ratios that ends them
+#: largest number of filter designs, and change of all ratios at which they end
 _PASSES, _SETTLED = 6, 1e-3
-#: scoring steps, and the slope beside its deviation at which they end
+#: largest number of scoring steps, and slope relative to its deviation at which they end
 _STEPS, _FLAT = 60, 1e-4
-#: share of right models of whose levels nothing is said
+#: probability that a correct model gives no warning
 _LEVEL = 0.999
-_EVALUATION = " Give the plant an evaluation model, if modes left out are what it lacks."
+_EVALUATION = " Give the plant an evaluation model, if it lacks truncated modes."
 #: lags of the autocovariances of the start
 _LAGS = 40
 #: fewest samples, and lines of the spectrum computed at once
 _FEWEST, _LINES = 1000, 4000
-#: a variance is kept above this part of the given one, and below this multiple in one pass
+#: least and largest ratio of a variance to the given one in one pass
 _LOW, _HIGH = 1e-6, 1e6
 
 
@@ -44,37 +44,37 @@ def estimate_noise(
 ) -> NoiseLevels:
     """Return the densities of all disturbances and sensor noises that explain a record best.
 
-    The innovations e of a fixed filter are stationary whatever the levels are, rigid-body motion
-    included, and their spectrum is linear in the variances t_i of the channels::
+    The innovations e of a fixed filter are stationary for any levels, including rigid-body motion,
+    and their spectrum is linear in the variances t_i of the channels::
 
         S(f) = sum_i t_i P_i(f),   P_i = T_i T_i^*,   T_i = H_i + C (z I - A + K C)^-1 (G_i - K H_i)
 
-    (``G_i = 0`` for a sensor's own noise). Their likelihood over the lines of the Fourier
-    transform (Whittle) and its derivatives are sums::
+    (``G_i = 0`` for sensor noise). Their likelihood over the lines of the Fourier transform
+    (Whittle) and its derivatives are sums::
 
         l = -sum_f log det S + tr S^-1 I,   dl/dt_i = -sum_f tr S^-1 P_i - tr S^-1 P_i S^-1 I
         information F_ij = sum_f tr S^-1 P_i S^-1 P_j
 
     Scoring in the logarithms of t_i starts at the non-negative least-squares fit of the
-    autocovariances (linear in t_i as well). The filter is designed again with what was found, so
-    that its innovations are white in the end: the likelihood is then that of the exact filter.
+    autocovariances (linear in t_i as well). The filter is designed again with the result, so that
+    its innovations become white, and the likelihood is then that of the exact filter.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with guesses of all densities that are to be found (their orders of magnitude);
-        what has none stays without. The record is explained with the modes of its evaluation
-        model, which are to be those of the machine, `fit.applied_to(model)`; without one the
-        noises of the sensors stand for the modes left out.
+        Sampled plant with guesses of all unknown densities (their orders of magnitude); channels
+        without a density get none. The record is explained with the modes of its evaluation model,
+        which should be those of the machine, `fit.applied_to(model)`; without it the sensor noises
+        include the truncated modes.
     records : Response, mapping {channel: (N,) array} or data frame
         All sensors and commands; the longest stretch without gaps is used.
     gate : float, optional
-        As in `KalmanEstimator.estimate`: outliers are gaps.
+        Gate as in `KalmanEstimator.estimate`: outliers are gaps.
 
     Returns
     -------
     NoiseLevels
-        `.asd`, `.relative`, and `.plant` with these densities.
+        Levels with `.asd`, `.relative`, and `.plant` with these densities.
 
     Raises
     ------
@@ -83,15 +83,15 @@ def estimate_noise(
     LabelError, ShapeError
         When channels are missing or of different lengths.
     ModelError
-        When fewer than 1000 samples are left without gaps and start-up.
+        When fewer than 1000 samples remain without gaps and start-up.
     SolverError
-        When the search does not settle; the message says what the record shows of the plant.
+        When the search does not converge; the message gives the result of `consistency`.
 
     Warns
     -----
     FlexplantWarning
-        When the innovations with these levels are still not white: the model is another one than
-        the machine's, and the stated deviations do not hold.
+        When the innovations with these levels are still not white: the model does not match the
+        machine, and the stated deviations are not valid.
 
     References
     ----------
@@ -120,15 +120,15 @@ def estimate_noise(
         if not first.size:
             begin = _least_squares(spectrum)
             first = np.sqrt(begin)
-            begin = np.clip(begin, 1e-3, _HIGH)  # none of them is absent
+            begin = np.clip(begin, 1e-3, _HIGH)  # all levels are positive
         else:
             begin = np.ones(len(channels))
         found = _scored(spectrum, begin, np.minimum(_LOW / ratios**2, 1.0))
         ratios = ratios * np.sqrt(found.variances)
         covariance = _level_covariance(found, channels)
-        # of a variance, which is known to this even where it may be 0 and its logarithm is not
+        # relative to a variance, which has a finite error even where it may be 0
         deviation = 2 * found.variances * np.sqrt(covariance.diagonal())
-        # what is known to a few percent only is settled well within that
+        # values that are known to a few percent are converged well within this
         if np.all(np.abs(found.variances - 1.0) < np.maximum(2 * _SETTLED, 0.1 * deviation)):
             break
     else:
@@ -143,8 +143,8 @@ def estimate_noise(
     if not verdict.holds:
         warn(
             "the noise levels do not explain the record: "
-            f"{verdict.text} The levels stand for what the model lacks, and their deviations hold "
-            f"for a right model only.{_EVALUATION if whole is plant else ''}"
+            f"{verdict.text} The levels include errors of the model, and their deviations are "
+            f"only valid for a correct model.{_EVALUATION if whole is plant else ''}"
         )
     return NoiseLevels(
         plant, channels, ratios, covariance, first, found.slope, verdict.nis, len(innovations),
@@ -153,7 +153,7 @@ def estimate_noise(
 
 
 def _whole_plant(plant: AnyPlant) -> AnyPlant:
-    """Return the plant with the modes left out, with the densities of the given one."""
+    """Return the plant with truncated modes and the densities of the given one."""
     found = plant.machine.evaluation_plant
     if found is None:
         return plant
@@ -163,10 +163,10 @@ def _whole_plant(plant: AnyPlant) -> AnyPlant:
 
 
 def _advice(observer: KalmanEstimator, estimate: Estimate, alone: bool) -> str:
-    """Return what the record says of the plant where its levels are not found, and what to do."""
+    """Return the result of the record for the plant if levels are not found, and advice."""
     said = consistency(observer, estimate, level=_LEVEL)
     if said.cause in ("none", "noise level", "noise ratio"):
-        return "Pass a plant with densities nearer to the true ones, or a longer record."
+        return "Pass a plant with densities closer to the true ones, or a longer record."
     return f"With the last ones {said.text}{_EVALUATION if alone else ''}"
 
 
@@ -175,8 +175,8 @@ def _noise_channels(plant: AnyPlant) -> tuple[str, ...]:
     silent = [name for name in noises if not plant.asd.get(name, 0.0) > 0]
     if silent:
         raise AssumptionError(
-            f"{', '.join(silent)} has no density to start from: levels are found for sensors with "
-            "noise of their own. Give Sensor(asd=) a guess, and a plant that reads sensors."
+            f"{', '.join(silent)} has no density to start from: levels are found only for "
+            "sensors with noise. Give Sensor(asd=) a guess, and a plant that reads sensors."
         )
     if plant.machine.continuous.dt:  # the noise of a sample is given as a whole
         return PROCESS, *noises
@@ -197,7 +197,7 @@ class _Source(NamedTuple):
 
 
 def _sources(plant: AnyPlant, channels: tuple[str, ...]) -> list[_Source]:
-    """Return what each channel adds per sample, at its present level."""
+    """Return the contribution of each channel per sample, at its present level."""
     rows = [plant.y.index(name) for name in sensors(plant)]
     n, found = plant.system.n_states, []
     forces = [other for other in channels if other.removesuffix(":noise") not in plant.y]
@@ -240,7 +240,7 @@ class _LevelSpectrum(NamedTuple):
 def _level_spectrum(
     observer: KalmanEstimator, sources: list[_Source], innovations: FloatArray
 ) -> _LevelSpectrum:
-    """Return the periodogram of innovations and what each channel adds to it."""
+    """Return the periodogram of innovations and the contribution of each channel."""
     m, K = observer.model, observer.predictor_gain
     count = len(innovations)
     size = np.sqrt(m.innovation(observer.predicted_covariance).diagonal())
@@ -280,11 +280,11 @@ class _Scored(NamedTuple):
 
 def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> _Scored:
     """Return the variances of the largest likelihood, by scoring in their logarithms."""
-    # those at the lower end that would still fall are left out of the steps
+    # variances at the lower limit that would decrease are left out of the steps
     bottom = np.log(lowest)
     log_t = np.log(start)
     value, slope, information = _likelihood(spectrum, np.exp(log_t))
-    # nearly a Newton step: the first one is seldom far
+    # nearly a Newton step: the start is seldom far away
     damping = 1e-6
     for _ in range(_STEPS):
         scale = np.sqrt(np.maximum(information.diagonal(), TINY))
@@ -307,8 +307,8 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
         else:
             damping = max(10 * damping, 1e-3)  # from here on it shortens a step
     raise SolverError(
-        f"the likelihood of the noise levels did not settle in {_STEPS} steps: the spectrum of the "
-        "innovations is far from any that these channels make. Judge the record with "
+        f"the likelihood of the noise levels did not converge in {_STEPS} steps: these channels "
+        "cannot explain the spectrum of the innovations. Judge the record with "
         "flexplant.estimation.consistency, and give the plant an evaluation model."
     )
 
@@ -337,8 +337,8 @@ def _level_covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
     size = np.sqrt(scaled.diagonal())
     if np.any(size == 0):
         raise AssumptionError(
-            f"the sensors show nothing of {channels[int(np.argmin(size))]!r}: its level cannot be "
-            "found. Give it no density, or add a sensor."
+            f"the sensors do not see {channels[int(np.argmin(size))]!r}, so that its level "
+            "cannot be found. Give it no density, or add a sensor."
         )
     values, vectors = np.linalg.eigh(scaled / np.outer(size, size))
     if values[0] < SPLIT:
@@ -352,9 +352,9 @@ def _level_covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
     return np.asarray(0.25 * inverse / np.outer(size, size))
 
 
-#: channel that stands for all disturbances of a plant made elsewhere
+#: name of the channel for all disturbances of a plant that was not assembled
 PROCESS = "process"
-#: relative deviation of a density from which its variance less two deviations is below 0
+#: relative deviation of a density above which its variance minus two deviations is below 0
 _BOUND = 0.25
 
 
@@ -367,23 +367,24 @@ class NoiseLevels(Value):
     given : StandardPlant
         The plant with the densities that the search started from.
     channels : tuple of str
-        Disturbances of w, then sensors (`y1:noise`); `process` stands for all disturbances of a
-        plant made elsewhere.
+        Disturbances of w, then sensors (`y1:noise`); `process` means all disturbances of a plant
+        that was not assembled.
     ratios : (p,) array
-        Estimated density of each channel beside the given one.
+        Ratio of the estimated density of each channel to the given one.
     covariance : (p, p) array
-        Of the logarithms of the ratios: the inverse of Fisher's information.
+        Covariance of the logarithms of the ratios: the inverse of Fisher's information.
     start : (p,) array
-        Ratios by autocovariance least squares, where the search began; 0 where it gave none.
+        Ratios by autocovariance least squares, the start of the search; 0 without a result.
     slope : float
-        Largest derivative of the likelihood at the end, beside its standard deviation: below 1e-3.
+        Largest derivative of the likelihood at the end, relative to its standard deviation: below
+        1e-3.
     nis : float
         Mean normalised innovation squared per sensor of the filter with these levels, from the
-        record itself: 1 when the model explains it.
+        record: 1 if the model explains it.
     samples : int
-        Used.
+        Number of used samples.
     verdict : str
-        Of `consistency`, on the record with these levels.
+        Verdict of `consistency` for the record with these levels.
     """
 
     given: AnyPlant
@@ -403,7 +404,7 @@ class NoiseLevels(Value):
         return "\n".join([first, *shown, *more]) + ">"
 
     def _shown(self, i: int) -> str:
-        """Return a level in words: a bound where it may be 0 just as well (two deviations)."""
+        """Return a text of a level: a bound if it may be 0 (within two deviations)."""
         # the variance t of a ratio has the deviation 2 t times that of the density's logarithm
         ratio, off = float(self.ratios[i]), self.relative[self.channels[i]]
         if off > _BOUND:

@@ -18,19 +18,19 @@ from .error import ON_CIRCLE
 from .estimator_channels import Recorded
 from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
-#: samples between two looks whether it is
+#: number of samples between two tests of stationarity
 _LOOK = 16
-#: relative: a covariance that is this near to the one it settles at is taken for it
+#: relative distance of a covariance from its limit at which it counts as stationary
 STATIONARY = TYPED
 
 
 class Moment(NamedTuple):
-    """What a later pass needs of a sample at which the gain was not stationary."""
+    """Data of a sample with a gain that was not stationary, for a later pass."""
 
     gains: FilterGains
-    T: FloatArray  # (nz, n), what the next adjoint adds to the estimate
-    shown: FloatArray  # (ny, r), delta in the whitened innovation
-    seen: FloatArray  # (nz, r), delta in the estimate
+    T: FloatArray  # (nz, n), effect of the next adjoint on the estimate
+    shown: FloatArray  # (ny, r), effect of delta on the whitened innovation
+    seen: FloatArray  # (nz, r), effect of delta on the estimate
     hat: FloatArray  # (nz,), for delta = 0
     variance: FloatArray  # (nz,), for delta known
     found: KnownParameters | None
@@ -41,7 +41,7 @@ class Walk:
 
     `hat` and `variance` (N, nz) are of the estimates, `white` (N, ny) whitened innovations for
     delta = 0, zeros where missing. `innovations`, their `deviation` and `whitened` (N, ny) are NaN
-    where a sample is missing, or nothing predicts it yet.
+    where a sample is missing or not predicted yet.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Walk:
         self.gaps = np.flatnonzero(~self.whole)
         self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
-        # channel by channel in memory: so the estimate takes them, without a copy
+        # channel by channel in memory, so that the estimate stores them without a copy
         self.hat, self.variance = (np.empty((nz, N)).T for _ in range(2))
         self.white = np.zeros((N, ny) if keep else (0, ny))
         self.innovations, self.deviation, self.whitened = (np.empty((ny, N)).T for _ in range(3))
@@ -139,7 +139,7 @@ class Walk:
 
     def _screened(self, k: int, until: int, x: FloatArray) -> tuple[int, FloatArray]:
         """Run the stationary filter up to a sample, or to the first that the gate drops."""
-        # later samples count with their innovations after it is dropped: they are filtered again
+        # later samples are filtered again after it is dropped
         length = until - k if not np.isfinite(self.gate) else LONGEST
         while k < until:
             end = min(k + length, until)
@@ -196,7 +196,7 @@ class Walk:
     def _innovate(
         self, k: int, e: FloatArray, S: FloatArray, C: FloatArray, found: KnownParameters | None
     ) -> None:
-        """Record the innovation with what is known of delta before the measurement; gate it."""
+        """Record the innovation with the knowledge of delta before the measurement; gate it."""
         there = self.there[k]
         self.innovations[k] = self.deviation[k] = self.whitened[k] = np.nan
         if C.shape[1]:
@@ -222,18 +222,18 @@ class Walk:
     def _settled(
         self, x: FloatArray, P: FloatArray, Z: FloatArray
     ) -> tuple[bool, FloatArray, FloatArray]:
-        """Return whether the gain is stationary; delta is put into x once it fades from it."""
+        """Return whether the gain is stationary; delta then becomes part of x."""
         weight, size = self._weight
         if Z.shape[1]:
             assert self.found is not None  # noqa: S101
             X = Z @ self.found.X
-            # a pass back changes delta itself by the root of what is left of it here
+            # a backward pass changes delta by the root of its remainder here
             left = STATIONARY * (1e-8 if self.keep else 1.0)
             if self.found.open.size or np.sum((weight @ X) * X) > left:
                 return False, x, Z
             x, Z = x + Z @ self.found.value, Z[:, :0]
         excess = float(np.sum(weight * (P - self.steady.P)))
-        # beside the rounding of both covariances
+        # compared with the rounding of both covariances
         return abs(excess) < STATIONARY + 1e-13 * size, x, Z
 
     @cached_property
@@ -244,7 +244,7 @@ class Walk:
     def _fading(
         self, k: int, until: int, x: FloatArray, Y: FloatArray
     ) -> tuple[int, FloatArray, FloatArray, bool]:
-        """Go on in blocks from ``x + Y eta`` until eta no longer matters, or to a gap.
+        """Continue in blocks from ``x + Y eta`` until eta no longer matters, or to a gap.
 
         Returns the sample after it, state and covariance there, and whether it is stationary.
         """
@@ -272,7 +272,7 @@ class Walk:
             self.deviation[at] = self.s * np.sqrt(np.diagonal(S, axis1=1, axis2=2))
             self.whitened[at] = np.linalg.solve(innovation_root(S), e[:, :, None])[:, :, 0]
             cut = self._dropped(k, at.stop)
-            if cut < at.stop:  # the block up to there again; none when it is its first sample
+            if cut < at.stop:  # the block up to there again, unless it is its first sample
                 x, until = first, cut
                 continue
             x = x + moved[-1] @ found.value[-1]
@@ -317,14 +317,14 @@ class Walk:
         return x
 
 
-#: largest part of the stationary variance of a state that may still be unknown of it
+#: largest remaining uncertainty of a state relative to its stationary variance
 _LARGEST = 1e4
-#: samples of the first stretch, and of the longest: twice as many each time
+#: number of samples of the first and of the longest stretch; it doubles each time
 FIRST, LONGEST = 64, 1024
 
 
 class ShownSoFar(NamedTuple):
-    """What the measurements of a stretch say of eta, before the first and after each of them."""
+    """Knowledge of eta before the first and after each measurement of a stretch."""
 
     value: FloatArray  # (k + 1, r)
     covariance: FloatArray  # (k + 1, r, r)
@@ -335,9 +335,9 @@ def excess(
 ) -> FloatArray | None:
     """Return Y (n, r) with ``P_k = P + Y Y'``, P_k the covariance now and P the stationary one."""
     # the filter of any first covariance P_k above the stationary P is the stationary filter of a
-    # first state `x + Y eta`, eta of zero mean and unit covariance, whose innovations
-    # `e = C F^k Y eta + white noise` show eta by least squares: the partitioned filter. None where
-    # P_k is not above P, or has so much to show still that digits would be lost. [Lainiotis1975]_
+    # first state `x + Y eta`, eta of zero mean and unit covariance, whose innovations `e = C F^k Y
+    # eta + white noise` give eta by least squares: the partitioned filter. None where P_k is not
+    # above P, or is so large that digits would be lost. [Lainiotis1975]_
     more = P - steady.P
     if Z.shape[1]:
         if found is None or found.open.size:
@@ -348,7 +348,7 @@ def excess(
         more = more + X @ X.T
     sizes, vectors = np.linalg.eigh(0.5 * (more + more.T))
     below = vectors[:, sizes < 0] * np.sqrt(-sizes[sizes < 0])
-    # beside the rounding of the terms
+    # compared with the rounding of the terms
     if np.sum((weight @ below) * below) > ROUNDING + 1e-13 * np.sum(np.abs(weight * steady.P)):
         return None
     return lasting_part(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
@@ -362,7 +362,7 @@ def lasting_part(weight: FloatArray, Y: FloatArray) -> FloatArray:
 
 
 def shown_so_far(rows: FloatArray, white: FloatArray) -> ShownSoFar:
-    """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
+    """Return the estimate of eta from whitened innovations ``white = rows eta + noise`` (k, ny)."""
     count, _, r = rows.shape
     information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
     information[0] = np.eye(r)
@@ -373,12 +373,13 @@ def shown_so_far(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
 
 
-#: a direction counts as found from this part of the best known one's information (root)
+#: root of the information on a direction, relative to the best known one, above which it counts as
+#: known
 _FOUND = 1e-10
 
 
 class KnownParameters(NamedTuple):
-    """What is known of the parameters delta: their value, ``X X'`` their covariance.
+    """Knowledge of the parameters delta: their value, and covariance ``X X'``.
 
     The columns of `open` are directions that no measurement has shown yet.
     """
@@ -391,7 +392,7 @@ class KnownParameters(NamedTuple):
         """Return the variance (p,) that delta adds where it enters by rows (p, r)."""
         variance = np.sum((rows @ self.X) ** 2, axis=1)
         missed = np.linalg.norm(rows @ self.open, axis=1)
-        # the root of rounding: an unknown motion enters the square
+        # the root of rounding, since an unknown motion enters squared
         return np.where(missed > 1e-8 * np.linalg.norm(rows, axis=1), np.inf, variance)
 
 
@@ -408,7 +409,7 @@ class Unknowns:
         self.root = np.asarray(np.linalg.qr(both, mode="r"))
 
     def found(self) -> KnownParameters:
-        """Return what is known by now."""
+        """Return the present knowledge."""
         R = self.root[: self.count, : self.count]
         U, sizes, V = np.linalg.svd(R, full_matrices=True)
         rank = int(np.count_nonzero(sizes > _FOUND * np.max(sizes, initial=0.0)))
@@ -418,14 +419,14 @@ class Unknowns:
 
 
 class Start(NamedTuple):
-    """A first state ``x = Z delta + x'``: delta (r,) quite unknown, x' of covariance P."""
+    """A first state ``x = Z delta + x'``: delta (r,) is unknown, x' has covariance P."""
 
     P: FloatArray
     Z: FloatArray
 
 
 def stationary_start(model: FilterModel) -> Start:
-    """Return the state before a record of a machine that has run for long, with u at rest."""
+    """Return the state before a record of a machine that ran for a long time, with u = 0."""
     # modes that are damped have the covariance of their stationary motion, `P = A P A' + Q`. Modes
     # on or outside the unit circle (rigid bodies, undamped ones) have none: their states x_r are
     # unknown parameters delta, without any prior. Others that follow them (such as late outputs) do
