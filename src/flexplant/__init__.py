@@ -15,7 +15,8 @@ From finite-element matrices and a measurement to the closed-loop error at a poi
                          close_loop(plant, *blocks) --> ClosedLoop --simulate--> Response
 
 Every model of one machine takes the same `Ports`: the drawing, the updated model, the truth. Each
-room below has its own page, ``help(fx.plant)``: what it is for, an example, its names elsewhere.
+room below has its own page, for example ``help(fx.plant)``: its purpose, an example, and the names
+of the same functions in other tools.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()

@@ -54,8 +54,8 @@ def _no_finite(array: npt.NDArray[Any], name: str, *, masked: bool) -> ModelErro
     finite = np.isfinite(array)
     if finite.all():
         return ModelError(
-            f"{name} has an entry of {array.flat[np.argmax(np.abs(array))]:.3g}: its powers are no "
-            "numbers of float64. Check its unit (SI)."
+            f"{name} has an entry of {array.flat[np.argmax(np.abs(array))]:.3g}: its powers "
+            "exceed the range of float64. Check its unit (SI)."
         )
     if not array.ndim:
         return ModelError(

@@ -95,7 +95,7 @@ class Certificate(Value, Mapping[str, float]):
         return all(check.holds is not False for check in self.checks)
 
     def __getitem__(self, what: str) -> float:
-        """Return the figure of a check; KeyError where there is no such check."""
+        """Return the figure of a check; KeyError where this check does not exist."""
         return {check.what: check.figure for check in self.checks}[what]
 
     def __iter__(self) -> Iterator[str]:

@@ -57,7 +57,7 @@ def columns_of(
                 rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
         except (UnicodeDecodeError, csv.Error) as error:
             raise LabelError(
-                f"{str(table)!r:.80} is no CSV file: {error}. Write it as text in UTF-8."
+                f"{str(table)!r:.80} is not a CSV file: {error}. Write it as text in UTF-8."
             ) from None
     else:
         rows = as_list(table, "a DOF table", "a CSV file or a list of mappings")
@@ -86,7 +86,7 @@ def _cell_number(row: Mapping[str, Any], column: str, line: int) -> float:
     except (TypeError, ValueError):
         raise LabelError(
             f"column {column!r} of the DOF table holds {row[column]!r:.60} in row {line} (from 0), "
-            "which is no number. Write it with a decimal point and no unit; coordinates are [m]."
+            "which is not a number. Write it with a decimal point and no unit; coordinates are [m]."
         ) from None
 
 

@@ -188,9 +188,7 @@ def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = ""
     """
     known = list(known)
     if not known:
-        return LabelError(
-            f"no {kind} {name!r}{f' in {owner}' if owner else ''}: there is none yet."
-        )
+        return LabelError(f"no {kind} {name!r}{f' in {owner}' if owner else ''}: none exists yet.")
     close = get_close_matches(str(name), [k for k in known if isinstance(k, str)], n=3, cutoff=0.5)
     shown = close or known[:6]
     listed = ", ".join(repr(label) for label in shown) + (

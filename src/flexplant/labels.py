@@ -188,7 +188,8 @@ class DofSet(Value):
         if row < 0:
             if self._dependent(label) is not None:
                 raise LabelError(
-                    f"DOF {label!r} is no row of the matrices: it follows others, by a joint. Its "
+                    f"DOF {label!r} is not a row of the matrices: it follows other DOFs, by a "
+                    "joint. Its "
                     "motion is row(label); name a DOF that is there, such as "
                     f"{self._label(0)!r}."
                 )

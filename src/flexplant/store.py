@@ -41,8 +41,8 @@ def _annotated(cls: type) -> Mapping[str, Any]:
 class Value(ABC):  # noqa: B024, kinds declare the abstract methods
     """A frozen dataclass whose arrays are read-only copies, also after pickling and loading.
 
-    What is no such field as its kind describes is refused at construction: by ShapeError where
-    sizes do not fit, LabelError where names do not, else by ModelError.
+    Construction refuses a field that does not fit its description: with ShapeError where sizes do
+    not fit, LabelError where names do not, otherwise ModelError.
     """
 
     registry: ClassVar[dict[str, type[Value]]] = {}
@@ -95,7 +95,8 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         def __getattr__(self, name: str) -> Any:
             """Say which attributes are near to one that is not there."""
             known = {n for cls in type(self).__mro__ for n in (*vars(cls), *_annotated(cls))}
-            if name.startswith("_") or name in known:  # one of its own that fails says why itself
+            # an existing property that fails raises its own error
+            if name.startswith("_") or name in known:
                 return object.__getattribute__(self, name)
             raise unknown_attribute(type(self).__name__, name, known - {"registry"})
 
@@ -217,8 +218,8 @@ def written(path: str | Path) -> Iterator[IO[bytes]]:
             f"the file {target} cannot be written ({error.strerror or error}): what it held before "
             "is kept. Make room, give the right to write, or name another folder."
         ) from error
-    finally:  # where it was written it is the file now
-        with suppress(OSError):  # there is none where none could be opened
+    finally:  # if it was written, it has been renamed to the file
+        with suppress(OSError):  # it does not exist if it could not be opened
             part.unlink()
 
 
@@ -370,7 +371,7 @@ def _decode(item: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 #: `name: text` or `name = text` after two spaces of indent, as values print what they hold; columns
-#: that two spaces set apart are none
+#: separated by two spaces are not entries
 _ENTRY = re.compile(r"^  (?! )((?:(?!  ).){1,48}?)(?:: | = )(\S.*)$")
 _CELL = "padding:.1em .8em .1em 0;text-align:left;vertical-align:top;border:0;background:none"
 

@@ -1,4 +1,4 @@
-"""Small numbers in words, each relative to what it is compared with; double precision has 2e-16."""
+"""Named tolerances, relative to what they are compared with; double precision: 2e-16."""
 
 from __future__ import annotations
 

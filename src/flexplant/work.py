@@ -147,7 +147,7 @@ class Checkpoint:
     def close(self) -> None:
         """Close the file, which ends its lock."""
         if self._file is not None:
-            with suppress(OSError):  # each line was written and flushed by itself
+            with suppress(OSError):  # each line was already written and flushed
                 self._file.close()
         if self._key is not None:
             _locked.discard(self._key)
@@ -194,7 +194,7 @@ class Checkpoint:
         self.header = found
         for line in lines:
             self.rows.update(_parsed_results(line.decode(errors="replace")))
-        if lines[-1]:  # cut off: what is appended has a line of its own
+        if lines[-1]:  # cut off: appended results start on a new line
             self._append(file, b"\n")
 
     def _append(self, file: IO[bytes], line: bytes) -> None:

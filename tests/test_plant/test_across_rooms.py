@@ -88,7 +88,7 @@ def test_a_fit_alone_opens_its_uncertainty():
 
 
 def test_a_reference_without_any_poi_says_so():
-    with pytest.raises(fx.errors.LabelError, match="there is none yet"):
+    with pytest.raises(fx.errors.LabelError, match="none exists yet"):
         fx.Ports(references=[fx.Reference("die")])
 
 

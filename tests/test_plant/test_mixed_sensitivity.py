@@ -52,7 +52,7 @@ def test_a_design_reaches_what_it_says_of_s_and_ks():
 
 
 def test_refusals():
-    with pytest.raises(ModelError, match="there is no weight"):
+    with pytest.raises(ModelError, match="no weight is given"):
         mixed_sensitivity(LAG)
     with pytest.raises(ModelError, match=r"weight S must be one by one or 1 by 1"):
         mixed_sensitivity(LAG, S=np.eye(2))

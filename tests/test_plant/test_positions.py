@@ -152,7 +152,7 @@ def test_refusals(modes):
     ):
         with pytest.raises(error, match=words):
             plant.at(**given)
-    with pytest.raises(LabelError, match=r"moves with 'x', which is none of the positions"):
+    with pytest.raises(LabelError, match=r"moves with 'x', which is not among the positions"):
         fx.Ports(y=[fx.Sensor("y", at=(0, 0, 0), moves={"x": (1, 0, 0)})])
     with pytest.raises(LabelError, match="is at a node: '1:z'"):
         fx.Sensor("y", at="1:z", moves={"x": (1, 0, 0)})

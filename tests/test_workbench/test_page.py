@@ -131,7 +131,7 @@ def test_undo_redo_keep_and_go_back(page):
 def test_what_is_wrong_is_said_and_the_last_good_design_stands(page):
     good, shown = page.design, page.views.sources["magnitude main"].data["y"]
     number = numbers(page, 1)["frequency"]
-    for text, said in (("3 kHz", "not below half the rate"), ("many", "is no frequency")):
+    for text, said in (("3 kHz", "not below half the rate"), ("many", "is not a frequency")):
         number.text.value = text
         assert page.message.visible
         assert said in page.message.object
@@ -280,7 +280,7 @@ def test_numbers_as_they_are_typed():
                         ("1e-3", 1e-3), ("2 ms", 2e-3)):  # fmt: skip
         assert parsed(text) == pytest.approx(value)
     for text in ("", "12 parsec", "1 2"):
-        with pytest.raises(fx.FlexplantError, match="is no number with a unit"):
+        with pytest.raises(fx.FlexplantError, match="is not a number with a unit"):
             parsed(text)
     notch = fx.Notch(100.0, depth=0.1, width=0.5)
     zeros, poles = (f for f in fields_of(notch, 1e3) if f.label.startswith("damping"))
@@ -415,7 +415,7 @@ def test_files_that_hold_a_plant(frf, tmp_path, capsys):
     assert main([str(tmp_path / "measured.npz")]) == 2
     assert "give --rate" in capsys.readouterr().err
     assert main([str(tmp_path / "none.npz")]) == 1
-    assert "there is no file" in capsys.readouterr().err
+    assert "does not exist" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -245,9 +245,10 @@ _PART = "It is a part of the value, below 1: try 0.05."
 class BranchAndBound(Search):
     """Branch and bound with convex relaxations: the optimum with a proof, or a gap.
 
-    The candidates are cut in groups of similar ones, and a branch holds the choices with so many
-    of each group. It is left where no choice in it can be better than the best one found; small
-    branches are screened by a lower bound of each choice. The start is that of `Exchange`.
+    The candidates are divided into groups of similar ones, and a branch holds the choices with a
+    given number from each group. A branch is discarded when none of its choices can be better than
+    the best one found; in small branches each choice is checked by its lower bound. The search
+    starts as `Exchange`.
 
     Parameters
     ----------
@@ -255,8 +256,8 @@ class BranchAndBound(Search):
         It ends when no choice can be better by more than this fraction of the value (a variance: of
         its root about half as much); 0 for the optimum.
     branches : int
-        It ends after opening so many, with the gap that was reached and a warning; 0 leaves the
-        exchanges at the start and the bound of the relaxation.
+        Largest number of branches to open; the search then ends with the gap that was reached and a
+        warning; 0 leaves the exchanges at the start and the bound of the relaxation.
     starts : int
         Starts of the exchanges, as in `Exchange`.
 
@@ -288,7 +289,7 @@ class BranchAndBound(Search):
             raise ModelError(
                 f"{problem.layouts.criterion!r} has no convex relaxation here, so nothing can be "
                 "bounded: it takes PoiVariance(own_modes=True), PoiLqr or ClosedLoopH2, "
-                "of ports without a filter or delay of their own. Use placement.Exhaustive() "
+                "of ports without a filter or delay. Use placement.Exhaustive() "
                 "or placement.Exchange()."
             )
         opened, stopped = 0, ""
@@ -400,7 +401,7 @@ class _Tree:
 
 
 def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Opened:
-    """Settle a small branch choice by choice, or cut it in parts with bounds of their own."""
+    """Check each choice of a small branch, or divide it into branches with new bounds."""
     branch = Branch(node.groups)
     # no choice in it satisfies the constraints or has a score
     if not problem.rows.possible(branch) or problem.layouts.missing(branch.members.tolist()):

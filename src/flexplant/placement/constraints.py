@@ -122,7 +122,7 @@ class LinearRows:
     def best(
         self, worth: FloatArray, count: int, required: Sequence[int]
     ) -> tuple[int, ...] | None:
-        """Return the choice of `count` with the largest sum of worth (N,); None if there is none.
+        """Return the choice of `count` with the largest sum of worth (N,); None if none exists.
 
         A mixed-integer linear program (HiGHS).
         """
@@ -169,7 +169,7 @@ class Constraint(Value):
 
 
 def check_limits(low: int | None, high: int | None) -> None:
-    """Raise ModelError when no count is within two limits; None is no limit."""
+    """Raise ModelError when no count is within two limits; None for no limit."""
     if low is not None and high is not None and low > high:
         raise ModelError(
             f"at_least {low} is above at_most {high}: no choice is both. Exchange them."
@@ -307,7 +307,7 @@ def _checked_zones(given: Any, name: str) -> tuple[Zone, ...]:
                 "fx.placement.Disc((0.3, 0.3), radius=0.05)."
             )
     if not listed:
-        raise ModelError(f"there is no zone: {name} is a Rectangle or a Disc. Give one.")
+        raise ModelError(f"no zone is given: give {name} a Rectangle or a Disc.")
     return tuple(listed)
 
 

@@ -267,9 +267,9 @@ class Convex(Scorer, ABC):
         """Return the cost at weights (N,); infinite where it has none."""
 
     def inner_tangent(self, branch: Branch, weights: FloatArray) -> Below | None:
-        """Return the tangent at weights of a branch moved slightly inwards; None if there is none.
+        """Return the tangent at weights of a branch moved slightly inwards; None if none exists.
 
-        A weight of zero has no part in the cost: a rigid-body mode might be missed.
+        A candidate of zero weight does not count in the cost: a rigid-body mode might be missed.
         """
         with attempted("a tangent within the branch", SolverError):
             return self.tangent(0.98 * weights + 0.02 * branch.centre(weights.size))
@@ -421,7 +421,7 @@ class Quadratic(Value, Convex):
         return cost, after, closed, adjoint, self.items @ after
 
     def _weighted(self, weights: FloatArray) -> FloatArray:
-        """Return g of the candidates with weights above zero, each times the root of its own."""
+        """Return g of the candidates with weights above zero, each times the root of its weight."""
         used = weights > 0
         return _square_root(np.sqrt(weights[used])[:, None] * self.items[used])
 

@@ -179,8 +179,8 @@ def noise_sizes(ports: Sequence[Any]) -> FloatArray:
     silent = [port.name for port, size in zip(ports, sizes, strict=True) if not size]
     if 0 < len(silent) < sizes.size:
         raise AssumptionError(
-            f"sensors {', '.join(silent[:6])} have no noise (asd 0) beside others that have some: "
-            "they would count without limit. Give all of them Sensor(..., asd=), or none."
+            f"sensors {', '.join(silent[:6])} have no noise (asd 0) while others have some: they "
+            "would count without limit. Give all of them Sensor(..., asd=), or none."
         )
     return divisor(sizes)
 

@@ -88,13 +88,12 @@ class ModeRows(LogDetOfSum):
 class ModeInformation(ByShapes):
     """Minus log det of the Fisher information of mode amplitudes, ``sum_i phi_i phi_i' / asd_i^2``.
 
-    One snapshot of the sensors, no dynamics, no disturbances: choices that distinguish the shapes
-    best. `RowSelection` searches for it by effective independence or pivoted QR, and it has a
-    bound. With fewer sensors than modes there is no information on all of them. It says next to
-    nothing of a POI: rankings of layouts by classical criteria (this one, Gramians, indices,
-    energy, MAC) had a Spearman correlation of -0.45 to 0.56 with that by the exact variance, on
-    plates. Where the POI matters, use
-    `PoiVariance`.
+    Finds choices that distinguish the mode shapes best, from one snapshot of the sensors, without
+    dynamics and disturbances. `RowSelection` searches for it by effective independence or pivoted
+    QR, and it has a bound. With fewer sensors than modes there is no information on all of them. It
+    hardly tells how well a POI is known: rankings of layouts by classical criteria (this one,
+    Gramians, indices, energy, MAC) had a Spearman correlation of -0.45 to 0.56 with that by the
+    exact variance, on plates. Where the POI matters, use `PoiVariance`.
 
     Parameters
     ----------

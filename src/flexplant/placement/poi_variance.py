@@ -226,7 +226,8 @@ class PoiVariance(Criterion):
         plant.check().require(("excited",), "a stationary Kalman filter")
         noise = plant.sensor_noise.diagonal()
         sizes = {name: noise[i] for i, name in enumerate(plant.y)}
-        if plant.model is not None:  # sensors of foreign matrices are rows, with noise of their own
+        # for matrices from elsewhere, sensors are rows and carry their own noise level
+        if plant.model is not None:
             sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
         require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
         if plant.model is not None:
@@ -235,17 +236,17 @@ class PoiVariance(Criterion):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
 
-        Delay lines of u are left out: their states are known exactly. Where ports have
-        filters or delays every choice has states of its own, and with modes left out the noise of
-        its sensors is correlated: each is a filter of its own, on rows of the plants with all
-        candidates. A prediction is ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's
-        motions some samples ago are states as well.
+        Delay lines of u are left out: their states are known exactly. Where ports have filters or
+        delays every choice has its own states, and with truncated modes the noise of its sensors is
+        correlated: each choice has its own filter, on rows of the plants with all candidates. A
+        prediction is ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's motions some
+        samples ago are states as well.
         """
         chosen = OnPlant(plant, "y", tuple(candidates), self)
         judge = None if self._own else chosen.whole.evaluation_plant
         if judge is not None:
             return OnBoth(chosen, judge)
-        read, system = sensors(chosen.whole), chosen.whole.system  # a reference is no sensor
+        read, system = sensors(chosen.whole), chosen.whole.system  # a reference is not a sensor
         at_once = [name for name in chosen.whole.w if name.removesuffix(":noise") not in read]
         if not plain(plant, candidates) or np.any(system.select(read, at_once).D):
             return chosen

@@ -177,8 +177,8 @@ class Placement(Value):
         No choice of as many candidates is better than this: the value itself when the optimum is
         proven (by every subset, or by branch and bound); else by convex relaxation, for mean
         squares (`PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, what wraps them)
-        where no port has a filter or delay of its own, and for log det; what all candidates reach
-        together for other sums; minus infinity for a callable.
+        where no port has a filter or delay, and for log det; for other sums the value of all
+        candidates together; minus infinity for a callable.
     evaluations : int
         Choices that were scored.
     history : tuple of tuples of float

@@ -129,7 +129,7 @@ def score_sensors(
     Raises
     ------
     ModelError
-        When the plant is not sampled or has no structure, a layout is empty or something is no
+        When the plant is not sampled or has no structure, a layout is empty or an entry is not a
         sensor.
     AssumptionError
         When the criterion has no meaning on this plant, whatever the sensors.
@@ -446,9 +446,7 @@ def sensor_map(
     where = candidate_places(plant, (*own, *tried))
     free = constraint_rows(constraints, where, "y").added(range(len(own)))[len(own) :]
     if not np.any(free):
-        raise ModelError(
-            "there is no point to try: give at least one that satisfies the constraints."
-        )
+        raise ModelError("no point can be tried: give at least one that satisfies the constraints.")
     places, tried = places[free], [sensor for sensor, kept in zip(tried, free, strict=True) if kept]
     zones = tuple(zone for item in all_of(constraints, "y") for zone in item.drawn(where))
     layouts = layouts_of(plant, "y", (*own, *tried), criterion)

@@ -337,7 +337,7 @@ def problem_of(
 def _candidate_ports(plant: StandardPlant, side: str, given: Sequence[Any]) -> tuple[Port, ...]:
     ports = tuple(known_candidates(plant, side, given).values())
     if not ports:
-        raise ModelError("there are no candidates: pass a list of at least one to choose from.")
+        raise ModelError("no candidates: pass a list of at least one to choose from.")
     if len(ports) != len(tuple(given)):
         raise LabelError("a candidate is listed twice: each may be chosen once.")
     return ports
@@ -346,7 +346,7 @@ def _candidate_ports(plant: StandardPlant, side: str, given: Sequence[Any]) -> t
 def _require_start(
     problem: Problem, constraints: Sequence[Constraint], places: Places, required: Sequence[str]
 ) -> None:
-    """Raise InfeasibleError when there is no choice to begin with."""
+    """Raise InfeasibleError when no choice satisfies the constraints."""
     layouts = problem.layouts
     first = problem.start(None) if len(problem.required) <= problem.count else ()
     what = f"no choice of {problem.count} of the {problem.total} candidates"
@@ -443,7 +443,7 @@ def pareto_curve(
     ModelError, LabelError, AssumptionError, CertificateError
         As `place_sensors`.
     InfeasibleError
-        When there is no choice for any amount.
+        When no choice exists for any amount.
 
     Examples
     --------
@@ -488,7 +488,7 @@ def pareto_curve(
             rows.append((float(amount), min(found, key=lambda one: one.value), low))
     if not rows:
         raise InfeasibleError(
-            f"there is no choice for any of the amounts {short(list(amounts))}. Give larger ones, "
+            f"no choice exists for any of the amounts {short(list(amounts))}. Give larger ones, "
             "or relax a constraint."
         )
     return ParetoCurve(

@@ -345,7 +345,7 @@ class OverPositions(Several):
     AssumptionError
         In a search, when at a position even all candidates miss a rigid-body mode.
     LabelError
-        When it is called on a plant without positions, or a name is none of them.
+        When it is called on a plant without positions, or a name is not one of them.
     ModelError
         When the measure is neither; when called, where a value is out of its range.
 

@@ -29,11 +29,9 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
   z (3) die:x  die:error  u1:effort
   y (2) y1  die:ref
 
-| channel | what it is |
-|---|---|
-| `die:x`, `die:ref` | a POI's axis, and what it shall follow |
-| `die:error`, `die:hat` | reference minus POI, and its estimate |
-| `y1:noise`, `u1:effort` | noise of a sensor, force of an actuator |
+| channel | meaning | |---|---| | `die:x`, `die:ref` | an axis of a POI, and the reference it shall
+follow | | `die:error`, `die:hat` | reference minus POI, and its estimate | | `y1:noise`,
+`u1:effort` | noise of a sensor, force of an actuator |
 
 White noise has the intensity asd^2 / 2, a sensor's sample the variance asd^2 rate / 2. Within a
 sample: measure, update, control, hold.

@@ -169,7 +169,7 @@ def _sigmas(plant: Partition, channels: Sequence[str], freq: Any, named: Any) ->
         missing = [name for name in channels if name not in named]
         if missing:
             raise LabelError(
-                f"there is no bandwidth of {', '.join(missing)}: give one for each axis, or a "
+                f"no bandwidth is given for {', '.join(missing)}: give one for each axis, or a "
                 "number for all."
             )
         found = [positive(freq[name], f"bandwidth of {name}") for name in channels]

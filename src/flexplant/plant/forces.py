@@ -44,9 +44,8 @@ class Disturbance(_PlacedForce):
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     direction : str
-        At points: x, y, z [N] or rx, ry, rz [N m].
-    asd : float [N/sqrt(Hz)]
-        One-sided amplitude spectral density of white noise; 0 for a force that is no noise.
+        At points: x, y, z [N] or rx, ry, rz [N m]. asd : float [N/sqrt(Hz)] One-sided amplitude
+        spectral density of white noise; 0 for a force that is not noise.
     shape : StateSpace, optional
         A stable filter that the channel goes through on its way to the structure: the asd is then
         that of the white noise at its input, and its states join the plant's.
@@ -147,7 +146,7 @@ class OutputDisturbance(ForcePort):
     Parameters
     ----------
     name, sensor : str
-        Of the channel, and of the sensor.
+        Names of the channel and of the sensor.
     asd : float [unit of the sensor/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     shape : StateSpace, optional
@@ -186,7 +185,7 @@ class Actuator(_PlacedForce):
     dynamics : StateSpace, optional
         Amplifier and motor, command to force: stable; its states join the plant's.
     latency : float [s]
-        Delay of the command by cable or bus, in seconds, besides the `delay` in samples of
+        Delay of the command by cable or bus, in seconds, in addition to the `delay` in samples of
         `discretized`. It acts exactly, also between samples, once the plant is sampled; a
         continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]

@@ -20,9 +20,9 @@ from .realisation import MODAL, ModalRealisation
 from .uncertainty.delta import Delta
 from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, changed_pairs
 
-#: places at which shapes of two meshes are compared, at most
+#: largest number of places at which the shapes of two meshes are compared
 _PLACES = 300
-#: draws refused in a row after which there is no such machine
+#: after this number of refused draws in a row an error says that no such machine was found
 _REFUSED = 50
 #: a drawn mode swings
 _MOST_DAMPING = 0.9

@@ -168,10 +168,10 @@ class PlantMachines:
 
 
 def interval_of(values: FloatArray, level: float = LEVEL) -> tuple[float, float]:
-    """Return the ends between which a log-normal figure of a further machine lies, from n drawn.
+    """Return the prediction interval of a log-normal figure of one more machine, from n drawn.
 
-    Of the logarithm it is ``mean +- t s sqrt(1 + 1 / n)``, Student's t with n - 1 degrees of
-    freedom.
+    For the logarithm the interval is ``mean +- t s sqrt(1 + 1 / n)``, Student's t with n - 1
+    degrees of freedom.
     """
     from scipy.special import stdtrit
 

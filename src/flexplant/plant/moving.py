@@ -35,7 +35,7 @@ class PortPath(Value):
     name : str
     points : (p, 3) array [m]
     channels : sequence of str
-        Of z for a POI, the one input of an actuator or disturbance.
+        Channels of z for a POI, or the one input of an actuator or disturbance.
     C : (p, channels, n) array
         A POI's rows over the plant's states: ``z = C[i] x + D[i] [w; u]`` while it is at point i.
     D : (p, channels, inputs) or (p, outputs, 1) array
@@ -218,9 +218,9 @@ class PositionMap(Value):
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str
-        The elastic modes; of a sampled plant those below half its rate.
+        The elastic modes; for a sampled plant those below half its sampling rate.
     figures : mapping {name: (...) array}
-        Figures of one's own.
+        Additional figures that you compute.
 
     Examples
     --------

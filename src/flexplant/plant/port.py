@@ -119,11 +119,11 @@ class ForcePort(Value):
 
 
 class SensorPort(Value):
-    """A port in y. A new kind has the fields below, and says by `row` or `see` what it measures.
+    """A port in y. A new kind has the fields below and defines by `row` or `see` what it measures.
 
-    By `row`, a displacement: that of a point beside another, say; with a `quantity` also its
-    velocity or acceleration. By `see`, anything that is linear in states and forces; `row` is then
-    what it shows at rest.
+    `row` gives a displacement, for example of one point relative to another; with a `quantity` also
+    its velocity or acceleration. `see` gives anything that is linear in states and forces; `row` is
+    then what the sensor shows at rest.
 
     Parameters
     ----------

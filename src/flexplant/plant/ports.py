@@ -377,13 +377,13 @@ class Ports(Value):
         return {name: unit for name, unit in found.items() if unit is not None}
 
     def poi(self, name: str) -> Poi:
-        """Return the POI of a name; LabelError when there is none."""
+        """Return the POI with this name; LabelError when it does not exist."""
         known = {poi.name: poi for poi in self.z}
         require_known("POI", [name], known)
         return known[name]
 
     def sensor(self, name: str) -> SensorPort:
-        """Return the sensor of a name; LabelError when there is none."""
+        """Return the sensor with this name; LabelError when it does not exist."""
         known = {sensor.name: sensor for sensor in self.y}
         require_known("sensor", [name], known)
         return known[name]

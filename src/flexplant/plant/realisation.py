@@ -98,7 +98,7 @@ class ModalRealisation(Value):
 
     @property
     def blocks(self) -> list[int]:
-        """Sizes of the diagonal blocks of A: 2 for each mode by itself, coupled ones as one."""
+        """Sizes of the diagonal blocks of A: 2 for each uncoupled mode, one for coupled ones."""
         b = self.pairs.shape[0]
         if self.coupling is None or not np.any(self.coupling):
             return [2] * b
@@ -163,7 +163,7 @@ def _at_once(model: ReducedModel) -> ModalRealisation:
     heavy, follow, flexibility = model.condensed()
     found = realise(heavy)
     values, vectors = np.linalg.eigh(flexibility)
-    # flexibilities beside the softest: what is left out is stiff enough to be rigid
+    # flexibilities relative to the softest: those left out are stiff enough to count as rigid
     kept = values > 1e-15 * values[-1]
     half = vectors[:, kept] * np.sqrt(values[kept])
     return found.replace(
@@ -176,8 +176,9 @@ def _at_once(model: ReducedModel) -> ModalRealisation:
 
 
 def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisation:
-    """Modal blocks where they hold the damping to working precision, the dense form else."""
-    # a mode that D damps by itself is a block whatever its damping: critical and overdamped too
+    """Modal blocks where they hold the damping to working precision, else the dense form."""
+    # a mode that D does not couple to others is a block for any damping, critical and overdamped
+    # too
     omega, r = real.omega, real.n_rigid
     if real.drags:
         why = f"dampers to ground drag rigid-body motion at up to {real.drag:.3g} 1/s"
@@ -218,7 +219,7 @@ def _worst_mode(real: RealForm, *, overdamped: bool = False) -> str:
 
 def _dense(model: Structure, real: RealForm, why: str) -> ModalRealisation:
     """Undamped modes, their velocities coupled by all of D."""
-    # rigid-body motions that D does not touch stay double integrators by themselves
+    # rigid-body motions that D does not damp stay separate double integrators
     r, C, phi = real.n_rigid, real.C.copy(), real.phi.copy()
     if r:
         size = PROPORTIONAL * max(float(np.abs(C).max()), TINY)
@@ -328,7 +329,7 @@ class ResidualForm(Value):
 
 @dataclass(frozen=True, eq=False)
 class FastStates(ResidualForm):
-    """Attachment vectors stay modes of their own, at their own high frequencies (the default).
+    """Attachment vectors stay separate modes at their own high frequencies (the default).
 
     The plant stays strictly proper between forces and displacements, so that it can be sampled
     without delay, filtered for white forces and simulated; it costs two states a vector.
@@ -345,11 +346,11 @@ class FastStates(ResidualForm):
 class Feedthrough(ResidualForm):
     """Attachment vectors, or all modes above a frequency, become their static flexibility.
 
-    Displacements then answer forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of what
-    was left out. Velocities and accelerations of that part are left out, being zero below its
-    frequencies. White forces then reach displacements directly (a sample would have infinite
-    variance: shape them for Kalman filters and simulation), and a simulation needs the delay of
-    at least a sample that every machine has.
+    Displacements then respond to forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of
+    the modes that were left out. Velocities and accelerations of these modes are neglected: they
+    are zero below the frequencies of these modes. White forces then reach displacements directly (a
+    sample would have infinite variance: shape them for Kalman filters and simulation), and a
+    simulation needs the delay of at least a sample that every machine has.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ class Position(Value):
     Raises
     ------
     LabelError
-        When the name is no Python identifier, which `at` takes as a keyword.
+        When the name is not a Python identifier: `at` takes it as a keyword.
     ModelError
         When the range is not increasing, or start lies outside.
 
@@ -85,7 +85,7 @@ class Position(Value):
 
 
 def values_over(positions: Sequence[Position], points: Any) -> dict[str, FloatArray]:
-    """Return the values of each position: given ones, or so many over its range."""
+    """Return the values of each position: the given ones, or a number over its range."""
     if isinstance(points, Mapping):
         require_known("position", points, [one.name for one in positions])
     return {one.name: _values(one, points) for one in positions}
@@ -267,7 +267,7 @@ def require_positions(ports: Sequence[Any], positions: Sequence[Position]) -> No
     for port, name in followed:
         if name not in known:
             raise LabelError(
-                f"{port.name!r} moves with {name!r}, which is none of the positions "
+                f"{port.name!r} moves with {name!r}, which is not among the positions "
                 f"({', '.join(known) or 'there are none'}). Name it and its range: "
                 f"Ports(..., positions=[fx.plant.Position({name!r}, range=(-0.1, 0.1))])."
             )

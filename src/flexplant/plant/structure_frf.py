@@ -48,9 +48,10 @@ class StructureFrf(Frf):
     check_freq : (c,) array [Hz]
         Where ``(K - omega^2 M + i omega D) q = f`` was solved with all of the matrices.
     error : (c,) array
-        Of the worst channel there, relative to the largest size that this channel has at all.
+        Error of the worst channel there, relative to the largest magnitude of this channel over all
+        frequencies.
     error_there : (c,) array
-        Of the worst channel, relative to its own size at this frequency.
+        Error of the worst channel, relative to its own magnitude at this frequency.
 
     Examples
     --------
@@ -131,14 +132,14 @@ def frequency_response(
         Damping of an FEModel, in place of its D. A Rayleigh is its matrix; modal damping is that
         of the modes and static shapes used; motions beyond them decay as the last mode does.
     checks : int
-        How many direct solutions of an FEModel; 0 for none.
+        Number of direct solutions of an FEModel that check the modes; 0 for none.
     tolerance : float
-        Of their difference, relative to the largest response of a channel.
+        Largest allowed difference, relative to the largest response of a channel.
 
     Returns
     -------
     Frf
-        Of a structure a `StructureFrf`, with the error that was found.
+        For a structure a `StructureFrf`, with the error that was found.
 
     Raises
     ------

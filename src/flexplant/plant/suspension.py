@@ -40,9 +40,10 @@ class GroundSpring(Value):
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     stiffness : float [N/m or N m/rad]
-        Of the spring; negative where a magnet attracts, as in reluctance actuators and maglev.
+        Stiffness of the spring; negative where a magnet attracts, as in reluctance actuators and
+        maglev.
     damping : float [N s/m or N m s/rad]
-        Of the damper beside it.
+        Damping of the damper in parallel with it.
     direction : str
         At points: x, y, z, rx, ry, rz.
 
@@ -117,20 +118,20 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     model : FEModel, ReducedModel or Modes
         Modes and reduced models are suspended within their own shapes, which for springs much
         softer than the structure is exact to the ratio of the two. Modes that a reduced model left
-        out are stiffened and damped each by itself.
+        out are stiffened and damped one by one.
     springs : GroundSpring or sequence
 
     Returns
     -------
     FEModel, ReducedModel or Modes
-        Of the same kind. Modes with damping become complex (springs couple what was damped mode
-        by mode), and attachment vectors are modes like the others then.
+        Model of the same kind. Modes with damping become complex (springs couple modes that were
+        damped one by one), and attachment vectors are then modes like the others.
 
     Raises
     ------
     ModelError
-        When there are no springs, the model is of another kind, or a suspension mode of Modes
-        would be overdamped; of complex ones also when one would be unstable.
+        When springs are missing, the model is of another kind, or a suspension mode of Modes would
+        be overdamped; for complex Modes also when one would be unstable.
 
     Examples
     --------
@@ -165,7 +166,7 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
 
 
 def _each(modes: Modes, springs: Sequence[GroundSpring]) -> Modes:
-    """Return modes that springs change each by itself: ``omega^2 + r k r'``, dampers likewise."""
+    """Return modes that springs change one by one: ``omega^2 + r k r'``, dampers likewise."""
     own = _Springs.of(modes, springs)
     size = np.abs(own.rows @ modes.phi) ** 2
     square = modes.omega**2 + own.stiffness @ size

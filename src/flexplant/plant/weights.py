@@ -41,7 +41,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i is while the machine rests with
     its POIs at their references, the other axes (`driven_axes`) at zero: ``G_yu T (G_zu T)^-1 r``
     at rest. On a free body this is its rigid-body motion. A controller that reads these errors has
-    one degree of freedom: what it does to a reference it does to a disturbance.
+    one degree of freedom: it responds to a reference as to a disturbance.
 
     A move bends the machine, so that its sensors are not where they are at rest, and the controller
     opposes the move. With an order the derivatives of the references correct y_i,ref: close the
@@ -86,8 +86,8 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
         raise AssumptionError(
-            f"there is no displacement sensor in y (its sensors: {kinds}): none of them shows "
-            "where the machine rests. Add Sensor(name, at=...)."
+            f"y has no displacement sensor (its sensors: {kinds}), so that none shows where the "
+            "machine rests. Add Sensor(name, at=...)."
         )
     driven = driven_axes(plant, freq=resting_frequency(plant), poi=poi)
     own = [(p, axis) for p, axis in ports.followed if p.channel(axis) in driven.channels]
@@ -159,7 +159,7 @@ def stage_weights(
         (`driven_axes`). Others are left out of z: they move with these. The first axis carries the
         scale.
     peak : float
-        Bound on |T| at u where gamma is 1; 1/W_S at high frequencies, beside 1 at f_c.
+        Bound on |T| at u where gamma is 1; value of 1/W_S at high frequencies (at f_c it is 1).
     disturbance, effort : float, optional
         Sizes of W_d f0^-1 and W_u f0 (before the division): the larger their product, the more
         |T| at u decides, and the less |S|. 3 and 3 when not given; 20 and 10 where frequencies are
@@ -177,9 +177,9 @@ def stage_weights(
     Raises
     ------
     AssumptionError, LabelError, ModelError
-        When there are no POIs, actuators or sensors, or the actuators do not move the axes apart;
-        when the name of the POI is unknown; when the plant was not assembled from a structure, or a
-        number is out of range.
+        When POIs, actuators or sensors are missing, or the actuators cannot move the axes
+        independently; when the name of the POI is unknown; when the plant was not assembled from a
+        structure, or a number is out of range.
 
     Examples
     --------
@@ -208,7 +208,7 @@ def stage_weights(
         )
     sizes = _Sizes.of(machine, driven_axes(machine, freq=crossing, poi=poi), 2.0 * np.pi * crossing)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
-    unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u beside peak
+    unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u relative to peak
     axes = {(p, axis): p.channel(axis) for p in ports.z for axis in p.axes}
     z: dict[str, Any] = {}
     w: dict[str, Any] = {}
@@ -306,8 +306,9 @@ def _capped(
 ) -> dict[str, float]:
     """Return the sizes of disturbances that move the axes as actuators do, bounded by their kind.
 
-    One that hardly moves the axes, such as a force on a heavy base, is no larger than an actuator's
-    of the same unit or the least of its kind; an acceleration of the floor is that of a unit axis.
+    A disturbance that hardly moves the axes, such as a force on a heavy base, is at most as large
+    as an actuator's of the same unit or as the smallest of its kind. An acceleration of the floor
+    is that of a unit axis.
     """
     found = {}
     for name, size in equal.items():
@@ -362,7 +363,7 @@ def mixed_sensitivity(
     Raises
     ------
     ModelError
-        When there is no weight, or a weight fits neither one channel nor all.
+        When no weight is given, or a weight fits neither one channel nor all.
 
     References
     ----------
@@ -383,8 +384,8 @@ def mixed_sensitivity(
         if weight is not None
     }
     if not weights:
-        raise ModelError("there is no weight: give at least one of S=, KS= and T=.")
-    # what each weight reads is an output of the loop of its own name
+        raise ModelError("no weight is given: give at least one of S=, KS= and T=.")
+    # each weight reads an output of the loop, which has the name of the weight
     p = len(g.outputs)
     refs, errors = ([f"{name}:{side}" for name in g.outputs] for side in ("ref", "error"))
     minus = StateSpace(

@@ -44,7 +44,7 @@ def parsed(text: str, unit: str | None = None) -> float:
     typed = found.group(2).lower() if found else ""
     if not found or typed not in _KINDS.get("any" if unit is None else unit, {*_UNITS, "db"}):
         of = {None: "number with a unit", "Hz": "frequency"}.get(unit, "number")
-        raise ModelError(f"{text!r} is no {of}. Type one such as 130, 1.2 kHz, 0.1 % or -20 dB.")
+        raise ModelError(f"{text!r} is not a {of}. Type one such as 130, 1.2 kHz, 0.1 % or -20 dB.")
     value = float(found.group(1))
     return float(10.0 ** (value / 20.0)) if typed == "db" else value * _UNITS[typed]
 

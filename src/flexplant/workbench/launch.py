@@ -313,7 +313,7 @@ def open_file(
     """
     file = Path(path)
     if not file.exists():
-        raise FileNotFoundError(f"there is no file {str(file)!r}.")
+        raise FileNotFoundError(f"file {str(file)!r} does not exist.")
     options: dict[str, Any] = {"quantity": quantity, "scale": scale}
     given = {name: value for name, value in options.items() if value is not None}
     said = "".join(f", {name}={value!r}" for name, value in given.items())
@@ -349,7 +349,7 @@ def open_file(
     if given and read is not reader:
         if scale is not None or quantity is None or not isinstance(value, Frf):
             raise ModelError(
-                f"{str(file)!r} is no universal file: it takes no scale, and as a plant no "
+                f"{str(file)!r} is not a universal file: it takes no scale, and a plant takes no "
                 "quantity. Leave them out."
             )
         value, line = value.converted(quantity), f"{line}.converted({quantity!r})"

@@ -232,7 +232,7 @@ class Page:
         try:
             freq = parsed(self.crossover.value, "Hz")
             if not self.loop.freq[0] <= freq <= self.loop.freq[-1]:
-                raise FlexplantError(f"{freq:g} Hz is no frequency of this plant's lines.")
+                raise FlexplantError(f"{freq:g} Hz is outside the frequencies of this plant.")
         except FlexplantError as problem:
             self.refuse(str(problem))
             return None

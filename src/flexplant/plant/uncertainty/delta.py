@@ -35,9 +35,9 @@ class MachineParts(Value):
     model : FEModel or ReducedModel, optional
         A model with other matrices, whose modes are then solved again in place of all the above.
     gains : mapping {str: float}
-        Of actuators and sensors, relative.
+        Changes of the gains of actuators and sensors, relative.
     late : float [samples]
-        What is added to the delay.
+        Change of the delay.
 
     Examples
     --------
@@ -105,9 +105,10 @@ class Delta(Value):
     Parameters
     ----------
     name : str
-        Of the channels: `mode6:freq` has the input `mode6:freq:w` and the output `mode6:freq:z`.
+        Prefix of the channel names: `mode6:freq` has the input `mode6:freq:w` and the output
+        `mode6:freq:z`.
     scale : float
-        Change at delta = 1: relative, of a parameter in its own unit, of the delay in samples.
+        Change at delta = 1: relative; for a parameter in its unit, for the delay in samples.
     mode : int
         Number of the mode, from 1, rigid-body modes included; 0 of what is not of a mode.
 
@@ -123,9 +124,9 @@ class Delta(Value):
     scale: float
     mode: int = 0
 
-    #: what it is of, for tables
+    #: the kind of quantity that changes, for tables
     kind: ClassVar[str] = ""
-    #: Deltas of a lower stage are opened, and change the machine, first
+    #: Deltas of a lower stage are applied first
     stage: ClassVar[int] = 1
     #: whether it changes the matrices or shapes of the plant's own model, not of a larger one
     of_own_model: ClassVar[bool] = False

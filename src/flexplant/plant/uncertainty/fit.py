@@ -61,8 +61,8 @@ class Fit(Uncertainty):
     LabelError
         When parameters are not those of the fit, or a mode is unknown.
     ModelError
-        When there is no covariance, the fit is of another model than the plant, or the uncertainty
-        covers negative stiffness or damping.
+        When the covariance is missing, the fit is of another model than the plant, or the
+        uncertainty covers negative stiffness or damping.
 
     Examples
     --------

@@ -25,7 +25,7 @@ class Known(NamedTuple):
     ----------
     deltas : sequence of Delta
     covariance : (m, m) array
-        Of the deltas as random numbers.
+        Covariance of the deltas as random numbers.
     drawn : sequence of Delta, optional
         What is drawn for a machine instead: the parameters of a fit, which move all modes and
         shapes.

@@ -156,9 +156,9 @@ def stated_by_mode(
     modes: Sequence[int] | None,
     factor: float = 1.0,
 ) -> list[ModeDelta]:
-    """Return Deltas of shares that are stated: one for all modes, an array, or {mode: share}."""
+    """Return Deltas of stated fractions: one for all modes, an array, or {mode: fraction}."""
     realisation, name = modal_realisation(plant), f"{kind.what} of a mode"
-    # negative stiffness, as of magnets, is no frequency; its modes are uncertain by name only
+    # modes of negative stiffness (magnets) have no frequency; they are uncertain by name only
     swing = [n for n in realisation.elastic if np.linalg.det(realisation.pairs[n - 1]) > 0]
     if isinstance(given, Mapping):
         chosen = list(given) if modes is None else list(modes)

@@ -14,7 +14,7 @@ from .neglected_dynamics import NeglectedModes, neglected_modes
 
 @dataclass(frozen=True, eq=False)
 class Neglected(Uncertainty):
-    """The modes that a plant lacks: one dynamic Delta under weights that bound what they do.
+    """The modes that a plant lacks: one dynamic Delta with weights that bound their effect.
 
     Machines that are drawn have these modes, with Deltas of modes on those of the same numbers;
     where parameters of the model are drawn, which are of the plant's own model, they have not.

@@ -27,7 +27,7 @@ Pair: TypeAlias = tuple[StateSpace, StateSpace]
 
 #: the weights lie this far above the largest difference found
 _MARGIN = 1.05
-#: offsets from a resonance, in its half widths, at which the bound is checked besides
+#: offsets from a resonance, in its half widths, at which the bound is checked as well
 _BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 
 
@@ -35,9 +35,9 @@ _BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 class NeglectedModes(Value):
     """``[z; y] = (G + W(s) Delta diag(1/scales)) [w; u]``, Delta stable and of gain at most 1.
 
-    One Delta for all that neglected modes do: from disturbances and actuators to points of
-    interest and sensors. That they reach a loop is its part from u to y, what they do to its
-    performance the others.
+    One Delta describes the whole effect of the neglected modes, from disturbances and actuators to
+    points of interest and sensors. Its block from u to y acts on the loop, the other blocks on the
+    performance.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def _resonance_grid(poles: ComplexArray) -> FloatArray:
 
 
 def _verifying(grid: FloatArray, poles: ComplexArray) -> FloatArray:
-    """Return frequencies between those of a grid, and others beside the resonances."""
+    """Return frequencies between those of a grid, and others near the resonances."""
     inner = [grid[:-1] + part * np.diff(grid) for part in (0.29, 0.5, 0.83)]
     own, half = np.abs(poles) / (2 * np.pi), -poles.real / (2 * np.pi)
     beside = own[:, None] + np.array([-0.43, 0.11, 0.57]) * half[:, None]
@@ -323,14 +323,14 @@ _SMOOTH = 20
 _STEPS, _BELOW = 40, 4.0
 #: relative: rounding of a sum in double precision
 _LOST = 1e-16
-#: a value of the curve below this part of what it is around is not followed; how far around
-#: that is, in logarithms
+#: a value of the curve below this fraction of its surroundings is not followed; the width of these
+#: surroundings, in logarithms
 _VALLEY, _WIDE = 1e-4, 0.1
 #: a resonance is worth its states when the curve stands this factor above its surroundings
 _PROMINENT = 3.0
 #: poles of a hump of unit frequency, and how far its two pairs are apart
 _HUMP, _APART = complex(-0.4, np.sqrt(1 - 0.4**2)), 1.1
-#: terms that add nowhere more than this part of the square of the weight are left out
+#: terms that add nowhere more than this fraction of the square of the weight are left out
 _NEGLIGIBLE = 1e-3
 
 
@@ -346,7 +346,7 @@ def covering(
     corners = np.geomspace(20 * np.pi * freq[1] / unit, 1.0, _SMOOTH)
     terms = [_Term(0, (pole,)) for pole in own]
     terms += [_Term(0, (corner * np.exp(0.75j * np.pi),)) for corner in corners[::2]]
-    # nothing at 0 Hz: beside many resonances that are not followed
+    # zero at 0 Hz: next to many resonances that are not followed
     terms += [_Term(2, (c * _HUMP, c * _APART * _HUMP)) for c in corners]
     x = (2 * np.pi * freq / unit) ** 2
     square = height**2
@@ -396,7 +396,7 @@ class _Term:
 
 
 def _peak_poles(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
-    """Return the poles at which the curve is far above what it is half an eighth away."""
+    """Return the poles at which the curve is far above its values half an eighth away."""
     at = np.log(np.maximum(freq, freq[1]))
     line = np.log(height + TINY)
     own = np.log(np.abs(poles) / (2 * np.pi))

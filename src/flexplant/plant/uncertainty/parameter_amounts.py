@@ -165,7 +165,7 @@ class Parameters(Uncertainty):
     Raises
     ------
     ModelError
-        When it is empty, a key is no parameter or an amount is not positive; when the plant was
+        When it is empty, a key is not a parameter or an amount is not positive; when the plant was
         not assembled from a model with matrices.
 
     Examples

@@ -25,8 +25,8 @@ _LARGEST = 0.05
 class DeltaChannels(NamedTuple):
     """``[blocks; z_Delta; neglected; z; y] = G [blocks; w_Delta; neglected; w; u]``, continuous.
 
-    Of a sampled plant G is its bilinear image, with the same gains and stability; the weights of
-    neglected modes are not in it: `neglected` has them.
+    For a sampled plant G is its bilinear image, with the same gains and stability. The weights of
+    neglected modes are not included: `neglected` holds them.
     """
 
     system: StateSpace
@@ -102,7 +102,7 @@ def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float])
     if plant.assembled.ports.latencies:
         raise ModelError(
             "Deltas on the parameters of a fit are sampled with one delay for all actuators, and "
-            "the ports of this plant have delays of their own. Model these by filters."
+            "some ports of this plant have their own delay. Model these by filters."
         )
     late = plant.delay + sum(
         delta.scale * values.get(delta.name, 0.0)
@@ -128,8 +128,8 @@ def _sampled_channels(uncertain: UncertainPlant[Any]) -> Opened:
         if any(machines[delta.name, end].states != base.states for end in (1.0, -1.0)):
             raise ModelError(
                 f"the delay of {uncertain.plant.delay:g} +- {delta.scale:g} samples passes a whole "
-                "number of samples, where what it does is not affine in it, so that no Delta "
-                "expresses it. Bound it on each side (1.1 +- 0.1 beside 0.9 +- 0.1), or draw "
+                "number of samples, where its effect is not affine in it, so that no Delta "
+                "expresses it. Bound it on each side (1.1 +- 0.1 and 0.9 +- 0.1), or draw "
                 "machines: uncertain.machines.plants."
             )
     slow = bilinear(base, rate)

@@ -123,8 +123,8 @@ class Shapes(Uncertainty):
     Parameters
     ----------
     directions : (m, n, r) array
-        Of each mode r directions over the n DOFs of the plant's modes, each a standard deviation
-        of the shape, independent (`flexplant.identification.shape_deviations`).
+        For each mode r directions over the n DOFs of the plant's modes, each an independent
+        standard deviation of the shape (`flexplant.identification.shape_deviations`).
     modes : sequence of m int
         Numbers of the modes, from 1, rigid-body modes included.
     deviations : float
