@@ -48,14 +48,14 @@ class Controller(Value):
     certificate : Certificate
         Numbers computed after the design by another computation.
     reached : mapping {str: float}
-        Of a weighted design: the norm from each group of w to each group of z, beside 1, which
-        is what the weights require; the largest is close to gamma. Of `design_lmi`: the norm of
-        each objective, in its own unit.
+        For a weighted design: the norm from each group of w to each group of z; the weights require
+        at most 1, and the largest is close to gamma. For `design_lmi`: the norm of each objective,
+        in its unit.
     left_out : SpillOver, optional
-        How the loop stands on the plant with the modes left out, where these are known.
+        Stability and margins on the plant with the truncated modes, where these are known.
     tolerances : ModeTolerances, optional
-        Of an uncertain plant: by what each mode may be off before the loop fails, beside what is
-        known of it, and machines drawn.
+        For an uncertain plant: the error of each mode at which the loop becomes unstable, compared
+        with its uncertainty; and machines drawn at random.
     notes : sequence of str
         What the certificate does not cover, and what else is worth knowing.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
@@ -133,9 +133,10 @@ class SynthesisMethod(Protocol):
         """Return a controller of the prepared problem."""
 
 
-#: the two norms agree to this part, and the claim holds to it
+#: the two norms agree to this relative accuracy, and so does the claimed value
 AGREEMENT = 1e-3
-#: half-widths beside a resonance where a gain is computed that no other search finds
+#: half-widths around a resonance where the gain is computed as well, for peaks that no other search
+#: finds
 _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 
 

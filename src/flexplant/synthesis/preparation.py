@@ -1,10 +1,10 @@
 """Plants made ready for synthesis: posed, scaled, and whether any controller stabilises them.
 
-Equations of machines in SI units (1e-9 m/N beside rates of 1e4 Hz) are hopeless as they stand.
-A sampled plant is mapped to continuous time (bilinear, norms are kept), time is scaled to the
-plant's own speed, states are balanced, and the channels are turned and scaled so that
-D12 = [0; I] and D21 = [0, I] where they have full rank. None of it changes a norm from w to z.
-The controller has a way back.
+Equations of machines in SI units (1e-9 m/N together with rates of 1e4 Hz) cannot be solved
+directly. A sampled plant is mapped to continuous time (bilinear, norms are kept), time is scaled to
+the plant's own speed, states are balanced, and the channels are turned and scaled so that D12 = [0;
+I] and D21 = [0, I] where they have full rank. None of it changes a norm from w to z. The controller
+has a way back.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Prepared(Value):
     y: Sequence[str]
     departure: float = 1.0
     direct: bool = False
-    #: point at the loop's speed: e^(j pi/4), or what it is in z for a problem that stays sampled
+    #: point at the loop's speed: e^(j pi/4), or its image in z for a problem that stays sampled
     point: complex = POINT
 
     @property
@@ -239,7 +239,7 @@ def posed(
     y: Sequence[str] | None,
     what: str,
 ) -> AnyPlant:
-    """Return the plant of a synthesis: u and y named where it has no names of its own."""
+    """Return the plant of a synthesis, with u and y given where it does not name them."""
     if u is None and y is None:
         plant: AnyPlant = plant_of(given)
     elif isinstance(given, StandardPlant | GeneralizedPlant):
@@ -302,9 +302,9 @@ def beyond_rounding(problem: Prepared) -> str:
     unstable = poles[poles.real > SPLIT * float(np.linalg.norm(problem.A, 2))]
     if not unstable.size:
         return (
-            "the plant is too badly conditioned. Weight z and w so that their sizes are alike "
-            "(metres beside newtons are not; stage_weights), or leave out states that u hardly "
-            "reaches or y hardly sees."
+            "the plant is too badly conditioned. Weight z and w so that their sizes are similar "
+            "(metres and newtons are not; see stage_weights), or remove states that u hardly "
+            "moves or y hardly shows."
         )
     growth = float(np.max(unstable.real))
     return _delay_effect(problem, growth) or (

@@ -14,8 +14,8 @@ from ..lti.riccati import RiccatiSolution, control_care, control_dare, filter_ca
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import RANK
 
-#: poles that were asked for and those that came may differ by this part of the largest: those of
-#: a multiplicity m are found to the root m of the rounding
+#: the placed poles may differ from the requested ones by this fraction of the largest: poles of
+#: multiplicity m are found to the m-th root of the rounding
 _PLACED = 1e-3
 
 

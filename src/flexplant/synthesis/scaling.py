@@ -17,8 +17,8 @@ from ..tolerances import SAME, TINY, divisor
 POINT = complex(np.exp(0.25j * np.pi))
 #: fraction of its terms that an answer has at least: what they cancel to may be rounding
 _HIDDEN = 1e-3
-#: effort or noise that is smaller, relative to the plant's own answer at the loop's speed, is not
-#: felt there: as much is added where there is none
+#: effort or noise that is smaller, relative to the plant's own response at the loop's speed, has no
+#: effect there: this amount is added where it is missing
 FELT = 1e-3
 #: relative to the fastest pole: where the search for the loop's speed ends. A double integrator has
 #: lost 14 digits there
@@ -26,8 +26,9 @@ _FAR = 1e7
 #: the same of a sampled plant [half the rate in rad/s, as mapped]: a third of the rate, since all
 #: answers are distorted above it
 THIRD = float(np.tan(np.pi / 3.0))
-#: points a decade of the search for the loop's speed, its start relative to the slowest pole (not
-#: a whole decade below it: an undamped pole is no point), and the factor a decade that is a fall
+#: points a decade of the search for the loop's speed, its start relative to the slowest pole (not a
+#: whole decade below it: no point may lie on an undamped pole), and the factor a decade that is a
+#: fall
 _POINTS, _START, _FALL = 8, 0.09, 2.0
 #: change of slope [factor a decade] that makes a corner of an answer. Efforts of 1e-3 to 1e-8 of
 #: the answers come within 1 % in 40 of 40 trials where the loop's speed is at most the last corner,
@@ -125,9 +126,9 @@ def _log_sizes(G: ComplexArray, m1: int, p1: int) -> FloatArray:
 
 def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank."""
-    # columns have unit size before the rank is taken, so that it does not depend on units. One that
-    # is not felt beside what the plant does on its channel at the loop's speed, `own` (m,), counts
-    # as zero, and `own` is its unit
+    # columns have unit size before the rank is taken, so that it does not depend on units. A column
+    # that is negligible against the plant's response on its channel at the loop's speed, `own`
+    # (m,), counts as zero, and `own` is its unit
     m = D.shape[1]
     sizes = np.linalg.norm(D, axis=0)
     felt = sizes > FELT * own
@@ -136,7 +137,7 @@ def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray
     sizes = np.zeros(m)
     sizes[: values.size] = values
     rank = int(np.count_nonzero(sizes > SAME))
-    # columns of Z: what D does not reach first, then what it does
+    # columns of Z: first the directions that D does not reach, then those it reaches
     Z = np.hstack([left[:, rank:], left[:, :rank]])
     S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))
     return Z, S / columns[:, None]

@@ -25,18 +25,18 @@ from ...tolerances import RANK, ROUNDING, divisor
 
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
 LANES = 4
-#: largest condition of the states' transformation: what rounding is multiplied with
+#: largest condition number of the states' transformation, which multiplies rounding errors
 _CONDITION = 1e7
-#: distances of poles [1], beside 1, within which they share a block, tried in turn; the last
-#: leaves the system as it is, in orthogonal states
+#: relative distances of poles [1] within which they share a block, tried in turn; the last leaves
+#: the system unchanged, in orthogonal states
 _NEAR = (1e-6, 1e-4, 1e-2, 0.1, np.inf)
 #: what the blocks may differ from the system, relative to the largest gain: in double precision
 #: (rounding times the condition), and in single, whose 24 bits a resonance of 1e-4 still stands
 _DOUBLE, _SINGLE = 1e-8, 1e-2
-#: how far rounding may have moved a pole, beside its distance from a frequency: the square, that
-#: of a double pole, is below the accuracy sought
+#: how far rounding may have moved a pole, relative to its distance from a frequency; its square,
+#: for a double pole, is below the required accuracy
 _MOVED = 3e-5
-#: a channel this far below the others of its output and input is not compared by itself
+#: a channel this far below the others of its output and input is not compared separately
 _SMALL = 1e-8
 
 
@@ -326,7 +326,7 @@ def _sections(g: StateSpace) -> FloatArray:
     shape = _root_product(poles, zeros, back)
     at = int(np.argmax(np.abs(wanted)))
     gain = float((wanted[at] / shape[at]).real)
-    # with a zero at z = 0 for each that is missing: so many samples too early
+    # with a zero at z = 0 for each missing zero: early by their number in samples
     sections = np.asarray(zpk2sos(zeros, poles, gain, pairing="nearest"), dtype=np.float64)
     late = len(poles) - len(zeros)
     for row in sections:
@@ -362,7 +362,8 @@ def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
     """Return why sections differ, and what helps: the product of their factors differs less."""
     if exact > _AGREEMENT:
         return (
-            "poles and zeros of so many states are lost to rounding. Reduce the controller first "
+            "with this number of states, rounding makes poles and zeros meaningless. Reduce the "
+            "controller first "
             "(reduce_controller)"
         )
     slow = float(np.abs(poles - 1.0).min()) / (2.0 * np.pi * dt)

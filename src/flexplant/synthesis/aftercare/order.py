@@ -295,8 +295,8 @@ def stable_before(plant: AnyPlant, controller: StateSpace) -> Any:
     facts = loop_facts(plant, controller)
     if not facts.is_stable:
         raise CertificateError(
-            f"the controller as given does not stabilise the plant ({facts.why}): "
-            "there is no loop to preserve. Is it the plant that it was made for?"
+            f"the controller as given does not stabilise the plant ({facts.why}), so its loop "
+            "cannot be preserved. Is it the plant that it was made for?"
         )
     return facts
 

@@ -42,7 +42,7 @@ from .moved_design import over_positions
 from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
-#: A beside its poles, from which on coordinates are blamed for a failure
+#: ratio of A to its poles above which a failure is attributed to badly scaled coordinates
 _MIXED = 1e3
 #: in the certificate: the upper bound of real mu of all uncertain frequencies together
 TOLERATED = "all frequencies at once"
@@ -87,19 +87,19 @@ def design_hinf(
         and a little disturbance where w or z misses an undamped mode. `Lmi()` needs neither and
         suits up to 30 states.
     bandwidth : float [Hz], optional
-        Of a stage that has no weights yet: those of `stage_weights` are used, for the POI's only
+        For a stage without weights: those of `stage_weights` are used, for the POI's only
         reference. `design_stage` finds the largest that holds.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     uncertain : UncertainPlant, optional
-        Of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: its frequencies are
-        tolerated; not needed where the plant is uncertain itself, or made of
-        ``uncertain.nominal`` by weights. Each mode gets a channel by which a change of its
-        frequency acts, scaled by the disturbances and with the shift of real mu, and the problem is
-        solved twice, the scales evened out in closed loop between. `gamma` is then with these
-        channels (above 1 is no failure), `certificate` has ``all frequencies at once``: below 1 no
-        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what
-        each may be.
+        Uncertainty of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: the design
+        tolerates its frequencies. Not needed where the plant itself is uncertain, or was made from
+        ``uncertain.nominal`` by weights. Each mode gets a channel through which a change of its
+        frequency acts, scaled by the disturbances and with the shift of real mu. The problem is
+        solved twice; in between, the scales are balanced in closed loop. `gamma` then includes
+        these channels (above 1 is not a failure). `certificate` has ``all frequencies at once``:
+        below 1, no machine of the uncertainty has a pole on the grid.
+        ``ClosedLoop.mode_tolerances`` gives the allowed error of each.
     damped_below : float [Hz]
         Uncertain modes below it that actuators push are damped, not only tolerated: their channel
         then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
@@ -201,7 +201,7 @@ def tolerant(
     share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
     return answer.replace(
         certificate=answer.certificate | {TOLERATED: share},
-        reached={},  # of the weights beside the channels of modes
+        reached={},  # of the weights, without the channels of modes
         tried={"before the scales were evened out": given.first, "after": answer.gamma},
         notes=(
             *answer.notes,
@@ -228,7 +228,7 @@ def evened(
 
 
 def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
-    """Return the controller that a method finds, not verified, and what it says of it."""
+    """Return the controller that a method finds, not verified, and the method's own results."""
     problem = prepared(plant.system, plant.u, plant.y)
     found = method.solve(problem)
     return problem.restored(found.A, found.B, found.C, found.D), found

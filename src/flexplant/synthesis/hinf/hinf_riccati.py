@@ -208,7 +208,7 @@ def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float
     if la.svdvals(loop)[-1] < _SLACK:
         where = "at half the rate" if problem.dt else "at infinite frequency"
         raise InfeasibleError(
-            f"there is no smallest gamma: {gamma:.3g} is reached, by infinite gain {where}, where "
+            f"gamma has no minimum: {gamma:.3g} is reached, by infinite gain {where}, where "
             f"u ({', '.join(problem.u)}) acts on y ({', '.join(problem.y)}) directly and cancels w "
             "in z at no cost. Weight the efforts in z, give the sensors noise in w, or give u a "
             "sample of delay or a low-pass."
@@ -259,7 +259,7 @@ class _Attempt(NamedTuple):
 
 
 def _attempt(problem: Prepared, gamma: float) -> _Attempt:
-    """Return the central controller for gamma, or why there is none."""
+    """Return the central controller for gamma, or why it does not exist."""
     # refuted means proved, not that the numerics failed: X or Y is indefinite, or rho(X Y) >
     # gamma^2
     known, dual = both_sides(problem)

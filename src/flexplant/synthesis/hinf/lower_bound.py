@@ -105,8 +105,8 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
 #: relative: errors of X and Y (their residuals are 1e-6), by which eigenvalues of X may be negative
 #: and rho(X Y) may exceed gamma^2; rounding of the terms of their equations
 _INACCURATE, _ROUNDED = 1e-5, 1e-14
-#: gamma is tried just below what a back-off of 5 % leaves, then at squares of that part until one
-#: is refuted; then intervals are halved to a relative width
+#: gamma is tried just below the value after a back-off of 5 %, then with squares of this fraction
+#: until one is refuted; then intervals are halved to a relative width
 _PART, _SQUARES, _WIDTH = 0.951, 8, 1e-3
 
 
@@ -159,7 +159,7 @@ class FullInformation(NamedTuple):
         values, vectors = la.eigh(X)
         if values[0] >= -_INACCURATE * max(values[-1], -values[0]):
             return False
-        # a residual of the equation moves X by itself over twice the slowest decay
+        # a residual of the equation moves X by the residual divided by twice the slowest decay
         x = vectors[:, 0]
         terms = np.sum(self.C**2) + 2.0 * np.linalg.norm(X @ x) * np.linalg.norm(self.A @ x)
         poles = la.eigvals(self.A + np.hstack([self.B1, self.B2]) @ F)

@@ -25,12 +25,12 @@ from ..controller import Controller
 from ..preparation import prepared
 from .lower_bound import pointwise_bound
 
-#: size of the channels beside the whole motion, where the search begins: they are for complex
-#: deltas, which allow for more than a real position
+#: size of the channels relative to the whole motion, at the start of the search: they are for
+#: complex deltas, which cover more than a real position
 _SIZE = 0.1
 #: halvings or doublings of a size or a scale, while they help
 _STEPS = 4
-#: what a bar counts, and how many there are at most: plants by themselves, then the search
+#: what the progress bar counts, and the largest number: single plants, then the search
 _DESIGNS, _MOST = "designs over the positions", 5 + 4 * _STEPS
 #: rows and columns that change by less, relative to the largest, do not move
 _STILL = 1e-9
@@ -113,9 +113,9 @@ def over_positions(
     progress: bool | None = None,
 ) -> Controller:
     """Return the controller whose worst norm over the positions is least of those tried."""
-    # tried are the mean plant and those at the ends and in the middle, each by itself; then the
-    # mean plant with a channel for each row and column that moves, `y = (C + delta dC) x` and
-    # `x+ = ... + (B + delta dB) u`, whose size and scale are searched
+    # tried are the mean plant and those at the ends and in the middle, one by one; then the mean
+    # plant with a channel for each row and column that moves, `y = (C + delta dC) x` and `x+ = ...
+    # + (B + delta dB) u`, whose size and scale are searched
     moving = PlantRange.of(given)
     search, motion = _Search(moving, design), _MotionChannels(moving)
     with Progress(_MOST, _DESIGNS, progress=progress):
@@ -254,7 +254,7 @@ class _MotionChannels:
 
 
 def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
-    """Return which rows change at all, each beside its own size."""
+    """Return which rows change at all, each relative to its own size."""
     size = np.abs(change).max(axis=1, initial=0.0)
     return np.flatnonzero(size > _STILL * np.abs(rows).max(axis=1, initial=0.0))
 

@@ -24,7 +24,7 @@ from ..controller import Controller, with_left_out
 from ..preparation import Prepared, prepared, require_reach
 from .lower_bound import both_sides
 
-#: corner of the integral action of the recipe, beside the bandwidth
+#: corner of the integral action of the recipe, relative to the bandwidth
 _INTEGRAL = 0.1
 #: claim and margin, and the smallest gamma by two computations, agree to this
 AGREEMENT = 1e-4
@@ -219,7 +219,7 @@ def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
     poles = _four_block(G, K).poles()
     pole = complex(poles[int(np.argmax(np.abs(poles) if G.dt else poles.real))])
     speed = abs(np.log(pole)) / G.dt if G.dt and pole else abs(pole)
-    # integrators come out of eigenvalues beside zero
+    # eigenvalues of integrators come out close to zero, not at zero
     rounding = 1e-9 * (1.0 / G.dt if G.dt else float(np.abs(poles).max()))
     speed = speed if speed > rounding else 0.0
     shifted = G.A - pole * np.eye(G.n_states)

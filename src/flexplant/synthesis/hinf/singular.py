@@ -260,7 +260,7 @@ def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: 
     if gammas[-2] > _FALL * gammas[-3] or gammas[-1] * _SETTLED > gammas[-2]:
         return
     raise InfeasibleError(
-        f"there is no smallest gamma: the infimum is 0. With noise and effort of "
+        f"gamma has no minimum: the infimum is 0. With noise and effort of "
         f"{found[0].level:.0e} to {found[least].level:.0e} added, {gammas[0]:.3g} to "
         f"{gammas[-1]:.3g} are reached by ever larger gains, with which u "
         f"({', '.join(problem.u)}) cancels w in z at no cost. {lack.words}. "

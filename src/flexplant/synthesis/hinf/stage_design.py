@@ -40,15 +40,15 @@ _CROSSES = 2.0 / 3.0
 #: relative difference between a stated bandwidth and where |S| crosses 1 that ends the search of
 #: weights, and the most designs that it takes: three or four suffice on plates and driven machines
 _REACHED, _DESIGNS = 0.01, 8
-#: first guess: |S| crosses 1 at this part of the first frequency that the actuators move
+#: first guess: |S| crosses 1 at this fraction of the first frequency that the actuators move
 _FIRST = 1.0 / 3.0
 #: factor between bandwidths tried, how many, and halvings of the last interval: 3 % of a bandwidth
 _STEP, _MOST, _HALVINGS = 1.3, 8, 2
-#: modulus margin that is kept with any one mode off, as a part of that of the plant itself
+#: modulus margin that is kept with any one mode off, as a fraction of the nominal one
 _KEPT = 0.875
-#: modes below so many times the bandwidth of the weights are damped, not only tolerated; more of
-#: them where the loop does not hold on machines drawn: a mode that is tolerated may hang on its
-#: shape (a margin of 0.43 became 0.33 on a machine by 1 % of other shapes in one mode's)
+#: modes below this multiple of the bandwidth of the weights are damped, not only tolerated; more of
+#: them where the loop is not stable on the machines drawn: a tolerated mode may depend on its shape
+#: (a margin of 0.43 became 0.33 on a machine by 1 % of other shapes in one mode's)
 _DAMPED = (3.5, 6.0)
 #: machines on which a loop must hold before it is promised
 _DRAWS = 20
@@ -82,10 +82,10 @@ def design_stage(
     Parameters
     ----------
     plant : StandardPlant or UncertainPlant
-        Of a machine that follows references, or of one that is held at rest where there is no
-        reference; continuous or sampled. A plant of which nothing is said is
-        taken with all its frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})``
-        and ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
+        Plant of a machine that follows references, or of one that is held at rest (without
+        references); continuous or sampled. A plant without stated uncertainty is taken with all its
+        frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})`` and
+        ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
     bandwidth : float [Hz], optional
         Bandwidth of the loop: where |S| from reference to error crosses 1 on the slowest axis. The
         weights are moved until it does, within 1 %; without a reference they are those of 1.5 times
@@ -205,7 +205,7 @@ class _StageTask:
             if one is None:
                 continue
             margin, drawn = self._judged(one.system)
-            if margin < self.margin:  # of the model itself: more damping is no cure
+            if margin < self.margin:  # of the model itself: more damping does not help
                 self.tried[one.bandwidth] = max(self.tried[one.bandwidth], margin)
                 break
             if drawn >= _KEPT * self.margin:
@@ -264,8 +264,8 @@ class _StageTask:
 
     def _judged(self, system: StateSpace) -> tuple[float, float]:
         """Return the modulus margin of a controller, and the least with its modes off."""
-        # the latter is 0 where a mode may not be off by itself. No further machine is drawn after
-        # one on which the loop does not hold
+        # the latter is 0 where a single mode off makes the loop unstable. No further machine is
+        # drawn after one on which the loop is unstable
         loop = self._loop(system)
         wholes = [] if self.whole is None else [loop.around(self.whole)]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
@@ -280,7 +280,7 @@ class _StageTask:
         return margin, least
 
     def _loop(self, system: StateSpace) -> ClosedLoop:
-        """Return the loop on the plant alone: what a rejected loop does is no news."""
+        """Return the loop on the plant alone: the evaluation of a rejected loop is not needed."""
         return close_loop(self.plant.replace(evaluation=None), self._block(system))
 
     def _block(self, system: StateSpace) -> StateSpace:

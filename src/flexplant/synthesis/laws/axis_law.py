@@ -21,13 +21,13 @@ from .law import Law, Section, product, tustin_s
 
 #: power of 1 / s of a mass's response
 _MASS = 2
-#: corner of the integrator beside the bandwidth
+#: corner of the integrator relative to the bandwidth
 _INTEGRATOR = 0.1
 #: ranges of the lead's zero below the bandwidth (not below the integrator), of its pole and of the
 #: low-pass above it, as factors; of a notch's depth and width
 _ZERO, _POLE, _ROLLOFF = (1.2, 10.0), (1.5, 60.0), (1.5, 60.0)
 _DEPTH, _WIDTH = (0.01, 1.0), (0.02, 1.0)
-#: loop gain at the last line, where the plant above it is unknown, beside that which holds |S|
+#: loop gain at the last line, above which the plant is unknown, relative to the gain that keeps |S|
 _BEYOND = 0.1
 #: how far a notch below the bandwidth may lie from a mode, as a factor
 _BESIDE = 1.3
@@ -144,7 +144,7 @@ class AxisLaw:
         """Return the least and largest numbers, and ``rows @ numbers <= most``, near some numbers.
 
         Pole, low-pass and notches end at the highest corner; a notch lies above the bandwidth, or
-        stays beside the mode that it is at.
+        stays close to its mode.
         """
         top = self.axis.ceiling
         leads = [_ZERO, _POLE] if self.axis.power == _MASS else [(1.0, 1.0), (1.0, 1.0)]
@@ -288,14 +288,15 @@ class AxisLaw:
 
 #: standard deviations of a line within which the response is taken to lie
 _DEVIATIONS = 2.0
-#: change between two lines, beside their size and in standard deviations, that is filled in
+#: change between two lines, relative to their size and in standard deviations, above which lines
+#: are added
 _STEP, _CLEAR = 0.15, 3.0
 #: lines over which an error is averaged, to either side
 _NEAR = 10
 #: resonances that may be notched, how far f^2 G rises above its median within a factor of
-#: frequency, and the part of a response that its error may be where a resonance is sought
+#: frequency, and the largest relative error of a response in which a resonance is sought
 _RESONANCES, _RISE, _WIDE, _KNOWN = 12, 2.0, 1.5, 0.3
-#: highest corner of a law beside the rate
+#: highest corner of a law relative to the rate
 _CORNER = 0.45
 
 
@@ -460,7 +461,7 @@ def _first(numbers: FloatArray) -> float:
 
 
 def near_lowest(room: FloatArray, most: int, level: float) -> IntArray:
-    """Return so many of the lowest local minima, those below a level, and the points about them."""
+    """Return at most `most` of the lowest local minima below a level, and their neighbours."""
     least = local_maxima(-room)[:most]
     near = (least[room[least] < level, None] + np.array([-1, 0, 1])).ravel()
     return np.asarray(near[(near >= 0) & (near < room.size)])

@@ -66,7 +66,7 @@ class Pid(SingleElement):
         integrator : float [Hz]
             Corner of the integral action; 0 without.
         zero, pole : float [Hz], optional
-            Of the lead; both or none.
+            Zero and pole of the lead; both or none.
         """
         k = number(gain, "gain")
         w_i = 2.0 * np.pi * positive(integrator, "integrator", zero=True)
@@ -246,7 +246,7 @@ class LowPass(SingleElement):
     order : {1, 2}
         Slope above it.
     damping : float
-        Of order 2; Butterworth unless given.
+        Damping ratio of order 2; by default that of a Butterworth filter.
 
     Examples
     --------

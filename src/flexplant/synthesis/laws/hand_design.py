@@ -64,7 +64,7 @@ class ShapedAxis(Value):
         elements: list[SingleElement] = []
         gain, on = self.gain, [flag(one, "on") for one in self.on]
         for element in given:
-            if isinstance(element, Law):  # its factors, each by itself
+            if isinstance(element, Law):  # its factors, one by one
                 elements += element.factors
                 gain *= element.gain
             else:
@@ -121,13 +121,14 @@ class LoopDesign(Value):
         Static transformations: commands of the axes to u, y to motions; none for a plant whose
         channels are axes.
     rate : float [Hz]
-        Of the controller; 0 when continuous.
+        Rate of the controller; 0 when continuous.
     delay : float
-        Of a measured plant: samples of delay beside what it shows.
+        For a measured plant: samples of delay in addition to those in the measurement.
     hold : bool
-        Of a measured plant: False when it was measured from sample to sample.
+        For a measured plant: False when it was measured from sample to sample.
     rigid, unstable : int
-        Of a measured plant: its rigid-body modes, and its poles outside the stability region.
+        For a measured plant: its number of rigid-body modes, and of poles outside the stability
+        region.
     references : mapping {axis: channel}
         References that axes follow. With feedforward an axis has one, ``axis:ref`` unless given.
     made_on : str

@@ -137,8 +137,8 @@ class LawElement(Value):
         """Return the law over a number."""
         if not isinstance(other, int | float | np.number) or not other:
             raise ModelError(
-                f"a law is divided by a number, not zero, got {short(other)}. The inverse of "
-                "an element is an element of its own: Notch(freq, depth=20), Lead(freq, 1 / ratio)."
+                f"a law is divided by a number, not zero, got {short(other)}. The inverse of an "
+                "element is another element: Notch(freq, depth=20), Lead(freq, 1 / ratio)."
             )
         return self.law * (1.0 / float(other))
 

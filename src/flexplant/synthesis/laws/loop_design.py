@@ -39,9 +39,9 @@ class DesignedLoops(Value):
     left_out : SpillOver, optional
         How the loop stands on a model with the modes left out, where these are known.
     notes : sequence of str
-        What is worth knowing.
+        Remarks on the design.
     tolerances : ModeTolerances, optional
-        Of an uncertain plant: by what each mode may be off before the loop fails.
+        For an uncertain plant: the error of each mode at which the loop becomes unstable.
     """
 
     system: StateSpace
@@ -134,17 +134,17 @@ def design_loops(
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or Frf
-        Of an assembled StandardPlant the axes are those that the actuators move (`decouple`),
+        For an assembled StandardPlant the axes are those that the actuators move (`decouple`),
         unless `before` and `after` are given.
     laws : Law or mapping {axis: Law}
         Error to command; one for all axes, or one each. Sampled at the rate of the plant.
     before, after : StateSpace or array, optional
         Static transformations: commands of the axes to u, y to motions of the axes.
     rate, delay, hold
-        Of an Frf: the rate of the controller (continuous unless given), its samples of delay, and
+        For an Frf: the rate of the controller (continuous by default), its samples of delay, and
         whether its hold is still to be applied, as for `in_axes`.
     rigid, unstable : int
-        Of an Frf: its rigid-body modes and its poles outside the stability region, as for
+        For an Frf: its number of rigid-body modes and of poles outside the stability region, as for
         `report_loops`.
     references : mapping {axis: channel of y}, optional
         References that an axis follows, such as ``{"die:z": "die:ref"}``.
@@ -237,7 +237,8 @@ def checked_laws(axes: Axes, laws: LawElement | Mapping[str, LawElement]) -> dic
         element = each[name]
         if not isinstance(element, LawElement):
             raise ModelError(
-                f"the law of {name!r} is no product of elements: {short(element)}. Pass a product "
+                f"the law of {name!r} is not a product of elements: {short(element)}. Pass a "
+                "product "
                 "of Pid, Lead, Notch and LowPass; a gain alone is Pid(gain)."
             )
         law = element.law

@@ -21,8 +21,8 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...store import Value
 from ...words import with_unit
 
-#: where integral action ends and where the lead is centred, as parts of the crossover: from a
-#: plant that lags by itself (1) to one that needs all the phase there is (30); lead of 0 to 67 deg
+#: where integral action ends and where the lead is centred, as fractions of the crossover: from a
+#: plant that lags anyway (1) to one that needs all available phase (30); lead of 0 to 67 deg
 _INTEGRAL, _LEAD = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0), (1.0, 1.5, 2.0, 3.0, 5.0)
 #: crossovers tried from the top, in each decade, and how many decades below the fastest
 _STEPS, _DECADES = 24, 6
@@ -45,7 +45,7 @@ class PidTuning(Value):
     gain : float
         k, in the unit of u over that of y.
     integral, lead, roll_off : float [Hz]
-        w_i, w_d and w_f over 2 pi; lead and roll-off are infinite where there is none.
+        w_i, w_d and w_f over 2 pi; lead and roll-off are infinite if unused.
     crossover : float [Hz]
         Where the loop gain is 1 for the first time.
     bandwidth : float [Hz]
@@ -93,15 +93,15 @@ def tune_pid(
     Parameters
     ----------
     plant : StateSpace, or a system of python-control or SciPy
-        Of any kind: with or without integrators, of either sign.
+        Any plant: with or without integrators, of either sign.
     bandwidth : float [Hz], optional
         Where the loop gain crosses 1; the largest that keeps the margin when not given. In
         continuous time nothing may limit it: then it is a thousand times the fastest pole.
     margin : float
         Modulus margin, between 0 and 1.
     rate : float [Hz], optional
-        Of the controller; the plant is then sampled exactly with its dead time. A controller in
-        continuous time when not given.
+        Rate of the controller; the plant is then sampled exactly with its dead time. By default the
+        controller is continuous.
     dead_time : float [s]
         From u to y; it needs a rate.
 
@@ -221,7 +221,7 @@ def _grid(g: StateSpace, freq: float) -> FloatArray:
     """Return frequencies [Hz] around a crossover, and those of the plant's modes."""
     top = 0.499 / g.dt if g.dt else freq * 10.0**_AROUND
     around = np.geomspace(freq / 10.0**_AROUND, top, 2 * _AROUND * _POINTS)
-    # beside a mode: on one without damping there is no response
+    # next to a mode, not on it: an undamped mode has an infinite response
     modes = (1.0 + 1e-3) * np.abs(continuous_poles(g).imag) / (2.0 * np.pi)
     return np.union1d(around, modes[(modes > around[0]) & (modes < top)])
 

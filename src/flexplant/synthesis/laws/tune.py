@@ -28,7 +28,8 @@ from .law import Axes, Law, decoupled, tustin_s
 from .loop_design import DesignedLoops, axes_of, made
 from .servo_loops import TARGET
 
-#: distance of a pole from zero frequency, beside the farthest, that counts as none
+#: distance of a pole from zero frequency, relative to the farthest pole, below which it counts as
+#: zero
 _ZERO = 1e-6
 
 
@@ -48,12 +49,12 @@ def tune_loops(
 ) -> DesignedLoops:
     """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
 
-    Of a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds a
-    law of each axis (PID, low-pass and notches), `design.report` its margins, `design.system` is
-    what `close_loop` takes and `write_c` exports. ``before=`` and ``after=`` decouple several axes,
-    as `decouple` finds. Where lines do not resolve a resonance, or have variance, the loop gain is
-    kept small. The best of many starts is returned, without proof that no other law does better,
-    and with a warning where the peak is not kept. How: `algorithms`.
+    For a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds
+    the law of each axis (PID, low-pass and notches), `design.report` its margins; `close_loop`
+    takes `design.system`, and `write_c` exports it. ``before=`` and ``after=`` decouple several
+    axes, as `decouple` finds. Where lines do not resolve a resonance, or have variance, the loop
+    gain is kept small. The best of many starts is returned, without proof that no other law does
+    better, and with a warning where the peak is not kept. How: `algorithms`.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def tune_loops(
         Rigid-body modes; unless given as many as axes, of a model those that it has. 0 on springs
         whose modes lie within the lines.
     notches : int
-        At most so many for each axis; one has to raise the bandwidth by 2 %.
+        Largest number of notches of each axis; each has to raise the bandwidth by 2 %.
     progress : bool, optional
         A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
@@ -394,10 +395,10 @@ _RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 4.0, 1e-6
 _LOWEST, _REACH = 12, 0.3
 #: distance kept beyond what is needed, to end with no less
 _SPARE = 2e-3
-#: steps down, and their factor, where the grid missed the very top of a peak; |S| beside the bound
-#: from which on that is no cure
+#: steps down, and their factor, where the grid missed the very top of a peak; |S| relative to the
+#: bound above which this does not help
 _DOWN, _LITTLE, _FAR = 5, 0.99, 1.05
-#: part of the bound on |S| from which on a frequency of the closed loop is added
+#: fraction of the bound on |S| above which a frequency of the closed loop is added
 _NEAR = 0.9
 
 

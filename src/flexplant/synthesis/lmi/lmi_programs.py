@@ -29,11 +29,12 @@ from ..preparation import Prepared
 #: A, B, C, D of a controller
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
-#: singular values below this part of the largest are none: channels are prepared to some 1e-12
+#: singular values below this fraction of the largest count as zero: channels are prepared to about
+#: 1e-12
 NULL = 1e-10
-#: part of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y
+#: fraction of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y
 APART = 0.6
-#: weight of the size of the controller's matrices beside the traces of X and Y
+#: weight of the size of the controller's matrices relative to the traces of X and Y
 MODERATION = 0.1
 #: settings of the solver's tolerances
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
@@ -84,7 +85,7 @@ class Plant(NamedTuple):
     def with_unit_channels(self) -> Plant:
         """Return the plant with u and y in units that make columns [B2; D12], rows [C2, D21] one.
 
-        What is not seen of noise or effort has no unit of its own.
+        A channel without visible noise or effort keeps its unit.
         """
         u_size = np.linalg.norm(np.vstack([self.B2, self.D12]), axis=0)
         y_size = np.linalg.norm(np.hstack([self.C2, self.D21]), axis=1)
@@ -140,7 +141,7 @@ class Plant(NamedTuple):
         )
 
     def size(self) -> float:
-        """Return a gamma of the plant's own size: its open gain beside its unit of frequency."""
+        """Return a gamma typical for the plant: its open gain near its unit of frequency."""
         shifted = (1.3 + 0.7j) * np.eye(self.A.shape[0]) - self.A
         gain = float(np.linalg.norm(self.C1 @ np.linalg.solve(shifted, self.B1) + self.D11, 2))
         bound = float(np.linalg.norm(self.C1) * np.linalg.norm(self.B1))
@@ -431,9 +432,9 @@ class Lmi(Value):
         Relative distance of the target from the smallest gamma, at which the controller's gains
         may be infinite. Doubled up to three times, to at most 5 %, where no controller keeps it.
     tolerance : float
-        Of the solver: gap and residuals, relative.
+        Tolerance of the solver: gap and residuals, relative.
     max_states : int
-        Larger problems are refused.
+        Largest number of states; larger problems are refused.
     progress : bool, optional
         A bar of these programs, as for `Riccati`.
 
@@ -534,8 +535,8 @@ class Lmi(Value):
         best = min(found, key=lambda one: abs(one.value - lower))
         if best.value < _NOTHING * guess:
             raise InfeasibleError(
-                f"there is no smallest gamma: the infimum is 0. {best.value:.3g} is reached, where "
-                f"the plant's own size is {guess:.3g}. u cancels w in z, at no cost. Weight the "
+                f"gamma has no minimum: the infimum is 0. {best.value:.3g} is reached; typical "
+                f"for this plant is {guess:.3g}. u cancels w in z, at no cost. Weight the "
                 "efforts in z, or give the sensors noise in w."
             )
         return best, lower

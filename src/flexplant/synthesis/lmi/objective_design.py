@@ -26,7 +26,7 @@ from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 
-#: rates of decay that are tried for peak gains, beside the plant's own speed
+#: rates of decay that are tried for peak gains, relative to the plant's own speed
 _RATES = (0.1, 0.3, 1.0, 3.0)
 #: steps from the best of them, the last one so small that the optimum is flat within it
 _STEPS = tuple(3.0 ** (0.5**i) for i in range(1, 4))
@@ -73,8 +73,8 @@ def design_lmi(
     Returns
     -------
     Controller
-        `gamma` is the verified norm of what was minimised, `reached` that of every objective,
-        the certificate holds the bound of the LMIs beside it.
+        `gamma` is the verified norm of what was minimised, `reached` that of every objective, the
+        certificate holds the bound of the LMIs for comparison.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most:
 
 
 def _balanced_plant(plant: AnyPlant) -> Plant:
-    """Return the plant in balanced states and units of its own, its w and z as they are."""
+    """Return the plant in balanced states and units, its w and z unchanged."""
     g = plant.system
     d = state_scale(g.A, g.B, g.C)
     m, p = len(plant.w), len(plant.z)

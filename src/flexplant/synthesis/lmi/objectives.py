@@ -314,8 +314,8 @@ def h2(v: Variables, channel: Channel, square: Any) -> list[Any]:
 
 def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
     """Return the LMIs of the star norm: peak to peak below gamma units, for one rate."""
-    # `x' P x` shrinks by the rate beside what |w| < 1 adds, so that x stays in an ellipsoid, and z
-    # is bounded there [Abedor1996]_. Of a sampled plant a step shrinks it by `1 - decay t`
+    # `x' P x` shrinks at this rate while |w| < 1 adds to it, so that x stays in an ellipsoid, where
+    # z is bounded [Abedor1996]_. For a sampled plant one step shrinks it by `1 - decay t`
     B, C, D = v.of(channel)
     z, w = D.shape
     n = v.P.shape[0]
@@ -519,7 +519,7 @@ class ObjectivePrograms:
         for tolerance in _ACCURACIES:
             settings = dict.fromkeys(TOLERANCES, tolerance)
             try:
-                # every claim is verified by the closed loop: a little violation is no harm
+                # every claim is verified with the closed loop: a small violation does no harm
                 solve_program(program, settings, violation=10.0 * tolerance)
                 return
             except SolverError:

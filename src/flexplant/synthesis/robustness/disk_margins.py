@@ -22,7 +22,7 @@ SKEWS = {"S-T": 0.0, "S": 1.0, "T": -1.0}
 #: heads of the two parts of the table
 _CLASSICAL = ("loop", "crosses 1 at [Hz]", "phase [deg]", "delay [ms]", "gain at [Hz]", "factor")
 _DISK = ("loop", "disk", "alpha", "at [Hz]", "gain [dB]", "phase [deg]", "reached by")
-#: divisions of a grid beside the largest size, as for the modulus margin
+#: refinements of the grid near the largest value, as for the modulus margin
 _ROUNDS = 6
 
 

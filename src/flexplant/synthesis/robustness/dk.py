@@ -126,7 +126,7 @@ def design_mu(
     AssumptionError, SolverError, InfeasibleError, CertificateError
         When no step gives a controller; see `design_hinf`.
     ModelError, LabelError
-        When `uncertain` is no uncertain plant, or channels are missing or unknown.
+        When `uncertain` is not an uncertain plant, or channels are missing or unknown.
 
     References
     ----------

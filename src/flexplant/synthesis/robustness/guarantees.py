@@ -60,8 +60,8 @@ class RobustStability(Value):
     values : mapping {str: float}
         The Deltas of that machine.
     machine : StandardPlant, optional
-        That machine, a little beyond its edge of stability; it can be simulated. None when it is
-        none that could exist (without stiffness or damping) or none was found.
+        That machine, a little beyond its edge of stability; it can be simulated. None when none was
+        found, or the one found could not exist (without stiffness or damping).
     frequencies, bounds : (k,) arrays [Hz, 1]
         Upper bounds at single frequencies; where they are not near the largest they need not be
         the smallest.
@@ -139,7 +139,7 @@ def robust_stability(
         ten modes. Where it is below 1 it is the answer; else the whole
         search follows.
     machines : int
-        How many are drawn, each Delta at an end of its interval.
+        Number of machines drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
         Of the machines and of the search for the worst.
     progress : bool, optional
@@ -186,7 +186,7 @@ def robust_stability(
     worst = None if upper < 1.0 else _worst(loop, found, upper, chance)
     values, machine, lower = _worst_machine(loop, worst)
     names = [name for name, _ in loop.channels.deltas]
-    # systems of many states are covered by sampling between the frequencies instead
+    # for systems of many states, samples between the frequencies replace the Hamiltonians
     beside = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
     if loop.dt:
         beside["distance of channels"] = loop.channels.distance
@@ -276,7 +276,7 @@ def _tried_on(
     rng: np.random.Generator,
     beside: Mapping[str, float],
 ) -> tuple[Certificate, SpillOver | None]:
-    """Return how stable machines at corners are, each closed exactly, and the modes left out."""
+    """Return how stable machines at corners are, each closed exactly, and the truncated modes."""
     size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
     for _ in range(count):
         ends = (size * rng.choice([-1.0, 1.0], len(names))).tolist()
@@ -393,7 +393,8 @@ def worst_case_gain(
     loop = uncertain_loop(uncertain, blocks, w=w, z=z)
     listed = [*loop.blocks, loop.performance]
     nominal, _ = peak_gain(loop.performed(uncertain.plant))
-    # in units of its size: a level of 1e-18, of 1e-9 m/N, is not resolved beside Deltas of one
+    # in units of its size: a level of 1e-18, from 1e-9 m/N, is not resolved next to Deltas of size
+    # 1
     size, g = nominal or 1.0, loop.system
     unit = np.ones((len(g.outputs), 1))
     unit[-loop.performance.z :] = 1.0 / size

@@ -63,9 +63,9 @@ class MuBounds(Value):
     lower : float
         The perturbation of size 1 / lower does; 0 when none was found.
     freq : float [Hz]
-        Where the upper bound is largest; NaN of a matrix.
+        Frequency where the upper bound is largest; NaN for a matrix.
     perturbation : (w, z) complex array
-        Of size 1 / lower, at the frequency where it acts; zero when none was found.
+        Perturbation of size 1 / lower, at the frequency where it acts; zero when none was found.
     frequencies, bounds : (k,) arrays [Hz, 1]
         Upper bounds that were computed at single frequencies; where they are not near the largest
         they need not be the smallest.
@@ -402,7 +402,7 @@ class Cover:
         return Interval(low, high)
 
     def _points(self, low: float, high: float, omega: float) -> FloatArray:
-        """Return frequencies in an interval, through and beside the resonances."""
+        """Return frequencies in an interval, at and around the resonances."""
         swing, width = self.poles.imag, np.abs(self.poles.real)
         beside = np.concatenate([-_BESIDE[:0:-1], _BESIDE])
         near = (swing[:, None] + width[:, None] * beside).ravel()

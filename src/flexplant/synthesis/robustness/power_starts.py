@@ -96,8 +96,8 @@ def power_iterations(
 
     The iteration of Young and Doyle for real and complex blocks together. The real Deltas of the
     first half of the starts are positive, those of the others have random signs; they may come out
-    inside their interval. It need not converge: what it gives is judged by what it does.
-    [Young1990]_; [PackardDoyle1993]_.
+    inside their interval. It need not converge: its result is judged by its effect. [Young1990]_;
+    [PackardDoyle1993]_.
     """
     blocks = _Structure(where)
     drawn = rng.standard_normal((count, 2, 2, M.shape[1]))

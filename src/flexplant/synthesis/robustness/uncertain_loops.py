@@ -250,7 +250,7 @@ def _nominal_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop:
 
 
 def require_uncertain(given: object) -> None:
-    """Raise ModelError when a value is no uncertain plant."""
+    """Raise ModelError when a value is not an uncertain plant."""
     if not isinstance(given, UncertainPlant):
         raise ModelError(
             f"need an UncertainPlant, got {short(given)}. Make it by plant.uncertain(fit), or "

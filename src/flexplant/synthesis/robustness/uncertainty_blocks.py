@@ -148,7 +148,7 @@ def _hermitian(size: int) -> ComplexArray:
 def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     """Return the squares d of a number for each block that even out ``d_i^(1/2) M_ij d_j^(-1/2)``.
 
-    Of one matrix or of each (n, z, w). Frobenius norms of the blocks stand for their largest
+    For one matrix or for each of (n, z, w). Frobenius norms of the blocks stand for their largest
     singular values [Osborne1960]_.
     """
     k = np.arange(len(where))

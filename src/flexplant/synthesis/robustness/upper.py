@@ -22,9 +22,9 @@ _GROWTH = 10.0
 _BACK = 0.15
 #: levels; relative distance of a level to what its centre reaches, at which it is the smallest
 _LEVELS, _SETTLED = 200, 2e-3
-#: G beside the trace of D times the size of M, from which on it is too large: all that G takes
-#: from M is Im M, where D of the blocks are alike; more lowers a bound by up to a few percent, and
-#: takes scalings that hold on shorter intervals
+#: G relative to the trace of D times the size of M, above which it is too large: G can only cancel
+#: Im M, where D of the blocks are similar; a larger G lowers a bound by up to a few percent, but
+#: its scalings hold on shorter intervals only
 WIDE, FREE = 1.0, 30.0
 #: a level this far below the size of M is zero
 _ZERO = 1e-10
@@ -55,7 +55,8 @@ def upper_level(
         return Certified(0.0, scalings.start)
     evened = scalings.scaled(scalings.start, osborne(M, scalings.places))
     tried = [evened, scalings.shifted(evened, M), *([] if start is None else [start])]
-    if scalings.skewed:  # the size of the leveled blocks' D beside the others' is known by trial
+    # the size of the leveled blocks' D relative to the others' is found by trial
+    if scalings.skewed:
         tried += [_leveled_by(scalings, one, 10.0**k) for one in tried[1:] for k in range(-8, 3)]
     reached, x = min(((reached_level(W, scalings, one), one) for one in tried), key=itemgetter(0))
     if not np.isfinite(reached):
@@ -94,7 +95,7 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
     found = upper_level(part, plain, enough=0.98)
     if found.level >= 1.0:
         return None
-    # D of the leveled blocks as small as they need to be beside those of the others
+    # D of the leveled blocks as small as necessary relative to those of the others
     own = centred(np.vstack([np.eye(plain.w), part]), plain, found.x, 1.0, steps=20)
     x = x.copy()
     for i, fro in zip(kept, plain.ranges, strict=True):
@@ -107,12 +108,12 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
 
 
 def _leveled_by(scalings: Scalings, x: FloatArray, factor: float) -> FloatArray:
-    """Return scalings whose leveled blocks' D is so many times larger."""
+    """Return scalings whose leveled blocks' D is larger by a factor."""
     return scalings.scaled(x, np.where(scalings.chosen, factor, 1.0))
 
 
 def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
-    """Return the smallest level for which F(x) >= 0: infinite where there is none."""
+    """Return the smallest level for which F(x) >= 0: infinite if none exists."""
     S0, S1 = scalings.matrix(x, 0.0), scalings.matrix(x, 1.0)
     fixed = _half(W.conj().T @ S0 @ W)
     grows = _half((S1 - S0)[: scalings.w, : scalings.w])
@@ -139,9 +140,9 @@ def centred(
     widest: float = WIDE,
 ) -> FloatArray:
     """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level."""
-    # where no real Delta at all closes the loop (M is complex beside a resonance) F grows with G
-    # without end, and scalings that hold at one frequency hold nowhere else: a square of G counts
-    # from `widest` times the trace of D and the size of M on
+    # where no real Delta makes the loop singular (M is complex near a resonance) F grows with G
+    # without limit, and scalings that hold at one frequency hold nowhere else: therefore a square
+    # of G is added above `widest` times the trace of D and the size of M
     slopes = _Slopes.of(scalings, scalings.coefficients(level))
     size = float(np.linalg.norm(W[scalings.w :])) * float(scalings.start @ x)
     wide = np.where(scalings.of_G, 1.0 / max(widest * size, TINY) ** 2, 0.0)

@@ -15,21 +15,21 @@ Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
 
 #: weak Wolfe conditions, and steps of their bisection
 _ARMIJO, _WOLFE, _BISECTIONS = 1e-4, 0.9, 30
-#: so many steps that gain less than this together end a search (less and less is
-#: gained where parameters grow without bound)
+#: number of steps whose total gain below this limit ends a search (the gain becomes ever smaller
+#: where parameters grow without bound)
 _STALLED, _GAIN = 8, 1e-4
-#: the first step, beside the size of the parameters
+#: the first step, relative to the size of the parameters
 _FIRST = 0.3
-#: part of the decrease of the model that a step has to reach; below and above which the model
+#: fraction of the decrease of the model that a step has to reach; below and above which the model
 #: is trusted less and more
 _ENOUGH, _POOR, _GOOD = 0.05, 0.3, 0.7
 #: factors of the damping after a step that is good, poor, refused with a new peak, and without
 _LESS, _MORE, _ANEW, _AGAIN = 0.2, 3.0, 2.0, 5.0
-#: refused steps after each other that end a search, and a decrease that is none
+#: number of refused steps in a row that ends a search, and a decrease that counts as zero
 _REFUSED, _SETTLED = 20, 1e-6
-#: shares below this are rounding
+#: fractions below this are rounding errors
 _SHARE = 1e-9
-#: small beside the rest of the quadratic program, large beside the rounding of its squares
+#: small against the rest of the quadratic program, large against the rounding of its squares
 _LIFT = 1e-3
 
 
@@ -80,7 +80,7 @@ def bfgs(
     spent: Callable[[], bool] = lambda: False,
 ) -> tuple[FloatArray, float]:
     """Return where BFGS with a weak Wolfe line search ends, and the value there."""
-    # stops below the value `enough`, after so many steps, and when `spent` is true
+    # stops below the value `enough`, after a number of steps, and when `spent` is true
     # [LewisOverton2013]_
     value, gradient = function(x)
     H, values = np.eye(x.size), [value]
@@ -139,7 +139,7 @@ def minimax(
     # each step minimises `max_i (f_i + g_i' d) + d' (|H| + mu I) d / 2`, H the Hessian of the
     # functions weighted as the step weights their gradients, |H| with its negative eigenvalues
     # turned round. A step that another peak refuses is tried again with the model of that peak, at
-    # x, and a larger mu. After so many steps, or when `spent` is true, it stops.
+    # x, and a larger mu. It stops after a number of steps, or when `spent` is true.
     # [ApkarianNoll2006]_
     value, _ = function.value(x)
     pieces, weights, mu = function.pieces(x), None, None

@@ -46,8 +46,8 @@ _QUARTER = 0.25
 _SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
 #: draws of a start until one is stabilised
 _DRAWS = 4
-#: decay [1] of drawn starts before the norm is lowered, in so many steps more: just stable, a
-#: loop has peaks that hide the others
+#: decay [1] of drawn starts before the norm is lowered, and the number of steps for it: a loop that
+#: is barely stable has peaks that hide the others
 _DECAYING, _DEEPER = 1e-2, 50
 #: radius around the end, relative, within which the report looks for a decrease
 _RADIUS = 1e-3
@@ -102,7 +102,8 @@ def design_structured(
     rng : int, SeedSequence or Generator
         Draws starts.
     evaluations : int
-        After so many closed loops of each plant the search ends with the best that it has.
+        Largest number of closed loops computed for each plant; the search then ends with the best
+        result so far.
     progress : bool, optional
         Show a bar; unless given, on a terminal after a while.
 
@@ -466,7 +467,7 @@ class _StructureSearch:
         return _End(found.value, found.x, decay, name, found.settled)
 
     def _minimised(self, family: ControllerFamily) -> FloatArray | None:
-        """Return the best parameters of another structure, from its first start and one beside it.
+        """Return the best parameters of another structure, from its first start and one near it.
 
         With a quarter of the evaluations that are left; None when it is not stabilised.
         """

@@ -91,9 +91,9 @@ class FixedOrder(Value):
     Parameters
     ----------
     order : int
-        States; 0 is a static gain.
+        Number of states; 0 for a static gain.
     pattern : (nu, ny) array of bool, optional
-        Of a static gain: which entries are free, the others are zero (decentralised feedback).
+        For a static gain: which entries are free; the others are zero (decentralised feedback).
     start : StateSpace, optional
         A controller y -> u to begin with, of this order; of an earlier design.
     direct : bool
@@ -276,8 +276,8 @@ class Parametrised:
     Parameters
     ----------
     make : function
-        Of an (n,) array; returns a StateSpace y -> u, always of the same order, sampled as the
-        plant is, and smooth in the parameters.
+        Function of an (n,) array that returns a StateSpace y -> u, always of the same order,
+        sampled like the plant, and smooth in the parameters.
     start : (n,) array
         Where the search begins; steps are taken in multiples of each entry (of 1 where it is 0).
     spread : float
@@ -319,9 +319,9 @@ class Parametrised:
 #: what an element may have free; the depth of a notch is not, unless it is named
 _NUMBERS = ("p", "i", "d", "pole", "freq", "ratio", "width", "damping", "depth")
 _FREE = _NUMBERS[:-1]
-#: logarithm of the farthest that a number moves
+#: logarithm of the largest factor by which a number changes
 _FARTHEST = 8.0
-#: highest corner beside half the rate; of a continuous plant beside its fastest pole
+#: highest corner relative to half the rate; for a continuous plant relative to its fastest pole
 _HIGHEST, _FASTER = 0.98, 10.0
 
 
