@@ -303,7 +303,7 @@ FAILURES = {
     "an infimum of zero": (
         *(collocated(), 0.0, None),
         [
-            r"no smallest gamma: the infimum is 0",
+            r"gamma has no minimum: the infimum is 0",
             r"u \(u0\) cancels w",
             "Weight the efforts in z and",
         ],

@@ -171,7 +171,7 @@ def test_what_does_not_go_together_is_refused():
         design_loops(frf, law(), after=axes["after"])
     with pytest.raises(ModelError, match=r"pass fx\.lti\.discretized\(plant"):
         design_loops(plant(), law(), rate=RATE)
-    with pytest.raises(ModelError, match=r"is no product of elements: 3.0.*is Pid\(gain\)"):
+    with pytest.raises(ModelError, match=r"is not a product of elements: 3.0.*is Pid\(gain\)"):
         design_loops(plant(), dict.fromkeys(["die:z", "die:rx", "die:ry"], 3.0))
     mass = StateSpace([[0, 1.0], [0, 0]], [[0], [1.0]], [[1.0, 0]], [[0]], inputs=["f"])
     with pytest.warns(FlexplantWarning, match=r"\(2 poles\) at 0.1592 Hz. Check sign"):

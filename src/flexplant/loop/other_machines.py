@@ -237,7 +237,7 @@ class ModeTolerances(Value):
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> fx.close_loop(plant, observer, servo).mode_tolerances()
-    <ModeTolerances of 2 modes: no frequency of a mode off by 5 % does harm
+    <ModeTolerances of 2 modes: stays stable if any one modal frequency shifts by 5 %
       mode      Hz  |S| at u of 2.86   unstable
       2     100.66         ->5 +>5 %  ->5 +>5 %
       3     174.35         ->5 +>5 %  ->5 +>5 %>

@@ -44,8 +44,9 @@ class Disturbance(_PlacedForce):
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     direction : str
-        At points: x, y, z [N] or rx, ry, rz [N m]. asd : float [N/sqrt(Hz)] One-sided amplitude
-        spectral density of white noise; 0 for a force that is not noise.
+        At points: x, y, z [N] or rx, ry, rz [N m].
+    asd : float [N/sqrt(Hz)]
+        One-sided amplitude spectral density of white noise; 0 for a force that is not noise.
     shape : StateSpace, optional
         A stable filter that the channel goes through on its way to the structure: the asd is then
         that of the white noise at its input, and its states join the plant's.
