@@ -28,7 +28,7 @@ of the same functions in other tools.
   driven: u1
   monitored: die:hat
   not judged on a larger model
-  no frequency of a mode off by 1 % does harm
+  stays stable if any one modal frequency shifts by 1 %
 
 **Conventions**
 
