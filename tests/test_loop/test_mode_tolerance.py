@@ -323,7 +323,7 @@ NOT_TO_TWO_PERCENT = pytest.mark.xfail(
     ],
 )
 def test_sensors_behind_filters_and_latencies(sensors):
-    """Machines that are unstable 1 % off, of which "stays stable if any one modal frequency shifts by 5 %" was said."""
+    """Machines that are unstable 1 % off, where 5 % was said to be safe for every mode."""
     model = fx.chain(
         masses=[2.0, 1.0, 0.5, 1.0], stiffnesses=[1e6, 4e5, 9e5], dampings=[3.0, 0.5, 6.0]
     )
