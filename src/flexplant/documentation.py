@@ -225,7 +225,7 @@ class _Site:
         room = short.pop(0) if short[0] in self.rooms else self.where.get(short[0])
         if room is None or (short and short[0] not in self.names[room]):
             return match[0]
-        # to the class of a member: pdoc would take ".member" in a link for a name of its own
+        # to the class of a member: pdoc would take ".member" in a link for a separate name
         place = f"#{short[0]}" if short else ""
         return f"[{match[0]}]({_HOME}flexplant/{room}.html{place})"
 

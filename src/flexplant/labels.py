@@ -326,7 +326,7 @@ class DofSet(Value):
             A DOF label, a point (interpolated between nodes), or a weighted sum of such,
             {label or (x, y, z): weight}.
         direction : str
-            The motion at points; a label carries its own.
+            Direction of the motion at a point; labels contain a direction.
         """
         row = np.zeros(len(self))
         if isinstance(at, str):

@@ -1,4 +1,4 @@
-"""Named tolerances, relative to what they are compared with; double precision: 2e-16."""
+"""Named tolerances, relative to the compared quantity; double precision: 2e-16."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def read_model(
     Raises
     ------
     FileNotFoundError
-        When there is no such file, as with every reader.
+        When the file does not exist, as with every reader.
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError

@@ -63,8 +63,9 @@ def read_frf_uff(
     path : str or Path
         A .uff, .unv or .uf file. Needs pyuff: pip install 'flexplant[uff]'.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the outputs shall be. Records that name their quantity are converted, those that do not
-        are taken as this. When not given, all must be of one kind.
+        Wanted quantity of the outputs. Records that name their quantity are converted; the
+        others are assumed to have this quantity. By default all records must have the same
+        quantity.
     scale : float, optional
         Factor that brings the numbers to SI (m, m/s or m/s^2 per N), where the file's units are
         not clear; otherwise it follows from the labels of the axes and dataset 164.

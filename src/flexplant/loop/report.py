@@ -42,7 +42,7 @@ class LoopMargins(Value):
         more.
     gain_margin, gain_reduction : float
         Factors on the gain, above and below 1, at which the loop reaches the critical point;
-        infinite and 0 if there is no such factor.
+        infinite and 0 if no such factor exists.
     phase_margin : float [deg]
         Smallest phase margin at the crossovers, lead or lag; 180 without a crossover. For an
         unstable loop this and the others are distances to the critical point, not margins.

@@ -28,7 +28,8 @@ def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> St
     sys : StateSpace, or a system of python-control or SciPy
         Sampled.
     method : {"hold", "tustin"}
-        What made it, or how a controller is to be read.
+        Method with which the system was sampled, or by which a controller is to be
+        converted.
 
     Returns
     -------
@@ -95,7 +96,7 @@ def resampled(
     sys : StateSpace, or a system of python-control or SciPy
         Sampled.
     rate : float [Hz]
-        The new one.
+        New sampling rate.
     method : {"hold", "tustin"}
         As in `continuous`, for both ways.
 

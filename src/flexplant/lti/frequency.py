@@ -453,7 +453,7 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     sys : StateSpace or control.StateSpace
         Continuous or sampled, stable or not.
     freq : (n_freq,) array [Hz], optional
-        Increasing. When not given: a grid refined at resonances and antiresonances
+        Frequencies, increasing; by default a grid refined at resonances and antiresonances
         (`default_freq`).
 
     Returns

@@ -130,7 +130,8 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
 def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[int]]:
     """Return real eigenvectors (n, n), the block-diagonal A and its blocks, slow poles first."""
     eye = np.eye(A.shape[0])
-    # a slow mode is not a rigid-body mode, even beside fast modes: rounding decides which may be
+    # a slow mode is not a rigid-body mode, even if other modes are fast: rounding decides which may
+    # be
     values, vectors, error = eigenvalues_with_error(A)
     near = np.abs(values - centre) <= error
     columns, parts = [np.zeros((A.shape[0], 0))], []

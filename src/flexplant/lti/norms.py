@@ -159,7 +159,7 @@ def _peak_gain(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[f
 
 
 def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None:
-    """Return the peak proved from residues, None where there is no proof."""
+    """Return the peak proved from residues, None without a proof."""
     if model is None or not model.poles.size:
         return None
     found = proved_peak(model, TOLERANCE)

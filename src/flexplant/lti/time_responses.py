@@ -179,7 +179,7 @@ def lsim(
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
     u : (n_in, n_time) or (n_time,) array
-        In the units of the inputs; a single row where there is one input.
+        Inputs in their units; a single row for one input.
     time : (n_time,) array [s]
         Equidistant from 0.
     start : (n,) array, optional

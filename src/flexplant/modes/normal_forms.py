@@ -381,7 +381,7 @@ def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
 
 def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray, ComplexArray]:
     """Return all poles (2k,) and eigenvectors (2k, 2k) of the states ``(|Omega| p, p')``."""
-    # all entries are rates; slow modes beside strong damping are large eigenvalues of the inverse
+    # all entries are rates; slow modes with strong damping are large eigenvalues of the inverse
     none, size = np.zeros((omega.size, omega.size)), np.abs(omega)
     if low and np.all(omega > 0):
         soft = C / np.outer(omega, omega)

@@ -332,8 +332,8 @@ def static_response(model: Any, loads: FloatArray) -> FloatArray:
     except la.LinAlgError as error:
         raise ModelError(
             f"K is singular beyond the {counted(r, 'rigid-body motion')} of the geometry (a "
-            "mechanism, a DOF without stiffness, or wrong coordinates): there is no static "
-            "response."
+            "mechanism, a DOF without stiffness, or wrong coordinates), so that the static "
+            "response does not exist."
         ) from error
     response = np.zeros_like(balanced)
     response[free] = la.cho_solve(factor, balanced[free] / size) / size

@@ -131,10 +131,10 @@ class RowSelection(Search):
     Parameters
     ----------
     method : SelectionCriterion
-        EffectiveIndependence (when not given) leaves out the candidate of least
-        ``E_i = phi_i' F^-1 phi_i`` again and again, with the information ``F = sum phi_i phi_i'``:
-        without it the determinant of F is ``1 - E_i`` times as large. PivotedQr and Greedy take
-        one after the other; when all modes are covered, they begin anew among the rest.
+        EffectiveIndependence (the default) repeatedly removes the candidate of least ``E_i
+        = phi_i' F^-1 phi_i``, with the information ``F = sum phi_i phi_i'``: without it the
+        determinant of F is ``1 - E_i`` times as large. PivotedQr and Greedy add one after
+        the other; when all modes are covered, they start again with the rest.
     driving_point : bool
         Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
         that places that move little are left out first (EfI-DPR).

@@ -410,7 +410,7 @@ def sensor_map(
     asd : float [m/sqrt(Hz), ...]
         Noise of the new sensor, as in `Sensor`.
     direction, quantity : str
-        What it measures, as in `Sensor`.
+        Direction and quantity that it measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
         As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
         a POI is, unless OffPoi(-1) is among them.

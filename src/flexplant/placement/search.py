@@ -73,8 +73,8 @@ def place_sensors(
         What every choice satisfies: Excluded, OffPoi, ZoneLimits, MinimumDistance,
         Among, Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
     method : Search, optional
-        Exchange, BranchAndBound, Exhaustive or ByRows. Every subset where there are at most 1500,
-        else `Exchange()`, when not given.
+        Exchange, BranchAndBound, Exhaustive or ByRows. By default every subset is tried if
+        there are at most 1500, otherwise `Exchange()`.
     executor : concurrent.futures.Executor, optional
         Works on starts, chunks of subsets or branches; the result is the same to the bit. When a
         process of a pool dies, its part is done once more.
@@ -82,9 +82,10 @@ def place_sensors(
         A file that keeps each part of the work as it comes. With a file that exists the search goes
         on where it was stopped, also after being killed.
     progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
     rng : int, SeedSequence or Generator, optional
-        For the random starts.
+        Random generator of the random starts, or its seed.
 
     Returns
     -------

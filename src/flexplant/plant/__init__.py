@@ -5,11 +5,13 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 
 - `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
-- `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` has a set of them.
-- `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is not known, opened
-  as Deltas and drawn as machines; a kind of one's own derives from `Uncertainty`. Dynamics that
-  the model lacks: `Neglected` modes, `UnmodelledDynamics(weight, at="u1")`.
-- `decouple`: the axes that the actuators move (`gravity_axes`: of a free body, with its mass);
+- `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes a set of
+them.
+- `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is uncertain, as Deltas
+for analysis and as machines drawn at random; your own kind of uncertainty derives from
+`Uncertainty`. Dynamics that the model lacks: `Neglected` modes, `UnmodelledDynamics(weight,
+at="u1")`. - `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body,
+with its mass);
   `frequency_response` of structures between their ports.
 
 >>> import flexplant as fx

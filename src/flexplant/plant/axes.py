@@ -81,8 +81,9 @@ def driven_axes(
     plant : StandardPlant
         Continuous or sampled, of any origin.
     freq : float or mapping {channel: float} [Hz], optional
-        Where each axis is decoupled, its bandwidth; a hundredth of the rate when not given, of a
-        continuous plant a fifth of the frequency of its slowest oscillation.
+        Frequency at which each axis is decoupled: its bandwidth. By default a hundredth of
+        the rate, for a continuous plant a fifth of the frequency of its slowest
+        oscillation.
     axes : sequence of str, optional
         Channels of z or y. When not given all axes of the POIs where the actuators move them
         independently, else those of the POIs that have a reference, else those with a reference.

@@ -44,7 +44,8 @@ class Disturbance(_PlacedForce):
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     direction : str
-        At points: x, y, z [N] or rx, ry, rz [N m].
+        Direction of the force at a point: x, y, z [N] or rx, ry, rz [N m]. Labels contain a
+        direction.
     asd : float [N/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for a force that is not noise.
     shape : StateSpace, optional
@@ -88,7 +89,7 @@ class BaseAcceleration(ForcePort):
     ----------
     name : str
     direction : str
-        x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
+        Direction of the acceleration: x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
     asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     shape : StateSpace, optional
@@ -376,7 +377,7 @@ class RigidForce(ForcePort):
     ----------
     name, asd, shape : as for `Disturbance`
     direction : str
-        x, y, z [N] or rx, ry, rz [N m].
+        Direction of the force: x, y, z [N] or rx, ry, rz [N m].
 
     Examples
     --------

@@ -102,7 +102,7 @@ class PlantMachines:
         count : int
             Number of machines.
         rng : int, SeedSequence, Generator or None
-            What seeds them.
+            Random generator of the machines, or its seed.
 
         Raises
         ------

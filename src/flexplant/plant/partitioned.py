@@ -421,9 +421,9 @@ class Partition(PartitionedSystem):
         sys : StateSpace or control.StateSpace
             With named channels.
         u, y : sequences of str, optional
-            Inputs that the controller drives, outputs that it reads. Both may be left out when
-            the channels are named like those of an assembled plant (`u1:effort`, `y1:noise`,
-            `die:z`, `die:ref`), as those of `plant.to_control()` are.
+            Inputs that the controller drives, and outputs that it reads. Both may be
+            left out when the channels are named like those of an assembled plant
+            (`u1:effort`, `y1:noise`, `die:z`, `die:ref`), as in `plant.to_control()`.
         w, z : sequences of str, optional
             Disturbances and performance; the remaining channels when not given.
         asd : mapping, optional

@@ -137,7 +137,7 @@ class SensorPort(Value):
     latency : float [s]
         Delay of the signal, in seconds.
     quantity : {"displacement", "velocity", "acceleration"}
-        What is measured.
+        Measured quantity.
     absolute : bool, optional
         Whether the motion of the ground is part of it; that of accelerations when not given.
 

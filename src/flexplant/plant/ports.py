@@ -31,10 +31,10 @@ class Sensor(SensorPort):
         The channel's name; its noise is the channel `name:noise` of w.
     at, direction, moves : as for `Disturbance`
     quantity : {"displacement", "velocity", "acceleration"}
-        What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
-        that reaches it would give its samples infinite variance, which Kalman filters and
-        simulation refuse: shape the disturbance, let it be held over each sample
-        (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
+        Measured quantity. An acceleration responds to forces at once (D21, D22). A white
+        disturbance that reaches it would give its samples infinite variance, which Kalman
+        filters and simulation refuse: shape the disturbance, let it be held over each
+        sample (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has variance
         asd^2 rate / 2. It is added to the samples, after dynamics and latency; what passes through

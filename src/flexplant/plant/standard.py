@@ -86,8 +86,9 @@ class StandardPlant(Partition):
         ----------
         rate : float [Hz]
         delay : float [samples]
-            From a measurement to the moment the actuators answer it; any fraction. A delay of at
-            least one sample leaves the controller the whole interval to compute.
+            Delay from a measurement to the reaction of the actuators, including
+            fractions. With at least one sample of delay the controller has the whole
+            interval to compute.
 
         Returns
         -------
@@ -181,7 +182,7 @@ class StandardPlant(Partition):
         Parameters
         ----------
         w, u, z, y : sequence of str, optional
-            Disturbances, actuators, axes of POIs and sensors to keep; all when not given.
+            Disturbances, actuators, axes of POIs and sensors to keep; all by default.
 
         Raises
         ------

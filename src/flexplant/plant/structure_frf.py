@@ -127,7 +127,7 @@ def frequency_response(
     ports : Ports
         The channels of a structure. Of a system: freq.
     freq : (n_freq,) array [Hz]
-        Increasing. Of a system None gives `default_freq`.
+        Frequencies, increasing. None: `default_freq` of a system.
     damping : Damping, optional
         Damping of an FEModel, in place of its D. A Rayleigh is its matrix; modal damping is that
         of the modes and static shapes used; motions beyond them decay as the last mode does.

@@ -45,7 +45,7 @@ class GroundSpring(Value):
     damping : float [N s/m or N m s/rad]
         Damping of the damper in parallel with it.
     direction : str
-        At points: x, y, z, rx, ry, rz.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
 
     Raises
     ------

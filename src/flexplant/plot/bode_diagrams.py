@@ -55,7 +55,8 @@ def bode(
     outputs, inputs : str or sequence of str, optional
         Channels of the first system; all by default. Others use the same names.
     freq : (n_freq,) array [Hz], optional
-        Where systems are evaluated; a grid of each, refined at resonances, when not given.
+        Frequencies at which systems are evaluated; by default a grid of each, refined at
+        resonances.
     wrap : bool
         Whether phases are drawn between -180 and 180 degrees.
     ax : pair of Axes, optional

@@ -369,7 +369,7 @@ def sensitivities(
     at : {"u", "y"}
         Where the loop is broken for S and T.
     freq : (n_freq,) array [Hz], optional
-        A grid of each loop, refined at its resonances, when not given.
+        Frequencies; by default a grid of each loop, refined at its resonances.
     colors : mapping {label: color}, optional
         Colours of some lines.
     ax : three Axes, optional

@@ -104,7 +104,7 @@ def residual_vibration(
     Raises
     ------
     ModelError
-        When the loop is no sampled stable ClosedLoop, or the move no SetPointProfile.
+        When the loop is not a stable sampled ClosedLoop, or the move is not a SetPointProfile.
     LabelError
         When the reference or the channel is unknown or must be named.
 

@@ -49,7 +49,7 @@ _LOST = 1e-3
 _SMALL = 1e-4
 #: relative change of M W that the final Rayleigh-Ritz step on the modes corrects
 _STALE = NULL
-#: relative error of a Ritz pair below which its shape needs no tolerance of its own
+#: relative error of a Ritz pair below which its shape needs no separate tolerance
 _SURE = ROUNDING
 #: size of values relative to the largest one times FOUND, below which they are not found together
 #: with it

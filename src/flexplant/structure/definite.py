@@ -268,8 +268,8 @@ def elastic_modes(
 
     ``K phi = omega^2 M phi`` is solved in the M-orthogonal complement of the M-orthonormal
     rigid-body motions (n, r), so that these mix with no elastic mode. Each frequency has a relative
-    error of at most 1e-8, or of its own rounding ``eps |phi|^T |K| |phi| / (2 omega^2)``, whichever
-    is larger: the stored entries of K do not define it more accurately.
+    error of at most 1e-8, or that of rounding ``eps |phi|^T |K| |phi| / (2 omega^2)``, whichever is
+    larger: the stored entries of K do not define it more accurately.
 
     The transformation that makes M the identity leaves an error of a rounding of the largest
     eigenvalue in all of them. Soft modes are therefore improved by inverse iteration with the

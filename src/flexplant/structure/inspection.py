@@ -276,7 +276,7 @@ def _matrix_lines(found: Facts) -> Iterator[Line]:
 
 def _inertia_line(found: Facts) -> Line:
     if found.mass_definite is None:
-        return ("fail", "mass", "there is no M", "export the mass matrix too")
+        return ("fail", "mass", "M is missing", "export the mass matrix too")
     if found.mass_definite:
         singular = found.massless.size or found.empty.size or found.without_inertia.size
         kind = "positive semi-definite" if singular else "positive definite"

@@ -40,7 +40,7 @@ class Controller(Value):
     system : StateSpace
         From measurements, references or estimates to actuators; the sign of the feedback is in it.
     method : str
-        How it was designed.
+        Method of the design.
     gamma : float, optional
         The norm that its closed loop was verified to stay below: H-infinity, of `design_h2` the H2.
     lower : float, optional

@@ -49,7 +49,7 @@ class WaferStage(Value):
     rate : float [Hz]
         Sampling rate of its controller.
     delay : float [samples]
-        From measurement to actuation.
+        Delay from a measurement to the reaction of the actuators, including fractions.
     step : float [m]
         Step of its sensors; 0 for none.
     drawing : mapping
@@ -112,7 +112,7 @@ class WaferStage(Value):
         deviation : float
             Standard deviation of their errors, relative to their size; 0: ideal, no covariance.
         rng : int or Generator, optional
-            Seed of the errors.
+            Random generator of the errors, or its seed.
 
         Raises
         ------

@@ -68,7 +68,8 @@ def wafer_stage(
     rate : float [Hz]
         Sampling rate of its controller.
     delay : float [samples], optional
-        From measurement to actuation; 1.3 when not given.
+        Delay from a measurement to the reaction of the actuators, including fractions; 1.3
+        by default.
     individual : int
         Which machine: its scatter and its second mass.
 

@@ -130,11 +130,11 @@ class MatrixParameter(_GivenParameter):
         Parameters
         ----------
         name, unit, bounds, prior
-            As for the class; bounds and prior are those of the change p.
+            See the class; bounds and prior are those of the change p.
         build : callable
             Function from the value to an FEModel, with the same DOFs at every value.
         value : float
-            Of the model that is updated.
+            Value of the model that is updated.
         step : float, optional
             Step of the difference; 1e-3 of the value by default.
 

@@ -288,7 +288,7 @@ def open_file(
         An Frf in a universal, CSV, MATLAB or NumPy file; what `.save` of a plant, a response or a
         LoopDesign wrote.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        What the outputs of a measurement shall be; as for `flexplant.io.read_frf_uff`.
+        Wanted quantity of the outputs of a measurement; see `flexplant.io.read_frf_uff`.
     scale : float, optional
         Factor that brings the numbers of a universal file to SI, where its units are not clear.
 

@@ -86,7 +86,7 @@ class Uncertainty(Value):
         return None
 
     def delta_blocks(self, plant: Partition) -> Sequence[Block]:
-        """Return the blocks of a plant that are no numbers of its machine: dynamics, say."""
+        """Return the blocks of a plant that are not numbers of its machine, such as dynamics."""
         return ()
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:

@@ -95,7 +95,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def delta_blocks(self) -> tuple[Block, ...]:
-        """The Deltas that are no numbers of the machine: unmodelled dynamics, one's own blocks."""
+        """The Deltas that are not numbers of the machine: unmodelled dynamics, your own blocks."""
         found = [block for kind in self.kinds for block in kind.delta_blocks(self.plant)]
         names = [delta.name for delta in self.deltas] + [block.name for block in found]
         twice = sorted({name for name in names if names.count(name) > 1})

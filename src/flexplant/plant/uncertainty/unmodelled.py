@@ -67,7 +67,7 @@ class UnmodelledDynamics(Uncertainty):
     Raises
     ------
     LabelError, ModelError
-        When a channel is no actuator or sensor, the weight is unstable or of another sampling
+        When a channel is not an actuator or sensor, the weight is unstable or of another sampling
         time, or the form does not fit the channels.
 
     References

@@ -83,14 +83,14 @@ def design_hinf(
         those of all positions and half way between. A labelled StateSpace (ours or
         python-control's) serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
-        `Riccati()` unless given, which adds a little noise and effort where D12 or D21 is singular,
-        and a little disturbance where w or z misses an undamped mode. `Lmi()` needs neither and
-        suits up to 30 states.
+        By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
+        singular, and a little disturbance where w or z misses an undamped mode. `Lmi()`
+        needs neither and suits up to 30 states.
     bandwidth : float [Hz], optional
         For a stage without weights: those of `stage_weights` are used, for the POI's only
         reference. `design_stage` finds the largest that holds.
     u, y : sequences of str, optional
-        Channels of the controller, for a StateSpace.
+        For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
         Uncertainty of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: the design
         tolerates its frequencies. Not needed where the plant itself is uncertain, or was made from
@@ -104,8 +104,8 @@ def design_hinf(
         Uncertain modes below it that actuators push are damped, not only tolerated: their channel
         then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
     progress : bool, optional
-        True shows a bar of the method's steps at once, False never; None after two seconds on a
-        terminal.
+        Whether to show a progress bar of the method's steps. None: on a terminal or in a
+        notebook, for work of more than two seconds.
 
     Returns
     -------

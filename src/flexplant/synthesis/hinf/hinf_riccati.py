@@ -72,8 +72,8 @@ class Riccati(Value):
     regularised : bool, optional
         True adds noise and effort to any problem, False to none; None decides as above.
     progress : bool, optional
-        True shows a bar of the bisection at once, False never; None after two seconds on a
-        terminal.
+        Whether to show a progress bar of the bisection. None: on a terminal or in a
+        notebook, for work of more than two seconds.
 
     References
     ----------

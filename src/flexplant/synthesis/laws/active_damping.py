@@ -28,7 +28,7 @@ from .damping_elements import KINDS, DampingElement
 _GAINS = np.geomspace(0.02, 50.0, 40)
 #: poles this much slower than the mode count as at rest, where rigid-body modes are
 _REST = 1e-3
-#: least damping of the other modes, over what they have
+#: least damping of the other modes, relative to their damping without the loop
 _KEPT = 0.7
 #: gains around the best
 _FINE = 41
@@ -47,7 +47,7 @@ class ActiveDamping(Value):
     element : DampingElement
         The tuned law from error to command.
     controller : StateSpace
-        From y to u with the sign of the feedback in it: for `close_loop`, beside a servo.
+        From y to u, including the sign of the feedback: for `close_loop`, in parallel with a servo.
     freq : float [Hz]
         Frequency of the mode without the loop.
     before, damping : float
@@ -128,7 +128,7 @@ def damp_modes(
         Number of the mode among the oscillating poles of u to y, from 1, by frequency; rigid-body
         modes and real poles are not counted.
     u, y : str, optional
-        Actuator and sensor, at one place or not; needed where there are several.
+        Actuator and sensor, collocated or not; needed where the plant has several.
     damping : float, optional
         Damping ratio, below 1; the largest when not given.
     margin : float
@@ -335,7 +335,7 @@ def _refusal(
     if found is None:
         return (
             f"{head}every gain leaves a modulus margin below {margin:g} or takes more than "
-            f"{100 * (1 - _KEPT):.0f} % of another mode's damping. Place the sensor beside the "
+            f"{100 * (1 - _KEPT):.0f} % of another mode's damping. Place the sensor at the "
             "actuator, or accept a smaller margin=."
         )
     most = float(found[0].damping[found[1]])

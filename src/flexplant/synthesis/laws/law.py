@@ -102,7 +102,7 @@ class LawElement(Value):
         Parameters
         ----------
         rate : float [Hz]
-            Above twice the frequency of each notch and low-pass.
+            Sampling rate; above twice the frequency of each notch and low-pass.
 
         Raises
         ------

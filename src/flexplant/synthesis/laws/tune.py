@@ -68,7 +68,8 @@ def tune_loops(
     notches : int
         Largest number of notches of each axis; each has to raise the bandwidth by 2 %.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------

@@ -436,7 +436,8 @@ class Lmi(Value):
     max_states : int
         Largest number of states; larger problems are refused.
     progress : bool, optional
-        A bar of these programs, as for `Riccati`.
+        Whether to show a progress bar of these programs. None: on a terminal or in a
+        notebook, for work of more than two seconds.
 
     References
     ----------

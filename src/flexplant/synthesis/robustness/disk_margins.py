@@ -44,7 +44,7 @@ class DiskMargin(Value):
         A change of this size that does. It equals alpha for one loop; for several together it is
         the other bound of mu.
     freq : float [Hz]
-        Where the loop is nearest.
+        Frequency at which the loop is closest to the critical point.
 
     Examples
     --------

@@ -123,9 +123,9 @@ def robust_stability(
     """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
 
     Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
-    block, unmodelled dynamics and the blocks of `uncertain_system` what they are. The bound holds
-    between grid points; a sampled loop is examined as it is sampled and delayed. What it says is
-    tried on machines drawn from the uncertainty, each closed exactly.
+    block; unmodelled dynamics and the blocks of `uncertain_system` keep their kind. The bound also
+    holds between grid points; a sampled loop is examined with its sampling and delay. The result is
+    checked on machines drawn from the uncertainty, each closed exactly.
 
     Parameters
     ----------
@@ -141,9 +141,10 @@ def robust_stability(
     machines : int
         Number of machines drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
-        Of the machines and of the search for the worst.
+        Random generator of the machines and of the search for the worst, or its seed.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------
@@ -309,7 +310,7 @@ class WorstCaseGain(Value):
     nominal : float
         The gain without uncertainty.
     freq : float [Hz]
-        Where `machine` has it.
+        Frequency at which `machine` has this gain.
     values : mapping {str: float}
         The Deltas of that machine.
     machine : StandardPlant
@@ -355,7 +356,7 @@ def worst_case_gain(
     w, z : sequence of str, or mapping {name: weight}
         Channels of the gain; weights are numbers or systems of one input and output.
     rng : int, SeedSequence, Generator or None
-        Of the search.
+        Random generator of the search, or its seed.
     progress : as for `robust_stability`, optional
 
     Returns

@@ -106,7 +106,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     blocks : sequence of RepeatedScalar and FullBlock
         ``w = Delta z`` in the order of the channels.
     rng : int, SeedSequence, Generator or None
-        Of the restarts.
+        Random generator of the restarts, or its seed.
 
     Returns
     -------

@@ -43,7 +43,7 @@ def robust_performance(
     w, z : sequence of str, or mapping {name: weight}
         Channels of performance and their weights.
     rng : int, SeedSequence, Generator or None
-        Of the search for the lower bound.
+        Random generator of the search for the lower bound, or its seed.
     progress : as for `robust_stability`, optional
 
     Returns

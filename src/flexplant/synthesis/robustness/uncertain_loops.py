@@ -142,7 +142,7 @@ class UncertainLoop:
         full = self.blocks[-1]
         # the phase that the weights have there is taken out: columns of M bear magnitudes
         W = np.diag(self.neglected.weights.evaluated(1j * found.omega))
-        # the last full block; what performance may have behind it is no Delta
+        # the last full block; a performance block after it is not a Delta
         a, b = found.vectors[sum(isinstance(block, FullBlock) for block in self.blocks) - 1]
         # a sampled one begins with a delay of one sample, whose phase is made up for
         ahead = 2.0 * np.arctan(0.5 * self.dt * found.omega)

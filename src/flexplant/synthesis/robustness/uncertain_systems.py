@@ -85,7 +85,7 @@ def uncertain_system(
     Raises
     ------
     ModelError, ShapeError
-        When blocks are no list of blocks, or do not fit the channels of M.
+        When blocks are not a list of blocks, or do not fit the channels of M.
     LabelError
         When u or y are not channels of M, or are channels of Deltas.
 

@@ -100,12 +100,13 @@ def design_structured(
     starts : int
         The first is the structure's own, the others are drawn around it and around the best end.
     rng : int, SeedSequence or Generator
-        Draws starts.
+        Random generator of the starts, or its seed.
     evaluations : int
         Largest number of closed loops computed for each plant; the search then ends with the best
         result so far.
     progress : bool, optional
-        Show a bar; unless given, on a terminal after a while.
+        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
+        two seconds.
 
     Returns
     -------

@@ -151,9 +151,9 @@ class Correlation(Value):
     mac : (m, m) array
         MAC of measured shapes (rows) with those of the model; empty without shapes.
     frac : (n_out, n_in) array
-        Of the responses; empty without.
+        Frequency response assurance criterion of the responses; empty without responses.
     fdac : (n_freq, n_freq) array
-        Of the responses; empty without.
+        Frequency domain assurance criterion of the responses; empty without responses.
     alike : sequence of groups of int
         Numbers of the model's modes, in the measured range, whose shapes the sensors cannot
         distinguish (a MAC above 0.9 with each other there): they are paired by frequency, and a
