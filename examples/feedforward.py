@@ -1,10 +1,11 @@
-"""The move of the wafer stage with feedforward: what each order of it buys on the machine.
+"""Feedforward for a move of the wafer stage: how much each order reduces the error.
 
-Run it: ``python examples/feedforward.py``. Two loops of `wafer_stage.py`, designed on the model of
-measured poles, move a machine of another formulation by 100 um. Feedforward is designed on the
-model of each loop for this move: by order, and as an inverse with preview. Then a loop of the
-drawing, whose mass and stiffness are wrong, learns its gains from repeated moves. Errors at the die
-in nm, the largest and the mean over 5 ms after it::
+Run it: ``python examples/feedforward.py``. Two loops of `wafer_stage.py`, designed on the model
+with measured poles, move a virtual machine by 100 um; the machine has another plate theory than the
+model. Feedforward is designed for this move on the model of each loop: order by order, and as an
+inverse with preview. Then a loop designed on the drawing, whose mass and stiffness are wrong,
+learns its feedforward gains from repeated moves. Errors at the die in nm: the largest during the
+move, and the mean over 5 ms after it::
 
     feedforward      best servo         tolerant
                    largest   after   largest   after
@@ -72,7 +73,7 @@ def learnt(case: dict[str, Any]) -> sim.LearnedFeedforward:
     return sim.learn_feedforward(start, trial, model, MOVE, duration=DURATION, trials=3)
 
 
-# %% What it shows
+# %% Results
 def main() -> dict[str, Any]:
     """Return the runs of both loops, and what was learnt."""
     case = stage.models(DAMPING)
@@ -105,7 +106,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
-    """Draw the error of both loops through the move, below without the term that hides others."""
+    """Draw the error of both loops in the move; below without the term that hides the others."""
     import matplotlib.pyplot as plt
 
     figure, axs = plt.subplots(2, 2, figsize=(13, 8), sharex=True, layout="constrained")

@@ -3,9 +3,9 @@
 Run it: ``python examples/from_nastran.py``, or with files of your own:
 ``python examples/from_nastran.py stage.pch stage.bdf``. Nastran punches the matrices of a model as
 DMIG cards with ``PARAM,EXTOUT,DMIGPCH`` (or ``EXTSEOUT(DMIGPCH)``); the nodes are in the bulk data.
-Without files the script writes those of a free aluminium block as Nastran would, ten digits a
-number. Ten digits are not enough for rigid-body modes at zero: the table shows what is lost, and
-what brings it back.
+Without files the script writes those of a free aluminium block as Nastran would, with ten digits
+per number. Ten digits are not enough for rigid-body modes at 0 Hz: the table shows the error, and
+how it is repaired.
 """
 
 # %% Names and numbers
@@ -83,7 +83,7 @@ def main(punch: Path | None = None, bulk: Path | None = None) -> dict[str, Any]:
     rom = fx.reduce(modes, fx.DesiredDofs(keep.labels))
     ends = {"inputs": keep.labels[:1], "outputs": keep.labels[-1:]}
     return {
-        "report": fx.check(matrices),  # in the units of the file, of which it has a guess
+        "report": fx.check(matrices),  # in the units of the file, which it guesses
         "warnings": [str(one.message).partition(": ")[2] for one in said],
         "printed": fx.solve_modes(as_printed, count=10),
         "modes": modes,

@@ -1,13 +1,13 @@
 """A six-axis stage that floats on magnets: from its mesh to the error at a moving point.
 
 Run it: ``python examples/maglev.py``. Magnets that attract have negative stiffness: without control
-the stage falls to one side or the other, twice as far every 10 to 30 ms. Eight actuators with
-noisy amplifiers hold it, seven sensors measure where it is relative to a floor that shakes, and
-the point of interest (POI), where a wafer is exposed, moves over its top while no sensor sees it.
+the stage falls to one side; the distance doubles every 10 to 30 ms. Eight actuators with noisy
+amplifiers hold it, seven sensors measure its position relative to a floor that vibrates. The point
+of interest (POI), where a wafer is exposed, moves over its top, and no sensor sees it.
 
-Every number of the tables is computed, none is simulated: rms errors come from Lyapunov equations.
-The last table has what the loop promises beside what it is on a virtual machine of another
-formulation, with a mass and magnets that the drawing does not have.
+All numbers in the tables are computed without simulation: rms errors come from Lyapunov equations.
+The last table compares the predictions for the loop with the result on a virtual machine that is
+computed with another theory, and has a mass and magnets that the drawing does not have.
 """
 
 # %% Names and numbers
@@ -35,7 +35,7 @@ MAGNETS = [
     for along, stiffness in (("x", -2e3), ("y", -2e3), ("z", -6e3))
 ]
 
-#: name: (place, direction) of eight actuators, one more in z and in x than there are axes
+#: name: (place, direction) of eight actuators, one more in z and in x than axes
 ACTUATORS = {
     "z1": ((0.05, 0.05, 0.0), "z"),
     "z2": ((0.35, 0.05, 0.0), "z"),
@@ -46,7 +46,7 @@ ACTUATORS = {
     "y1": ((0.1, 0.0, 0.025), "y"),
     "y2": ((0.3, 0.0, 0.025), "y"),
 }
-#: seven sensors beside the floor: encoders, one more in z than there are axes
+#: seven sensors in addition to that of the floor: encoders, one more in z than axes
 SENSORS = {
     "ez1": ((0.0, 0.0, LZ), "z"),
     "ez2": ((LX, 0.0, LZ), "z"),
@@ -59,7 +59,7 @@ SENSORS = {
 AMPLIFIER = 1e-4  # N/sqrt(Hz) at its input
 ENCODER = 1e-11  # m/sqrt(Hz)
 FLOOR = 2e-5  # m/s^2/sqrt(Hz) between 1 and 60 Hz
-#: where the POI goes, from the middle of the top to a corner
+#: path of the POI, from the middle of the top to a corner
 PATH = [(0.2 + 0.16 * s, 0.15 + 0.11 * s, LZ) for s in np.linspace(0.0, 1.0, 3)]
 
 
@@ -106,7 +106,7 @@ def held(plant: fx.StandardPlant) -> dict[str, Any]:
 def main() -> dict[str, Any]:
     """Return what is printed, drawn and pinned by the tests."""
     many = modes(40)
-    few = many.select(range(16))  # six on the magnets, ten elastic; the others count as left out
+    few = many.select(range(16))  # six on the magnets, ten elastic; the others are truncated
     plant = fx.assemble_plant(few, ports(), evaluation=many)
     sampled = plant.discretized(RATE, delay=DELAY)
     path = [held(sampled.at(point)) for point in PATH]
@@ -121,14 +121,14 @@ def main() -> dict[str, Any]:
         "decoupling": rigid,
         "path": path,
         "budgets": {axis: middle.budget(f"die:{axis}") for axis in ("x", "z")},
-        # a filter that reads the decoupled motions alone, at the corner
+        # a filter that reads only the decoupled motions, at the corner
         "six": fx.design_kalman(corner.through(gravity_axes(corner).to_motions)),
     }
 
 
 # %% Tables
 def poles(found: dict[str, Any]) -> str:
-    """Return what the magnets make of the six rigid-body motions."""
+    """Return the effect of the magnets on the six rigid-body motions."""
     grows = sorted(pole.real for pole in found["plant"].system.poles() if pole.real > 1e-6)
     rows = [f"{pole:8.2f}{1e3 * np.log(2.0) / pole:12.1f}" for pole in grows]
     return "\n".join(["growth [1/s], doubles in [ms]", *rows])
@@ -156,7 +156,7 @@ def _unit(axis: str) -> str:
 
 
 def on_the_machine(found: dict[str, Any]) -> str:
-    """Return the motion and the margin of the loop in the middle, promised and on the machine."""
+    """Return the motion and the margin of the loop in the middle: predicted, and on the machine."""
     loops = {"promised": found["path"][0]["loop"], "on the machine": found["machine"]}
     lines = ["".join(f"{head:>16s}" for head in ["", *loops])]
     for axis in AXES:

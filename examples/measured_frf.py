@@ -1,12 +1,12 @@
-"""From a noisy measurement to a model whose parameters are known, and how well they are.
+"""From a noisy measurement to an updated model, with the accuracy of its parameters.
 
 Run it: ``python examples/measured_frf.py``. The virtual machine floats under a slow servo and is
-shaken by multisines; its frequency responses (FRFs) give poles, the poles say what its drawing has
-wrong, and responses that were not used say whether that is true. The machine differs from the
-drawing in three things: 0.5 kg at z8 that no drawing shows, Young's modulus 70 instead of 69 GPa,
-and 1 % modal damping instead of 0.7 %. It has the drawing's mesh, so that a truth exists for each
-parameter and deviations can be judged by it; what an update is worth on a machine of another
-formulation is in ``wafer_stage.py``. Pictures go to ``examples/out``.
+excited by multisines. Its frequency responses (FRFs) give poles, the poles show what is wrong in
+its drawing, and responses that were not used check the result. The machine differs from the drawing
+in three things: 0.5 kg at z8 that no drawing shows, Young's modulus 70 instead of 69 GPa, and 1 %
+modal damping instead of 0.7 %. It has the drawing's mesh, so that each parameter has a true value
+to compare with; ``wafer_stage.py`` shows an update for a machine that is computed with another
+theory. Pictures go to ``examples/out``.
 """
 
 # %% Names and numbers
@@ -27,12 +27,12 @@ OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 L = 0.6
 RATE = 10e3  # Hz
 BAND = (150.0, 1400.0)  # Hz, where modes are identified
-ABOVE = (1400.0, 2000.0)  # Hz, lines that nothing is fitted to
+ABOVE = (1400.0, 2000.0)  # Hz, lines that are not used in any fit
 RUNS = 6
 SENSOR = 1e-9  # m rms per sample
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
-UNUSED = "y5"  # a sensor that nothing is fitted to
+UNUSED = "y5"  # a sensor that is not used in any fit
 ACTUATORS = {f"u{i}": point for i, point in enumerate(INSET, 1)}
 SENSORS = {f"y{i}": point for i, point in enumerate([*CORNERS, (3 * L / 4, L, 0.0)], 1)}
 FITTED = [name for name in SENSORS if name != UNUSED]
@@ -45,7 +45,7 @@ PORTS = fx.Ports(
 TRUTH = {"mass": 0.5, "stiffness": 70 / 69 - 1, "damping": 0.01 / 0.007 * np.sqrt(70 / 69) - 1}
 
 
-# %% The drawing, reduced to 49 DOFs: 24 modes and the compliance at 25 places in question
+# %% The drawing, reduced to 49 DOFs: 24 modes and the compliance at 25 candidate places
 SHAPE = {"size": (L, L), "thickness": 0.0272, "elements": (8, 8)}
 plate = fx.kirchhoff_plate(**SHAPE, density=2702, youngs_modulus=69e9, poisson_ratio=0.35)
 z8 = plate.dofs.nearest((L / 2, L / 4, 0.0), "z")
@@ -74,9 +74,9 @@ def poles(frf: fx.Frf) -> tuple[fx.identification.IdentifiedModes, fx.MeasuredMo
     return found, fx.numbered(found, drawing, at=at, partial=True, least_mac=0.8)
 
 
-# %% Where is the mass? Stiffness and damping are wrong everywhere: found anew with every place
+# %% Where is the mass? Stiffness and damping are wrong everywhere: estimated again for each place
 def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
-    """Return what compares lines of the sampled machine with a model behind the same hold."""
+    """Return the residual of lines of the sampled machine and of a model with the same hold."""
     used, where = frf.select(outputs=outputs), {name: SENSORS[name] for name in outputs}
     return fx.FrfResidual(used, lines=lines, places=where | ACTUATORS, hold=RATE)
 
@@ -92,7 +92,7 @@ def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Loc
     return by_poles, fx.updating.localise(drawing, left, [response(frf, low, FITTED)], **everywhere)
 
 
-# %% What the model says about responses that were not used
+# %% The model's prediction of responses that were not used
 def predicted(model: Any, freq: np.ndarray) -> fx.Frf:
     """Return a model's FRFs, behind the machine's zero-order hold."""
     return fx.frequency_response(fx.assemble_plant(model, PORTS).discretized(RATE).Gyu, freq)
@@ -131,7 +131,7 @@ def main() -> dict[str, Any]:
     return {**result, "true poles": machine.poles(numbered.modes).poles}
 
 
-# %% Real structures, where their data are: FLEXPLANT_DATA=<folder> says where
+# %% Real structures, if their data are present in the folder FLEXPLANT_DATA=<folder>
 DATA = Path(os.environ.get("FLEXPLANT_DATA", "data")) / "fe"
 BRIDGE = DATA / "updating" / "SteelPedBrdg_sim_form1_LM.mat"
 SHAKEN = DATA / "uff" / "uff55_translation_rotation.uff"

@@ -1,10 +1,10 @@
 """A million degrees of freedom (DOFs) on a laptop: from the mesh to a closed loop.
 
 Run it: ``python examples/million_dofs.py 1000000`` (about a minute of one core and 7 GB), or with
-fewer DOFs; without a number it takes 100 000. A square plate is meshed, its modes are found, each
-with a residual and all with a count that says none is missing, the model is reduced to the DOFs of
-sensors and actuators, and a loop is closed on it. Frequencies are compared with those that Leissa
-printed for a free square plate.
+fewer DOFs; without a number it takes 100 000. A square plate is meshed. Its modes are computed,
+each with a residual, and a count proves that none is missing. The model is reduced to the DOFs of
+sensors and actuators, and a loop is closed on it. Frequencies are compared with those published by
+Leissa for a free square plate.
 """
 
 # %% Names and numbers
@@ -96,7 +96,7 @@ def table(result: dict[str, Any]) -> str:
         [
             f"{model.n_dof} DOFs, {model.K.nnz} entries of K; {steps} (CPU)",
             f"{modes}",
-            f"beside Leissa's upper bounds: {low:.2%} to {high:.2%}",
+            f"relative to Leissa's upper bounds: {low:.2%} to {high:.2%}",
             f"reduced to {rom.M.shape[0]} DOFs; its frequencies differ by {kept:.0e} at most",
             f"{result['loop']}",
         ]

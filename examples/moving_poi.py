@@ -1,11 +1,11 @@
-"""A point of interest that moves while it is exposed: what an estimate must know of its place.
+"""A point of interest that moves during exposure: why its estimate needs the path.
 
 Run it: ``python examples/moving_poi.py``. A plate is scanned under a lens: the point of interest
 (POI) runs over the plate at 0.3 m/s, from the middle towards an edge, while amplifier noise shakes
-the plate and a servo holds it. The model is a mesh with measured poles; the machine is of another
-formulation. The same record is read in three ways: with the motion of the middle as that of the
-POI, with the middle's motion carried to the POI as if the plate were rigid, and with the path, so
-that every mode counts with its shape at the place of each sample.
+the plate and a servo holds it. The model is a mesh with measured poles; the machine is computed
+with another theory. The motion of the POI is estimated from the same record in three ways: as the
+motion of the middle; as the motion of the middle transferred to the POI as if the plate were rigid;
+and with the path, so that every mode counts with its shape at the place of each sample.
 """
 
 # %% Names and numbers
@@ -31,7 +31,7 @@ SCAN = fx.simulation.scan(
 )
 DURATION = 0.8  # s
 
-# %% The machine, and the model: twelve modes of a mesh that has not its formulation
+# %% The machine, and the model: twelve modes of a mesh with another theory
 machine = fx.testbeds.wafer_stage(damping=0.005, added_mass=0.0, rate=RATE, delay=DELAY)
 plate = fx.kirchhoff_plate(
     size=(L, L),
@@ -61,7 +61,7 @@ def path(time: np.ndarray) -> np.ndarray:
     return np.column_stack([x, np.full(time.size, L / 2), np.zeros(time.size)])
 
 
-# %% One run, three readings of it
+# %% One run, three estimates
 def main() -> dict[str, Any]:
     """Return the run, the estimates of the motion in z at the POI, and their errors."""
     observer = fx.design_kalman(design)

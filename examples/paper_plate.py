@@ -1,9 +1,9 @@
-"""The paper's plate: its reduction and its update, the paper's numbers and figures beside ours.
+"""The paper's plate: reduction and update, compared with the numbers and figures of the paper.
 
 Run it: ``python examples/paper_plate.py``. It prints one table and writes the counterparts of the
-paper's figures 3 to 11 to ``examples/out``. The paper says 0.1 % modal damping, but its printed
-eigenvalues have 1 %, so 1 % it is here. As in the paper, machine and drawing share their mesh;
-``wafer_stage.py`` goes on from here to closed loops and a machine of another formulation.
+paper's figures 3 to 11 to ``examples/out``. The paper states 0.1 % modal damping, but its printed
+eigenvalues have 1 %, so 1 % is used here. As in the paper, machine and drawing have the same mesh;
+``wafer_stage.py`` continues with closed loops and a machine that is computed with another theory.
 """
 
 # %% Names
@@ -30,8 +30,8 @@ PAPER = {"mode 6": "461", "lambda_12": "-28.5 - 2870i", "lambda_14": "-39.3 - 39
 def frf_error(compliance_at: list[str]) -> float:
     """Return max |H_red - H_full| at a corner up to mode 20, over its static compliance.
 
-    Elastic motion alone is compared: the rigid-body motion is infinite at rest and the same in
-    both. The full model answers with all its modes, the reduced one by its own (M*, D*, K*).
+    Only elastic motion is compared: the rigid-body motion is infinite at rest and the same in both.
+    The full model responds with all its modes, the reduced one with its matrices M*, D*, K*.
     """
     damping = fx.ModalDamping(DAMPING)
     full = fx.solve_modes(plate, damping=damping)
@@ -73,7 +73,7 @@ def main() -> dict[str, Any]:
 
 # %% The table
 def table(result: dict[str, Any]) -> str:
-    """Return reduction and update as text, the paper's numbers beside ours."""
+    """Return reduction and update as text, compared with the numbers of the paper."""
     nominal, fit = result["nominal"], result["fit"]
     before, after = nominal.modes(), fit.model.modes()
     lines = [f"{'1 % damping':62s}{'flexplant':>18s}{'paper':>16s}"]

@@ -1,10 +1,10 @@
-"""Where to put sensors and actuators: choices with a proof of how good they are.
+"""Where to put sensors and actuators: choices with a bound on the best possible one.
 
 Run it: ``python examples/placement.py``. The stage of ``wafer_stage.py`` carries 0.5 kg that no
-drawing shows; its model is updated from a measurement, with the uncertainty of what was found. The
-error at the die, which no sensor sees, decides where four sensors go: on a grid of 48 places
-without the die itself, in picometres, with a bound below which no choice can be. What is chosen
-then measures on the machine, beside sensors at the corners.
+drawing shows; its model is updated from a measurement, with the uncertainty of the result. Four
+sensors are placed so that the error at the die, which no sensor sees, is smallest. They are chosen
+from a grid of 48 places outside the die; a bound shows that no choice can be better than that. The
+chosen sensors are then compared on the machine with sensors at the corners.
 """
 
 # %% Names and numbers
@@ -40,17 +40,17 @@ GRID = [(x, y, 0.0) for x in np.linspace(0.0, L, 7) for y in np.linspace(0.0, L,
 SENSORS = [fx.Sensor(f"s{i}", at=place, asd=ENCODER) for i, place in enumerate(GRID)]
 PLACES = [(x, y, 0.0) for x in np.linspace(0.1, L - 0.1, 3) for y in np.linspace(0.1, L - 0.1, 3)]
 ACTUATORS = [fx.Actuator(f"a{i}", at=place) for i, place in enumerate(PLACES)]
-#: nobody can measure on the die, nor near its edge
+#: sensors are not possible on the die and near its edge
 DIE = fx.placement.Disc((L / 2, L / 2), radius=0.05)
-#: nor here, where a cable is
+#: nor here, where a cable runs
 CABLE = fx.placement.Rectangle((-0.01, 0.15), (0.25, 0.45))
 #: z at the die, and its rotations at the edge of a field, 13 mm away
 AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 
 
-# %% The machine: measured, and what is not known of its modes
+# %% The machine: measured, and the uncertainty of its modes
 def plants(case: dict[str, Any], rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
-    """Return the sampled plant of the measured model, and three machines that it could be too."""
+    """Return the sampled plant of the measured model, and three other possible machines."""
     small = plant_of(case, "measured").replace(evaluation=None)  # scored on its own modes
     return small, small.uncertain(frequency=case["off"]).machines.drawn(3, rng=rng)
 
@@ -77,7 +77,7 @@ def on_machine(case: dict[str, Any], plant: fx.StandardPlant) -> tuple[float, fl
 # %% Sensors
 def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[str, fx.Placement]:
     """Return four sensors by several criteria and constraints."""
-    # modes that the reduced model has left out do not count here, they would undo the bound
+    # modes that the reduced model has truncated are not included here: the bound would not hold
     goal = fx.PoiVariance("die", AXES, own_modes=True)
     off = Excluded(DIE)
     search = Exchange(starts=1)
@@ -102,7 +102,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
     }
 
 
-# %% Actuators, both, and what more devices buy
+# %% Actuators, both together, and the benefit of more devices
 def both(plant: fx.StandardPlant) -> dict[str, Any]:
     """Return actuators and sensors for the closed loop, the curve over counts, and their worth."""
     cost = ClosedLoopH2("die", AXES, effort=1e-9)

@@ -1,11 +1,12 @@
-"""A controller in C at 10 kHz: in a process of its own, the machine in another.
+"""A controller in C at 10 kHz in one process, the machine in another.
 
-Run it: ``python examples/real_time.py``; it needs a C compiler and POSIX shared memory, no rights
-and no real-time kernel. Observer, servo and feedforward, designed on a model and written as C, hold
-a virtual machine of another formulation, which runs in C too. Each sample: the machine waits for
-its time and writes its sensors, the controller answers, the machine goes on with what it got. A
-late answer delays the sample, so the motion is that of `simulate` on any computer, however busy;
-how late samples and answers are is measured. On two cores that others used too [us]::
+Run it: ``python examples/real_time.py``; it needs a C compiler and POSIX shared memory, but no
+special rights and no real-time kernel. Observer, servo and feedforward are designed on a model,
+exported as C code, and control a virtual machine that is computed with another theory and also runs
+in C. In each sample the machine waits for the sampling instant and writes its sensors; the
+controller writes its commands; then the machine continues with these commands. A late command
+delays the sample, so that the motion equals that of `simulate` on any computer, however busy. The
+delays of samples and commands are measured. On two cores that other programs used too [us]::
 
                    median     99 %   99.9 %  largest
     sample late       1.9      3.7     76.3  11840.6
@@ -179,7 +180,7 @@ def run(loop: fx.ClosedLoop, move: Any, duration: float) -> dict[str, Any]:
     at = move.at(np.arange(samples) / RATE)
     w[:, plant.w.index("die:ref")] = at.position
     for derivative in ("velocity", "acceleration", "jerk", "snap"):
-        if (name := f"die:ref:{derivative}") in plant.w:  # what the feedforward reads
+        if (name := f"die:ref:{derivative}") in plant.w:  # inputs of the feedforward
             w[:, plant.w.index(name)] = getattr(at, derivative)
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     head, width = 16 + 8 * (len(plant.y) + len(loop.controller.outputs)), 2 + len(shown)

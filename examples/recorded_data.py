@@ -1,15 +1,16 @@
-"""From a record to the motion at the die: whether the filter is right, and what makes it so.
+"""From a record to the motion at the die: whether the filter is consistent, and how to correct it.
 
-Run it: ``python examples/recorded_data.py``, or with a CSV file of your own whose columns are
-``time`` and the sensors and commands by name. Without one the script records two seconds of a
-virtual stage whose amplifiers are three times noisier than their data sheet says, and loses 0.1 s
-of one sensor. A filter made with the data sheet states errors that are too small; the record shows
-it, and gives the densities with which they are right.
+Run it: ``python examples/recorded_data.py``, or with your own CSV file, whose columns are ``time``
+and the sensors and commands by name. Without a file the script records two seconds of a virtual
+stage whose amplifiers are three times noisier than their data sheet says, and loses 0.1 s of one
+sensor. A filter made with the data sheet states errors that are too small. The record shows this,
+and gives the noise densities with which the stated errors are correct.
 
-Machine and model are one mesh here on purpose: only then are the densities of the record those that
-it was made with. On a machine with all its modes (`fx.testbeds.wafer_stage`, all poles below half
-the rate in the model) modes above that fold into the record: the verdict names them, and the
-sensors' densities come out nearly four times too large, since they stand for these modes.
+Machine and model have the same mesh here on purpose: only then the estimated densities should equal
+those used for the record. On a machine with all its modes (`fx.testbeds.wafer_stage`, all poles
+below half the rate in the model) modes above half the rate are aliased into the record. The verdict
+names them, and the estimated densities of the sensors are nearly four times too large, because they
+include these modes.
 """
 
 # %% Names and numbers
@@ -34,7 +35,7 @@ ENCODER = 3e-11  # m/sqrt(Hz)
 DAMPING = fx.ModalDamping(0.01)
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
-DARK = (1.0, 1.1)  # s, when y2 sees nothing
+DARK = (1.0, 1.1)  # s, when y2 measures nothing
 SETTLED = 0.5  # s, from when errors are judged
 
 # %% The model of the stage: a plate, twelve modes of it
@@ -61,9 +62,9 @@ def plant(amplifier: float) -> fx.StandardPlant:
     return fx.assemble_plant(modes, ports).discretized(RATE, delay=DELAY)
 
 
-# %% A record: a stage held by a slow servo, one sensor dark for a while
+# %% A record: a stage held by a slow servo; one sensor fails for a while
 def recorded(path: Path) -> fx.Response:
-    """Write what a controller sees to a CSV file; return the run, with what it cannot see."""
+    """Write the signals of a controller to a CSV file; return the run with all signals."""
     machine = plant(REAL)
     eyes = fx.design_static(machine)
     servo = fx.design_servo(machine, bandwidth=10.0, observer=eyes)
@@ -80,7 +81,7 @@ def recorded(path: Path) -> fx.Response:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file by name; pandas.read_csv(path) serves as well."""
+    """Return the columns of a CSV file by name; pandas.read_csv(path) works as well."""
     with path.open(encoding="utf-8") as file:
         names = file.readline().strip().split(",")
     return dict(zip(names, np.loadtxt(path, delimiter=",", skiprows=1).T, strict=True))
@@ -88,7 +89,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 # %% The filter of the data sheet, the densities of the record, the filter made with these
 def main(path: Path | None = None) -> dict[str, Any]:
-    """Return both filters, their estimates and what the record says of them."""
+    """Return both filters, their estimates and their tests on the record."""
     run = recorded(OUT / "record.csv") if path is None else None
     records = read(path or OUT / "record.csv")
     sheet = fx.design_kalman(plant(SHEET))
@@ -126,7 +127,7 @@ def table(result: dict[str, Any]) -> str:
         lines.append(
             f"{name:10s}{sheet[name]:14.3g}{levels.asd[name]:14.3g}{levels.relative[name]:8.1%}"
         )
-    if result["run"] is not None:  # only a virtual machine shows what nobody can measure
+    if result["run"] is not None:  # only a virtual machine shows the true motion
         lines += ["", f"{'estimate at the die':22s}{'error [nm]':>12s}{'stated [nm]':>12s}"]
         for name, (rms, stated, _) in errors(result).items():
             lines.append(f"{name:22s}{1e9 * rms:12.2f}{1e9 * stated:12.2f}")
@@ -135,14 +136,14 @@ def table(result: dict[str, Any]) -> str:
 
 # %% The picture
 def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
-    """Draw the estimate with its deviation while a sensor is dark."""
+    """Draw the estimate with its deviation while a sensor fails."""
     import matplotlib.pyplot as plt
 
     figure, ax = plt.subplots(figsize=(9, 4), layout="constrained")
     one, run = result["estimates"]["record"], result["run"]
     near = (one.time > DARK[0] - 0.05) & (one.time < DARK[1] + 0.05)
     deviation = 1e9 * one.deviation("die:hat")[near]
-    # of a machine of one's own the truth is not known: the estimate itself is drawn
+    # for your own machine the truth is not known: the estimate itself is drawn
     middle = 1e9 * (one["die:hat"] - (0.0 if run is None else run["die:z"]))[near]
     center = middle if run is None else np.zeros_like(middle)
     ax.axvspan(*DARK, color="0.92", label="y2 sees nothing")

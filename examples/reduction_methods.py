@@ -2,9 +2,9 @@
 
 Run it: ``python examples/reduction_methods.py``. The plate of the paper with 0.5 % damping, four
 actuators and four corner sensors, is reduced to 24 coordinates by every method of
-``flexplant.reduce``; the table says what each gets right: frequencies below 1.5 kHz, responses
-from actuators to sensors over the band, the elastic compliance at 0 Hz, and the time it takes.
-The full responses are solved from the matrices, not from modes.
+``flexplant.reduce``; the table shows the errors of each: of frequencies below 1.5 kHz, of responses
+from actuators to sensors over the band, and of the elastic compliance at 0 Hz; and the computing
+time. The full responses are solved from the matrices, not from modes.
 """
 
 # %% Names and numbers
@@ -45,7 +45,7 @@ PORTS = [*ACTUATORS, *SENSORS]
 
 # %% The methods, all at order 24
 def methods() -> dict[str, tuple[Any, fx.ReducedModel, float]]:
-    """Return {name: (method, reduced model, CPU seconds)}; what a method needs counts."""
+    """Return {name: (method, reduced model, CPU seconds)}; with all preparations."""
     modes = fx.solve_modes(plate, count=ORDER)  # for the choice of DOFs, not counted
     chosen = fx.select_dofs(modes, ORDER, required=PORTS)
 

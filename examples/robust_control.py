@@ -1,13 +1,14 @@
-"""From what a measurement leaves open to a guarantee: what a loop keeps on every such machine.
+"""From the uncertainty of a measurement to guarantees for a loop on every possible machine.
 
 Run it: ``python examples/robust_control.py``. The stage of ``wafer_stage.py`` is modelled by the 13
-modes of the band that was measured, their poles as found: real Deltas say by what their frequencies
-may be off, a weight says what the 147 modes above leave out. For the sampled, delayed loop of a
-servo it then (1) bounds mu between all frequencies, (2) finds the worst gain from set-point to
-error, and the machine that has it, (3) simulates that machine, (4) compares both with the virtual
-machine, of another formulation than any model here, (5) shows what mu of an H-infinity controller
-says that forgets the modes above, (6) reduces that controller as its loop sees it and writes it in
-C. It stops when one of its claims is no longer true.
+modes of the measured band, with their measured poles. Real Deltas describe the uncertainty of their
+frequencies; a weight bounds the effect of the 147 modes above, which are truncated. For the sampled
+loop of a servo, with its delay, the script (1) bounds mu at all frequencies, also between grid
+points, (2) finds the worst gain from set-point to error, and the machine that has it, (3) simulates
+that machine, (4) compares both with the virtual machine, which is computed with another theory than
+all models here, (5) shows mu of an H-infinity controller that ignores the modes above, (6) reduces
+that controller, weighted by its loop, and writes it in C. The script stops when one of its claims
+is no longer true.
 """
 
 # %% Names and numbers
@@ -32,9 +33,9 @@ UNMOVED = 5, 12  # modes with nodes at all actuators: their frequencies do not m
 BANDWIDTH, MORE = 60.0, 80.0  # Hz, of the servo and of H-infinity
 
 
-# %% The model: what was measured, and what is not known of it
+# %% The model: measured modes and their uncertainty
 def uncertain_plant(case: dict[str, Any]) -> tuple[fx.StandardPlant, Any, Any]:
-    """Return the sampled plant of a few modes, and it without and with the modes above."""
+    """Return the sampled plant of a few modes, and the plant without and with the modes above."""
     full = case["full"]["measured"]
     plant = fx.assemble_plant(full.select(range(MODES)), ports(), evaluation=full)
     plant = plant.discretized(RATE, delay=case["machine"].delay)
@@ -51,7 +52,7 @@ def peak(loop: fx.ClosedLoop) -> float:
 
 
 def study() -> dict[str, Any]:
-    """Return the loop, what is proven of it, and the worst machine beside others."""
+    """Return the loop, its guarantees, and the worst machine compared with others."""
     case = models(DAMPING)
     machine = case["machine"]
     plant, alone, uncertain = uncertain_plant(case)
@@ -76,7 +77,7 @@ def study() -> dict[str, Any]:
 
 # %% Simulation: the nominal machine, and the worst one, through a move of 100 um
 def moved(loop: fx.ClosedLoop) -> fx.Response:
-    """Return a move in 40 ms and what follows."""
+    """Return a move in 40 ms and the time after it."""
     move = fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
     return fx.simulate(loop, reference=move, duration=0.5, rng=7)
 
@@ -86,7 +87,7 @@ def difference(runs: dict[str, fx.Response]) -> np.ndarray:
     return np.asarray(runs["worst"]["die:error"] - runs["nominal"]["die:error"])
 
 
-# %% After-care: H-infinity with fewer states, and in C
+# %% After the design: H-infinity with fewer states, and in C
 def aftercare(weighted: fx.StandardPlant, full: fx.Controller, folder: Path) -> dict[str, Any]:
     """Return the reduced controller, and the files that hold it."""
     small = reduce_controller(weighted, full)

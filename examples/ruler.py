@@ -1,10 +1,11 @@
 """From a real measurement to a plant and a controller: a ruler, hit by hand at ten places.
 
-Run it: ``python examples/ruler.py``. No model is made: the responses give the modes, the modes the
-plant, and the measured responses say what the controller does to the ruler itself. The ruler hangs
-free, the accelerometer is at its end, ten places along it were hit; mains of 50 Hz are on the
-record. The force is not calibrated: motions are in the record's own unit. The picture goes to
-``examples/out``. Data: pydvma (Butlin, Woodhouse; BSD-3), see ``data/ruler.LICENSE``.
+Run it: ``python examples/ruler.py``. No finite-element model is used: the responses give the modes,
+the modes give the plant, and the measured responses show the effect of the controller on the ruler
+itself. The ruler hangs free, the accelerometer is at its end, and ten places along it were hit; the
+record contains 50 Hz from the mains. The force is not calibrated: motions are in the unit of the
+record. The picture goes to ``examples/out``. Data: pydvma (Butlin, Woodhouse; BSD-3), see
+``data/ruler.LICENSE``.
 """
 
 # %% Names and numbers
@@ -22,17 +23,17 @@ import flexplant as fx
 HERE = Path(globals().get("__file__", ".")).parent  # "." in a notebook
 OUT = HERE / "out"
 PLACES = range(1, 11)
-END, FAR = "10:z", "1:z"  # where the accelerometer is, and the other end
+END, FAR = "10:z", "1:z"  # end with the accelerometer, and the other end
 RATE, DELAY = 5e3, 1  # Hz, samples
 LOWER = 4.0  # by how much the highest peak at the far end is to be lowered
-NOISE = 0.01  # of the sensor, beside the highest peak of what it measures
+NOISE = 0.01  # of the sensor, relative to the highest peak of its signal
 ROOTS = 4.73004, 7.85320, 10.99561, 14.13717  # cos x cosh x = 1: a free beam, f as x^2
-EFFORT = 1.0  # weight of the coil's force, beside the hand's
+EFFORT = 1.0  # weight of the coil's force, relative to the hand's
 
 
 # %% The measurement
 def measured() -> fx.Frf:
-    """Return the responses at the accelerometer's end to hits, by reciprocity those to its end."""
+    """Return the responses at the accelerometer to hits; by reciprocity, those to hits there."""
     stored = np.load(HERE / "data" / "ruler.npz")
     data, names = stored["accelerance"].astype(complex)[:, None], [f"hit{i}" for i in PLACES]
     return fx.Frf(stored["freq"], data, ["end"], names, quantity="acceleration")
@@ -46,8 +47,8 @@ def identified(frf: fx.Frf) -> Any:
 def bending(found: Any) -> Any:
     """Return the modes that move the end as the hit at the end does: bending.
 
-    A residue at the place that is driven is real and positive, ``2 i omega psi l > 0``. Torsion
-    is seen by an accelerometer on one side and a hit on the other with the opposite sign.
+    A residue at the driven place is real and positive, ``2 i omega psi l > 0``. Torsion has the
+    opposite sign if the accelerometer is on one side and the hit on the other.
     """
     own = 2j * found.poles.imag * (found.shapes * found.participation)[-1]
     return found.select(np.flatnonzero(own.real > 0).tolist())
@@ -66,7 +67,7 @@ def plant(found: Any) -> fx.StandardPlant:
 
 
 def controller(plant: fx.StandardPlant, freq: np.ndarray) -> fx.Controller:
-    """Return the H-infinity controller that lowers the peak, as little effort as it takes."""
+    """Return the H-infinity controller that lowers the peak with the least effort."""
     peak, seen = (
         np.abs(fx.frequency_response(plant.system, freq)[name, "hand"]).max()
         for name in ("far:z", "y")
@@ -75,11 +76,11 @@ def controller(plant: fx.StandardPlant, freq: np.ndarray) -> fx.Controller:
     return fx.design_hinf(plant.weighted(z=weights, w={"y:noise": NOISE * seen}))
 
 
-# %% What it does to the ruler itself: the measured responses in closed loop
+# %% Effect on the ruler itself: the measured responses in closed loop
 def on_the_ruler(frf: fx.Frf, controller: fx.Controller) -> np.ndarray:
     """Return the response (10, n_freq) at all places, to a hand at the end, of the closed loop.
 
-    Of the measured accelerance H with K behind hold and delay: ``H / (1 - K H_end)``.
+    With the measured accelerance H, and K including hold and delay: ``H / (1 - K H_end)``.
     """
     s, T = 2j * np.pi * frf.freq, 1 / RATE
     H = frf.converted("displacement").data[:, 0]

@@ -1,9 +1,10 @@
-"""A stage that scans under heads on its frame: what the position does, and controllers that follow.
+"""A stage that scans under heads on its frame: the effect of the position, scheduled controllers.
 
 Run it: ``python examples/scanning_stage.py``. The plate moves 200 mm in x below a lens and four
-encoder heads that stay with the frame, so that each point of it that is measured or exposed
-depends on x. One observer and one servo designed at the centre stand beside designs at eleven
-positions, linear between them. Both run on a machine of another formulation than the model's.
+encoder heads that stay with the frame, so that the measured and exposed points on the plate depend
+on x. One observer and one servo designed at the centre are compared with designs at eleven
+positions, interpolated linearly. Both run on a machine that is computed with another theory than
+the model.
 """
 
 # %% Names and numbers
@@ -25,7 +26,7 @@ L, RATE, DELAY, BANDWIDTH = 0.6, 10e3, 1.3, 30.0  # m, Hz, samples, Hz
 HEADS = [(x, y, 0.0) for y in (0.05, L - 0.05) for x in (0.15, L - 0.15)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 X = fx.plant.Position("x", range=(-0.1, 0.1))
-BELOW = {"x": (-1.0, 0.0, 0.0)}  # what is below a head moves against the stage
+BELOW = {"x": (-1.0, 0.0, 0.0)}  # the point below a head moves opposite to the stage
 MODES = [4, 5, 6, 7, 8]  # measured
 NOTCHES = [360.0]  # Hz: the same at all positions
 #: m: from -0.1 to 0.1 at 0.8 m/s
@@ -76,7 +77,7 @@ def main() -> dict[str, Any]:
     schedule = fx.loop.schedule_loops(plant, design, places=np.linspace(*X.range, 11))
     print(schedule)
 
-    # %% What the position does: of the model, then of the machine
+    # %% Effect of the position: on the model, then on the machine
     truth = machine.loop(PORTS, *centre.blocks).plant
     places = np.linspace(*X.range, 5)
 

@@ -1,10 +1,10 @@
-"""A solid stage with six degrees of freedom, imported from foreign matrices.
+"""A solid stage with six degrees of freedom, imported from matrices of another program.
 
 Run it: ``python examples/solid_stage.py``. A block of aluminium, meshed with eight-node bricks, is
-written as a finite-element program would, in Matrix Market files in mm and t with a table of the
-DOFs, and read back in SI: flexplant then knows matrices and nodes, but no elements. The shapes
-between the nodes are interpolated, so that sensors, actuators and the point of interest may be
-anywhere in the block.
+written as a finite-element program would do it: in Matrix Market files in mm and t with a table of
+the DOFs, and read back in SI: flexplant then knows matrices and nodes, but not the elements. Mode
+shapes are interpolated between the nodes, so that sensors, actuators and the point of interest may
+be anywhere in the block.
 
 Six sensors and six actuators (each through its amplifier, with 40 us of cable) control x, y, z, rx,
 ry and rz of a point that no sensor sees.
@@ -139,7 +139,7 @@ def ports() -> fx.Ports:
 
 # %% Six axes
 def main() -> dict[str, Any]:
-    """Return what the tests pin."""
+    """Return the numbers that the tests check."""
     model = imported()
     modes = fx.solve_modes(model, count=20, damping=fx.ModalDamping(0.005))
     plant = fx.assemble_plant(modes, ports())

@@ -1,8 +1,8 @@
 """Specifications of a stage as tests: ``python -m pytest examples/test_specifications.py``.
 
-``python examples/test_specifications.py`` prints the tables that they check. The design runs on a
-reduced model, the tests on a virtual machine of another formulation with all its modes. When one
-fails, the message is the table of all requirements, reached and allowed.
+``python examples/test_specifications.py`` prints the tables that they check. The design uses a
+reduced model; the tests use a virtual machine with all its modes, computed with another theory.
+When a test fails, the message is the table of all requirements, with reached and allowed values.
 """
 
 # %% The stage, its channels and what it must do

@@ -1,4 +1,4 @@
-"""Mixed sensitivity of four textbook plants: S, T and K S below the bounds that weights set.
+"""Mixed sensitivity of four textbook plants: S, T and K S below bounds given by weights.
 
 Run it: ``python examples/textbook.py``. The plants are a slow lag, an integrator, a rigid body with
 a lightly damped mode, and a lag with a zero in the right half plane. Each weight says how small one
@@ -7,9 +7,9 @@ quantity has to be: ``|S| < 1 / |W_S|`` for errors, ``|K S| < 1 / |W_KS|`` for t
 norm gamma of all weighted quantities together. Where gamma is below 1 all bounds are met, where it
 is above 1 they are missed by at most that factor.
 
-The table compares gamma with its lower bound, which no controller undercuts. For a zero z in the
-right half plane a bound is known by hand: S(z) = 1 whatever the controller does, so that gamma is
-at least ``|W_S(z)|``. A bandwidth close to such a zero cannot be had: the last column shows it.
+The table compares gamma with a lower bound that holds for every controller. For a zero z in the
+right half plane a bound is known by hand: S(z) = 1 for every controller, so that gamma is at least
+``|W_S(z)|``. A bandwidth close to such a zero is impossible: the last column shows it.
 """
 
 # %% Plants and weights
@@ -62,7 +62,7 @@ def main() -> dict[str, tuple[Any, fx.Controller]]:
 
 
 def least_by_hand(case: Case, zero: float = ZERO) -> float:
-    """Return ``|W_S(z)|``, below which no controller comes for a plant with that zero."""
+    """Return ``|W_S(z)|``, the lower bound on gamma for a plant with that zero."""
     return float(abs(case.weights["S"].evaluated(zero)[0, 0]))
 
 

@@ -1,9 +1,10 @@
-"""A wafer stage that no drawing resembles: what a model and a measurement of this machine buy.
+"""A wafer stage that differs from its drawing: what a model and a measurement gain.
 
 Run it: ``python examples/wafer_stage.py``. A meshed plate is reduced, updated and calibrated with
-the poles of measured responses, and what is designed on it runs on a virtual machine of another
-formulation: (1) estimates of the die's motion, (2) a controller that tolerates what is not known of
-the modes, beside one that does not, (3) a further sensor. It stops when a claim is no longer true.
+the poles of measured responses. Designs on it run on a virtual machine that is computed with
+another theory: (1) estimates of the die's motion, (2) a controller that tolerates the uncertainty
+of the modes, compared with one that does not, (3) one more sensor. The script stops when a claim is
+no longer true.
 """
 
 # %% Names and numbers
@@ -59,7 +60,7 @@ def reduced(damping: float, *, compliance: bool = True) -> fx.ReducedModel:
     return fx.reduce(modes, fx.DesiredDofs(grid if compliance else [*grid[:12], *grid[13:]]))
 
 
-# %% The update: measured poles give mass at z8 and stiffness, then stand in the model themselves
+# %% The update: measured poles give mass at z8 and stiffness, then replace those of the model
 def identified(machine: Any) -> fx.MeasuredModes:
     """Return the machine's poles and shapes at the corners from noisy frequency responses."""
     frf = machine.measure_frf(ports(), period=1.0, periods=3, discard=1, rng=4)
@@ -73,7 +74,7 @@ def numbered(found: fx.MeasuredModes, model: Any) -> fx.MeasuredModes:
 
 
 def meshed(damping: float, mass: float = 0.0, stiffer: float = 0.0) -> fx.Modes:
-    """Return 160 modes of a finer mesh, which are also those that a reduced model leaves out."""
+    """Return 160 modes of a finer mesh; they include those that a reduced model truncates."""
     material = ALUMINIUM | {"youngs_modulus": (1.0 + stiffer) * ALUMINIUM["youngs_modulus"]}
     fine = fx.kirchhoff_plate(size=(L, L), thickness=0.0272, elements=(40, 40), **material)
     part = fx.PointMass(fine.dofs.nearest((L / 2, L / 4, 0.0), "z"), mass)
@@ -82,7 +83,7 @@ def meshed(damping: float, mass: float = 0.0, stiffer: float = 0.0) -> fx.Modes:
 
 
 def models(damping: float) -> dict[str, Any]:
-    """Return a machine, its models, those with the modes left out, and what is not known."""
+    """Return a machine, its models, those with truncated modes, and the uncertainty."""
     machine, nominal = fx.testbeds.wafer_stage(damping=damping, rate=RATE), reduced(damping)
     found = identified(machine)
     poles = numbered(found, nominal)
@@ -116,7 +117,7 @@ def plant_of(case: dict[str, Any], kind: str, force: float = 1e-3) -> fx.Standar
     return plant.discretized(RATE, delay=case["machine"].delay)
 
 
-# %% Estimation: four ways from the sensors to the die, each with more of the machine in it
+# %% Estimation: four ways from the sensors to the die, each with more knowledge of the machine
 def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
     """Return, for each axis, predicted errors and those of 5 runs of 2 s under a slow servo."""
     nominal, fit = (plant_of(case, kind, force) for kind in ("drawing", "measured"))
@@ -134,7 +135,7 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
     return {axis: fx.simulation.compare_estimators(designs, run, axis, start=1.0) for axis in axes}
 
 
-# %% Control: H-infinity of a sure model and of an unsure one, and the best servo that holds
+# %% Control: H-infinity without and with uncertainty, and the best servo that stays stable
 def hinf(plant: fx.StandardPlant) -> tuple[Any, ...]:
     """Return the errors that the H-infinity controller reads, and the controller."""
     errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, BANDWIDTH)
@@ -173,15 +174,15 @@ def control(case: dict[str, Any], asked: float | None = None) -> dict[str, dict[
     return found
 
 
-# %% Placement: where a fifth sensor would help the die most, the die itself left out
+# %% Placement: where a fifth sensor helps the die most, outside the die itself
 def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
-    """Return the predicted error of the die over places of a sensor beside those at the corners."""
+    """Return the predicted error of the die over places of a sensor in addition to the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
     plant, goal, off = plant_of(case, "measured"), fx.PoiVariance("die"), fx.placement.OffPoi(0.12)
     return fx.placement.sensor_map(plant, points, goal, asd=NOISE, constraints=[off])
 
 
-# %% What it shows: each claim is printed with its figures, and stops the example when untrue
+# %% Results: each claim is printed with its figures, and stops the example when untrue
 def claims(cases: dict[float, dict[str, Any]]) -> dict[str, bool]:
     """Return what this example shows, and whether it is true."""
     light, usual = cases[0.001], cases[0.01]
@@ -232,7 +233,7 @@ def table(result: dict[str, Any]) -> str:
         poles, modes = case["poles"], case["models"]["updated"].modes()
         off = 100 * (poles.freq / modes.freq[np.array(poles.modes) - 1] - 1.0)
         parts.append(f"\nUpdate at {damping:.1%} (true: 0.5 kg, more elsewhere)\n{case['fit']}")
-        parts.append("measured poles beside it [%]: " + " ".join(f"{x:+.2f}" for x in off))
+        parts.append("measured poles relative to it [%]: " + " ".join(f"{x:+.2f}" for x in off))
     for damping, case in cases.items():
         for force, errors in case["errors"].items():
             parts.append(f"\n{damping:.1%} damping, amplifiers {force:g} N/sqrt(Hz):\n{errors}")

@@ -1,9 +1,9 @@
-"""Loops shaped by hand in a browser, on what a machine answers: from measured FRFs to C code.
+"""Loops shaped by hand in a browser, on measured FRFs of a machine, up to C code.
 
 Run it: ``python examples/workbench.py``. It measures the virtual stage, opens the workbench on its
-frequency responses, with a model beside them for the error at the die and the modes left out, and
-waits until Ctrl-C. ``--no-browser`` only prints what the page shows of the same design, which is
-made here as the page makes it. On a measurement of yours, without a line of Python:
+frequency responses, with a model for the error at the die and the truncated modes, and waits until
+Ctrl-C. ``--no-browser`` only prints the results that the page would show for the same design. For
+your own measurement, without a line of Python:
 ``python -m flexplant.workbench measured.uff --rate 10000``.
 """
 
@@ -32,7 +32,7 @@ PORTS = fx.Ports(
 )
 
 
-# %% What is known: responses of the machine, and the drawing
+# %% Available: responses of the machine, and the drawing
 def measured() -> fx.Frf:
     """Return the responses from each actuator to each sensor, with their variance."""
     machine = fx.testbeds.wafer_stage(rate=RATE)
