@@ -198,7 +198,7 @@ def test_kinds_are_numbers_of_directions():
         (lambda: DofSet([1], [["z"]], np.zeros((1, 3))), LabelError, "unknown directions"),
         (lambda: DofSet([1], ["z"], np.zeros((1, 3)), "cubic"), LabelError, "interpolated"),
         (lambda: DofSet.from_table([{"node": "a", "direction": "z", "x": 0, "y": 0, "z": 0}]),
-         LabelError, "column 'node'.*row 0.*no number"),
+         LabelError, "column 'node'.*row 0.*not a number"),
         (lambda: DofSet.from_table([{"node": 1, "direction": "z", "x": "1 m", "y": 0, "z": 0}]),
          LabelError, "column 'x'.*'1 m'"),
         (lambda: DofSet.from_table([{"node": 1, "direction": "z", "x": None, "y": 0, "z": 0}]),

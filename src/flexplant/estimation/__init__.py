@@ -1,8 +1,9 @@
 """Estimation: the motion at a point of interest from sensors elsewhere.
 
 - `design_kalman(plant)`: the stationary filter of the POIs; modes of the evaluation model that are
-truncated in the plant count as noise. - `KalmanEstimator.rms(channel)`: the predicted error;
-``rms(channel, on=other_plant)``: the error on another plant.
+  truncated in the plant count as noise.
+- `KalmanEstimator.rms(channel)`: the predicted error; ``rms(channel, on=other_plant)``: the error
+  on another plant.
 - `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
   moving POI); ``step(y, u)`` runs sample by sample.
 - `consistency`, `estimate_noise`: a test of the filter with a record, and noise levels from it.

@@ -175,22 +175,26 @@ def consistency(
     With a correct model the whitened innovations are white noise of unit variance. Five tests share
     the level (each at ``level^(1/5)``): the mean of their squares (NIS, chi-square), their
     correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett), their
-    largest one and their mean. - a mean that exceeds the density at the lowest lines: the *offset*
-    of a sensor.
+    largest one and their mean. The likely causes follow from the failed tests:
+
+    - single samples of a sensor that noise cannot explain, and whose effect on the filter is that
+      of one sample: *outliers*;
+    - a mean that exceeds the density at the lowest lines: the *offset* of a sensor.
 
     The effect of these is removed, and the rest has one more cause:
 
     - coloured as on the evaluation model, if there is one: the plant is correct and its
-    *truncation*, or the *folding* of modes above half the rate, is visible;
+      *truncation*, or the *folding* of modes above half the rate, is visible;
     - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
-    - coloured, but explained by other levels of process and sensor noise (two levels, fitted to the
-    spectrum): the *noise ratio*; - another peak, which the change of a neighbouring mode explains
-    better than an additional mode: the *frequency* or damping of that mode. Frequency and damping
-    of all such modes are fitted to the record by
-      maximum likelihood, the commands counted, so that a closed loop does not bias them (`moved`);
+    - coloured, but explained by other levels of process and sensor noise (two levels, fitted to
+      the spectrum): the *noise ratio*;
+    - another peak, which the change of a neighbouring mode explains better than an additional
+      mode: the *frequency* or damping of that mode. Frequency and damping of all such modes are
+      fitted to the record by maximum likelihood, including the commands, so that a closed loop
+      does not bias them (`moved`);
     - any other peak: *truncation*, if it lies above all modes or a truncated mode is known there;
-    *folding*, if the plant has modes above it, or the truncated mode lies above half the rate; or a
-    disturbance that is missing in the plant.
+      *folding*, if the plant has modes above it, or the truncated mode lies above half the rate;
+      or a disturbance that is missing in the plant.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Export: C code of controllers, and functional mock-up units.
 
 - `write_c`: a controller in one C file with its header, from a `fx.ClosedLoop` (observer and servo
-together) or a `fx.Controller`; 60 states take 0.04 us per sample.
+  together) or a `fx.Controller`; 60 states take 0.04 us per sample.
 - `write_fmu`: a `fx.StandardPlant` or a controller, sampled, for FMI 2.0 and 3.0.
 
 Names elsewhere: MATLAB Coder, Simulink Coder.

@@ -46,7 +46,7 @@ def structural_modes(
       geometry, and residual vectors :math:`v v^T/\omega_v^2 = G`, completed from the places that
       are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`;
     - modes just outside the band become residual vectors too, with their frequency and damping,
-    where they are modes of a structure: real shapes with equal input and output shapes.
+      where they are modes of a structure: real shapes with equal input and output shapes.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 - `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
 - `read_matrices`: matrices without DOFs, which still give `frequencies(10)`; `read_modes`: modes of
-a solved model.
+  a solved model.
 - `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
   `estimate_frf`.
 - `read_mat`, `write_mat`: systems to and from MATLAB.

@@ -5,14 +5,13 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 
 - `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
-- `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes a set of
-them.
+- `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes some.
 - `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is uncertain, as Deltas
-for analysis and as machines drawn at random; your own kind of uncertainty derives from
-`Uncertainty`. Dynamics that the model lacks: `Neglected` modes, `UnmodelledDynamics(weight,
-at="u1")`. - `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body,
-with its mass);
-  `frequency_response` of structures between their ports.
+  for analysis and as machines drawn at random; your own kind of uncertainty derives from
+  `Uncertainty`. Dynamics that the model lacks: `Neglected` modes,
+  `UnmodelledDynamics(weight, at="u1")`.
+- `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body, with its
+  mass); `frequency_response` of structures between their ports.
 
 >>> import flexplant as fx
 >>> chain = fx.chain(masses=[1.0, 0.3], stiffnesses=[2e4])
@@ -31,9 +30,11 @@ with its mass);
   z (3) die:x  die:error  u1:effort
   y (2) y1  die:ref
 
-| channel | meaning | |---|---| | `die:x`, `die:ref` | an axis of a POI, and the reference it shall
-follow | | `die:error`, `die:hat` | reference minus POI, and its estimate | | `y1:noise`,
-`u1:effort` | noise of a sensor, force of an actuator |
+| channel | meaning |
+|---|---|
+| `die:x`, `die:ref` | an axis of a POI, and the reference it shall follow |
+| `die:error`, `die:hat` | reference minus POI, and its estimate |
+| `y1:noise`, `u1:effort` | noise of a sensor, force of an actuator |
 
 White noise has the intensity asd^2 / 2, a sensor's sample the variance asd^2 rate / 2. Within a
 sample: measure, update, control, hold.

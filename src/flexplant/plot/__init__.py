@@ -5,7 +5,7 @@
 - `update`, `parameters`, `residual`, `stabilisation`, `identified`: measurements and updates.
 - `layout`, `mode_shape`, `sensor_map`, `placed`: the machine and its devices.
 - `report(path, ...)`: a whole design as one HTML file, with zoomable pictures, moving mode shapes,
-certificates, seeds and versions.
+  certificates, seeds and versions.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()

@@ -1,8 +1,8 @@
 """Set-points, sampled-data runs of a closed loop, and error metrics.
 
 - `simulate(loop, reference=, duration=, rng=)`: a `Response`, with nonlinear `elements=`
-(`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, your own) and optionally
-between samples; the noise is that of `fx.design_kalman`.
+  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, your own) and
+  optionally between samples; the noise is that of `fx.design_kalman`.
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
   robust to a change of the frequency) and `quiet_setpoint` leave modes at rest;

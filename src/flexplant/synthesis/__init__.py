@@ -9,7 +9,7 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
   `design_structured` (fixed order, PID and notches).
 - `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
 - `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
-uncertain plants, from machines (``plant.uncertain``) or from your own blocks (`uncertain_system`).
+  uncertain plants, from machines (``plant.uncertain``) or your own blocks (`uncertain_system`).
 
 To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
 `second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write what runs elsewhere.

@@ -51,7 +51,7 @@ class Machines(Value):
 
     - deviation s, changes dp of the parameters and slope b from their posterior (`Trend`);
     - trend ``t = sign(b) log(1 + 2 |b| g) / 2`` with g the frequency over the largest measured one;
-    a fraction r of it, uniform between 0 and 1, acts as mass and the rest as stiffness;
+      a fraction r of it, uniform between 0 and 1, acts as mass and the rest as stiffness;
     - ``M' = exp(-r t) (I + sum dp dM) exp(-r t)``, ``K' = Omega exp(E) Omega + sum dp dK``, E
       symmetric with ``2 (s e + (1 - r) t)`` on its diagonal and deviations ``sqrt(2) s`` off it:
       frequencies and shapes change together. Rigid-body masses have the deviation 2 s, since they
