@@ -14,9 +14,9 @@ From finite-element matrices and a measurement to the closed-loop error at a poi
         +-->K--+                               v           v
                          close_loop(plant, *blocks) --> ClosedLoop --simulate--> Response
 
-Every model of one machine takes the same `Ports`: the drawing, the updated model, the truth. Each
-room below has its own page, for example ``help(fx.plant)``: its purpose, an example, and the names
-of the same functions in other tools.
+The same `Ports` serve every model of one machine: the drawing, the updated model, and the virtual
+machine. Each room below has its own page, for example ``help(fx.plant)``: its purpose, an example,
+and the names of the same functions in other tools.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -39,25 +39,27 @@ of the same functions in other tools.
 | channels | inputs `[w; u]`, outputs `[z; y]`; `u = K y`: the sign is in the controller |
 | names | `die:z` (POI), `die:ref`, `die:error` (reference minus POI), `die:hat` (estimate) |
 | time | dt = 0 is continuous; within a sample: measure, update, control, hold |
-| modes | numbered from 1, rigid-body modes included; these are undamped unless a damper says so |
+| modes | numbered from 1, including rigid-body modes; only dampers damp rigid-body modes |
 
 **What to rely on**
 
-- Answers carry a check made by another route. A Kalman filter's predicted error is recomputed by a
-  Stein equation, an H-infinity controller is verified by the closed-loop norm, found with proof and
-  by a sweep; modes by residual and count. A failed check raises.
+- Every result is checked by a second method. The predicted error of a Kalman filter is computed
+  again from a Stein equation. An H-infinity controller is verified by its closed-loop norm, once
+  with proof and once by a frequency sweep. Modes are verified by residuals and a count. A failed
+  check raises an error.
 - Checks go beyond the design model. A plant knows its *evaluation model*, a larger model of the
-  same machine: the modes that the plant lacks are noise in a filter's predicted error, and every
-  loop is tried on the plant that has them: what they make unstable is named. Results of a plant
-  without one say so. A fit says by chi-square whether the parameters explain the data.
-- SI units serve as they are. Gains of 1e-9 m/N, damping of 0.1 %, rigid-body modes at exactly zero,
-  repeated modes: scaling happens inside.
-- Nothing is repaired silently. Errors say what is wrong, what was got, why it matters and what to
-  do next.
+  same machine. The modes that the plant lacks count as noise in the predicted error of a filter,
+  and every loop is also tested on the plant with these modes; loops that they make unstable are
+  reported. Results of a plant without evaluation model say so. For a fit, chi-square shows whether
+  the parameters explain the data.
+- SI units need no scaling by the user. Gains of 1e-9 m/N, damping of 0.1 %, rigid-body modes at
+  exactly 0 Hz and repeated modes are scaled internally.
+- Nothing is repaired silently. Error messages state what is wrong, which value was found, why
+  it matters and what to do next.
 
 **Which example for which task** (``python examples/<name>.py`` in the repository)
 
-- see what a model of this machine buys: `examples/wafer_stage.py`
+- see what a model and a measurement gain: `examples/wafer_stage.py`
 - read matrices of a finite-element program: `examples/from_nastran.py`; an imported solid in six
   axes: `examples/solid_stage.py`
 - mesh a body with holes by scikit-fem: `examples/from_skfem.py`
@@ -79,9 +81,10 @@ of the same functions in other tools.
 - write a specification as tests: `examples/test_specifications.py`
 - run a controller in C with the machine, at 10 kHz: `examples/real_time.py`
 
-**Beside its peers.** CPU seconds on one core of a server, ours and a peer's in one run of
-``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio above 1 means that ours is
-faster; the answers are compared first. Figures of another run differ by some 20 %.
+**Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
+package (peer) in one run of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
+above 1 means that flexplant is faster; the results are compared first. Times vary by about 20 %
+from run to run.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
@@ -103,22 +106,22 @@ faster; the answers are compared first. Figures of another run differ by some 20
 | poles of a close pair in noise: error 5e-07 | 0.51 s | scikit-rf: 7e-07 | 0.5 s | 0.97 |
 | a sparse OUTPUT4 file of Nastran | 7.1 ms | pyYeti | 32 ms | 4.5 |
 
-Peers are better where no check is wanted. Of the time for all modes of the plate, a third goes into
-residuals of each, and a third sets rigid-body motions apart and finds soft modes again to all
-digits; a hold returns a labelled system, checked; H-infinity of 3 states is enclosed to 1 %, its
-norm found twice; mu has a lower bound too, by a perturbation that reaches it. On plates of 10 000
-to 300 000 DOFs eigsh with a factor of CHOLMOD or PARDISO is 1.4 to 1.8 times faster than
-`solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_peers.py``).
-``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` times many more.
+Peers are faster where checks are not wanted. For all modes of the plate, a third of the time goes
+into residuals, and a third into the separation of rigid-body motions and the full accuracy of soft
+modes. The zero-order hold returns a checked system with names. H-infinity of 3 states is bounded
+to 1 % and its norm computed twice. mu has a lower bound too, from a perturbation that reaches it.
+On plates of 10 000 to 300 000 DOFs eigsh with a factor of CHOLMOD or PARDISO is 1.4 to 1.8 times
+faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_peers.py``). ``python
+-m pytest -n 0 -m benchmark -s tests/benchmarks`` times many more.
 
 **Limits**
 
 - Sizes tried: models of 2 to 998 787 DOFs (24 modes of that one: 39 to 45 s and 4.8 GB on one core;
-  of a solid of 292 008: 85 s and 4.1 GB; ``python tests/benchmarks/modes_peers.py solid 45 ours``
-  repeats it; memory settings are in `flexplant.sparse`); plants of 2 to 490 states; a Kalman filter
-  of 1000 states (18 s and 0.4 GB; time grows with their third power); H-infinity in six axes with
-  40 modes (3 s); four of 1024 candidate places (41 s, 0.7 % above what is proven); studies of
-  10 000 machines (91 MB from the first thousand to the last); 1e8 samples of a filter in C.
+  for a solid of 292 008 DOFs: 85 s and 4.1 GB; ``python tests/benchmarks/modes_peers.py solid 45
+  ours`` repeats it; memory settings are in `flexplant.sparse`); plants of 2 to 490 states; a Kalman
+  filter of 1000 states (18 s and 0.4 GB; time grows with their third power); H-infinity in six axes
+  with 40 modes (3 s); four of 1024 candidate places (41 s, 0.7 % above what is proven); studies of
+  10 000 machines (91 MB of memory throughout); 1e8 samples of a filter in C.
 - Dampings tried: 0.01 % to 1 %, none at all, and magnets of negative stiffness.
 - Units tried: SI, and files in mm and t or other units of length, mass and time.
 - Structures are linear and time-invariant, M, D and K symmetric: no gyroscopic terms, contact or
@@ -177,11 +180,11 @@ to 300 000 DOFs eigsh with a factor of CHOLMOD or PARDISO is 1.4 to 1.8 times fa
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy
 (MIT), matplotlib (its own, of BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e
 '.[ansys]'``: ``hdf5`` is h5py and ``workbench`` panel (BSD-3), ``uff`` pyuff and ``ansys``
-ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc (MIT-0) and latex2mathml (MIT). What
-these need in turn has licences of the same kinds. slycot (GPL-2) and other peers are used in tests
-only. Sources are cited by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its
-text says 0.1 % modal damping while its printed eigenvalues have 1 %; `examples/paper_plate.py`
-shows both.
+ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc (MIT-0) and latex2mathml (MIT). Their
+own dependencies have similar licences. slycot (GPL-2) and other peers are used in tests only.
+Sources are cited by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its text
+says 0.1 % modal damping while its printed eigenvalues have 1 %; `examples/paper_plate.py` shows
+both.
 """
 
 from importlib import import_module as _import_module

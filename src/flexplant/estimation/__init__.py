@@ -21,10 +21,11 @@
 
 **How accurate is a predicted error?** As accurate as the evaluation model, including errors of its
 mesh: ``modes.extrapolated(coarser)`` corrects these, and ``observer.interval`` gives the interval
-of the error on machines that agree with a measurement. On a plate of 0.6 m x 0.6 m 8 x 8 elements
-predict the error of z on finer meshes within 6 %, that of rotations within 23 %; on one of 0.5 m x
-0.3 m they predict z 65 % too large, since other shapes mix in modes of almost one frequency above
-10 kHz. There 12 x 12 elements are within 5 % for z, compared with 24 x 24.
+of the error on machines that agree with a measurement. For a plate of 0.6 m x 0.6 m, a mesh of 8 x
+8 elements predicts the error of finer meshes within 6 % in z and within 23 % in rotations. For a
+plate of 0.5 m x 0.3 m the same mesh predicts an error in z that is 65 % too large: above 10 kHz,
+modes of nearly equal frequency have other shapes on a finer mesh. There 12 x 12 elements agree with
+24 x 24 within 5 % in z.
 
 Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 (`KalmanEstimator.to_filterpy`).

@@ -1,4 +1,4 @@
-"""Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
+"""Readers and writers of other formats; for values of flexplant use `.save` and `flexplant.load`.
 
 - `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
 - `read_matrices`: matrices without DOFs, which still give `frequencies(10)`; `read_modes`: modes of

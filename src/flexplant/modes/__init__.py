@@ -1,7 +1,7 @@
 """Modes of a structure: the eigenvalue problem solved, counted and checked; attachment vectors.
 
 `solve_modes` gives the lowest modes, mass-normalised, rigid-body modes at exactly 0. A Sturm count
-says that no mode is missing, a residual comes with each. `compliance_at=` keeps the static
+proves that no mode is missing, and each mode has a residual. `compliance_at=` keeps the static
 compliance of the truncated modes where forces act. Modes are numbered from 1.
 
 - `solve_modes(model, count=, damping=, compliance_at=)`: small and large models.

@@ -2,11 +2,11 @@
 
 - `place_sensors(plant, candidates, count)`: the best choice for the error at the POI.
 - `place_actuators`, `place_both`: the same for forces, and for both together.
-- `score_sensors`, `score_actuators`: what each candidate is worth alone.
+- `score_sensors`, `score_actuators`: the score of each candidate alone.
 - `sensor_map`: the error over a grid of places of one more sensor.
-- `pareto_curve`: what more devices buy.
+- `pareto_curve`: the best score over the number of devices.
 
-Criteria are values (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as are constraints
+Criteria are objects (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as are constraints
 (`Excluded`, `OffPoi`, `MinimumDistance`, ...) and searches (`Exchange`, `Exhaustive`,
 `BranchAndBound`, which proves its answer).
 

@@ -1,7 +1,7 @@
-"""Ports and the standard plant: the one bridge from (M, D, K) to (A, B, C, D).
+"""Ports and the standard plant: from (M, D, K) to (A, B, C, D).
 
-`Ports` say where disturbances w, actuators u, points of interest z and sensors y are, once for
-every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K y``.
+`Ports` define the places of disturbances w, actuators u, points of interest z and sensors y, once
+for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K y``.
 
 - `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
@@ -39,14 +39,15 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 White noise has the intensity asd^2 / 2, a sensor's sample the variance asd^2 rate / 2. Within a
 sample: measure, update, control, hold.
 
-**Weights of a stage.** ``plant.weighted(...)`` takes those of `stage_weights`, or weights of one's
-own: numbers, `fx.lti.low_pass_filter`, `fx.lti.inverse_sensitivity`, any system with one input
+**Weights of a stage.** ``plant.weighted(...)`` takes those of `stage_weights`, or your own
+weights: numbers, `fx.lti.low_pass_filter`, `fx.lti.inverse_sensitivity`, any system with one input
 and one output.
 
-What its numbers do, with the plate of ``examples/wafer_stage.py`` at 0.1 % damping, 10 kHz, 1.3
-samples late: designed on a reduced model with measured poles, with ``uncertainty`` for the
-others, judged on a machine of another formulation. "to" is where |S| from reference to error
-reaches 1, then its peak, the modulus margin at u, and |S| at 5 Hz::
+The effect of its arguments is shown for the plate of ``examples/wafer_stage.py`` at 0.1 % damping,
+10 kHz, with a delay of 1.3 samples. The design uses a reduced model with measured poles, with
+``uncertainty`` for the other modes; the results are those of a machine that is computed with
+another theory. "to" is the frequency at which |S| from reference to error reaches 1; the other
+columns are the peak of |S|, the modulus margin at u, and |S| at 5 Hz::
 
     bandwidth  changed          gamma   to [Hz]  |S| [dB]  margin at u  |S| at 5 Hz
            60                    1.00      44       5.1        0.53        0.0032
@@ -60,15 +61,15 @@ reaches 1, then its peak, the modulus margin at u, and |S| at 5 Hz::
           120  effort 30         1.00      57       5.5        0.48        0.0014
           120  noise 0.5         1.03      77       6.1        0.42        0.0005
 
-A larger effort makes the loop slower and its margin larger; disturbance and noise matter
-little here; peak 6 lets a mode that is off go unstable. Where frequencies are certain the
-ratios are 3 and 3: the larger disturbance or effort, the more |T| at u decides. Noise below
-0.02 leaves the controller more gain at the modes that the model lacks.
+A larger effort makes the loop slower and its margin larger. Disturbance and noise have
+little influence here. With peak 6 a mode of wrong frequency becomes unstable. Without uncertainty
+the ratios are 3 and 3: the larger disturbance or effort, the more |T| at u determines gamma. Noise
+below 0.02 gives the controller more gain at the modes that the model lacks.
 
-Without ``uncertainty`` the same model, designed for 80 Hz, is unstable on that machine. At 1 %
-damping it keeps a margin of 0.44 there (0.34 on the drawing), with ``uncertainty`` 0.50, where 80
-Hz are asked as well and 62 reached. `fx.design_stage` finds the largest bandwidth whose margin is
-0.4.
+Without ``uncertainty``, a design for 80 Hz on the same model is unstable on that machine. At 1 %
+damping that design has a margin of 0.44 on the machine (0.34 on the drawing). With
+``uncertainty`` the margin is 0.50, but |S| reaches 1 at 62 Hz already. `fx.design_stage` finds the
+largest bandwidth with a margin of 0.4.
 
 Names elsewhere: ``augw``, ``mixsyn``: `mixed_sensitivity`, then `fx.design_hinf`; ``connect``,
 ``sumblk``: not needed, channels are found by name.

@@ -6,7 +6,7 @@
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
   robust to a change of the frequency) and `quiet_setpoint` leave modes at rest;
-  `residual_vibration` says what is left on the evaluation model.
+  `residual_vibration` predicts the remaining vibration on the evaluation model.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: limits on margins and errors; a verdict compares them with achieved values.
 - `rms_along(loop, moving=)`: the errors of a moving machine along its path.
@@ -25,9 +25,9 @@
 
 Names elsewhere: ``lsim``, ``forced_response``, Simulink.
 
-**Many machines.** A pipeline is a plain function of one machine that returns a row of the table.
-`examples/fleet.py` has the whole chain: measure, update, calibrate, design, verify on the machine.
-With the names of the README's script, one controller for machines with other masses:
+**Many machines.** A pipeline is a plain function that takes one machine and returns a row of the
+table. `examples/fleet.py` has the whole chain: measure, update, calibrate, design, verify on the
+machine. With the names of the README's script, one controller for machines with other masses:
 
 ```python
 MASSES = [0.3, 0.6]  # kg
@@ -44,7 +44,7 @@ The same study runs on a laptop, on a pool of processes and on a cluster. The th
 to the last bit:
 
 ```python
-laptop = fx.study(MASSES, pipeline, rng=1, checkpoint="study.jsonl")  # killed, it goes on there
+laptop = fx.study(MASSES, pipeline, rng=1, checkpoint="study.jsonl")  # continues after a stop
 print(laptop)  # columns of arrays: pandas.DataFrame(dict(laptop)); "failed" says why, or nothing
 
 from concurrent.futures import ProcessPoolExecutor

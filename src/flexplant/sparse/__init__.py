@@ -1,8 +1,8 @@
 """Symmetric sparse factors: orderings, Cholesky, LDL', PARDISO, CHOLMOD.
 
 Large models are solved by a multifrontal factor in NumPy, without a compiler: nested dissection
-orders the unknowns, dense fronts do the work. It is used by `fx.solve_modes` and by frequency
-responses of structures, and needs no separate call. Another solver can be chosen:
+orders the unknowns, and the work is done in dense blocks. It is used by `fx.solve_modes` and by
+frequency responses of structures, and needs no separate call. Another solver can be chosen:
 
 >>> import flexplant as fx
 >>> plate = fx.kirchhoff_plate(

@@ -8,7 +8,8 @@ It is read from files (`fx.read_model`), or meshed here:
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
 - `ModalDamping` (of measured poles too), `Rayleigh`; a complex K is read as modal damping.
 - `check`: report on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
-- `interpolated`: shapes between the nodes of foreign matrices, so that a POI may be anywhere.
+- `interpolated`: shapes between the nodes of matrices without elements, so that a POI may be
+  anywhere.
 
 >>> import flexplant as fx
 >>> plate = fx.plate(

@@ -1,7 +1,7 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity, tuned loops.
 
-A `Controller` carries what was checked of it: norm by two routes, stability, the loop on a model
-with the modes left out (the plant's evaluation model), and how far each mode may be off.
+A `Controller` holds the results of its checks: the norm by two methods, stability, the loop on the
+evaluation model of the plant (with the truncated modes), and the allowed error of each mode.
 
 - `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
@@ -11,8 +11,8 @@ with the modes left out (the plant's evaluation model), and how far each mode ma
 - `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
   uncertain plants, from machines (``plant.uncertain``) or your own blocks (`uncertain_system`).
 
-To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
-`second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write what runs elsewhere.
+For the implementation: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
+`second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write code.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()

@@ -1,15 +1,15 @@
-"""Virtual machines: full-order truths with hidden differences, which answer like hardware.
+"""Virtual machines: full-order models with hidden differences, used like hardware.
 
-No machine here has the mesh or the formulation of a model that is designed on, so that what a
-design claims is judged by something else than itself.
+No machine here has the mesh or the plate theory of the models used for design, so that the claims
+of a design are tested independently.
 
 - `wafer_stage`: a free plate in polynomials with rotary inertia, masses that no drawing shows,
-  scattered stiffness and damping, sensors with steps, a delay.
+  scattered stiffness and damping, sensors with finite resolution, and a delay.
 - `magnet_stage`: a stage on magnets of negative stiffness, in six axes.
 - `three_masses`: a sampled standard plant of three masses, for small examples.
 - `gantry`, `dual_stage`, `steering_mirror`, `flexible_joint`, `isolation_table`, `hexapod`,
   `ball_screw`, `maglev_block`: sampled plants of driven machines with relative drives and sensors.
-- `WaferStage.measure_frf`, ``poles``: measurements; ``run``, ``loop``: a design runs on it.
+- `WaferStage.measure_frf`, ``poles``: measurements; ``run``, ``loop``: to test a design.
 
 >>> import flexplant as fx
 >>> machine = fx.testbeds.wafer_stage(damping=0.01)
@@ -20,7 +20,7 @@ array([244.7, 355.3, 455.1])
 ('u1',)
 
 A machine that you write has the same two methods, ``loop(ports, *blocks)`` and ``poles(modes)`` or
-``measure_frf(ports)``, and goes into `fx.study` like these.
+``measure_frf(ports)``, and can be used in `fx.study` like these.
 """
 
 from ..rooms import public_names as _public_names

@@ -1,16 +1,18 @@
 """The workbench: loops shaped by hand in a browser, on measured responses and on models.
 
 - `open_page`: ``fx.workbench.open_page(plant)`` opens the page on this machine, and ``python -m
-  flexplant.workbench measured.uff`` opens it on a file. In a notebook the answer is the page.
-- `WorkbenchServer`: ``design``, what was shaped last; ``serve``, ``close``.
-- `LoopLimits`: what the page draws as forbidden, and judges.
-- `open_file`: what the page opens by its path: a plant, or a design to go on with.
+  flexplant.workbench measured.uff`` opens it on a file. In a notebook the page is shown below the
+  cell.
+- `WorkbenchServer`: ``design``, the current design; ``serve``, ``close``.
+- `LoopLimits`: limits that the page draws and checks.
+- `open_file`: opens a file by its path: a plant, or a design to continue.
 
-The page shows L, Nyquist, S, T, KS, PS, the error in time and by source, the modes left out, and
-every machine of a fleet while a slider moves. What it makes is a `fx.synthesis.LoopDesign`, the
-elements of each axis, on or off: it saves, loads, and writes the script that makes it again. It
-needs Panel: ``pip install 'flexplant[workbench]'``. It is served to this machine only, reads no
-pickle, and opens no file but those whose path it was given. `examples/workbench.py` is its story.
+The page shows L, Nyquist, S, T, KS, PS, the error in time and by source, the truncated modes, and
+every machine of a fleet while a slider moves. Its result is a `fx.synthesis.LoopDesign`: the
+elements of each axis, switched on or off. It can be saved and loaded, and writes a script that
+repeats the design. The page needs Panel: ``pip install 'flexplant[workbench]'``. It accepts
+connections from this computer only, reads no pickle, and opens only files whose path it was given.
+`examples/workbench.py` shows its use.
 
 >>> import flexplant as fx
 >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
