@@ -306,13 +306,13 @@ class ClosedLoop(Value):
     def on_machines(self) -> MachineLoops:
         """The same controller around machines that agree with the measurement.
 
-        ModelError when none are known of the plant.
+        ModelError when the plant knows no such machines.
         """
         known = self.plant.machine.machines
         if known is None:
             raise ModelError(
-                "other machines are not known. Make the plant from fit.calibrated(measured) "
-                "with evaluation=, or of plant.uncertain(machines)."
+                "other machines are not known. Make the plant from fit.calibrated(measured) with "
+                "evaluation=, or use plant.uncertain(machines)."
             )
         return MachineLoops(self, known)
 
@@ -344,9 +344,9 @@ class ClosedLoop(Value):
     def tolerances(self) -> ModeTolerances | None:
         """Tolerances of modes; None for coupled modes or an unstable loop.
 
-        Where frequencies are stated as uncertain with the modes left out, where they are known;
-        `interval` says what happens when all is off at once. Frequencies are followed to 1 %, or to
-        2.5 times what is known.
+        If frequencies are stated as uncertain, truncated modes are included where they are known;
+        `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
+        or up to 2.5 times their uncertainty.
         """
         return reported_tolerances(self)
 
@@ -478,12 +478,12 @@ def close_loop(
     """Return the closed loop of a plant with controller blocks, connected by name.
 
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
-    applied command of an actuator (plant.u), or an output of another block. An output of a block
-    that has an actuator's name drives it, and several such outputs add; every other output is
-    monitored. A block may also read signals that are known in advance: the derivatives of a
-    reference (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`, `die:ref:snap`), which
-    `simulate` takes from the SetPoint, and forces (`u1:feedforward`), which are given as
-    references.
+    applied command of an actuator (plant.u), or an output of another block. A block output with the
+    name of an actuator drives that actuator; several outputs with the same name are added. All
+    other outputs are monitored. A block may also read signals that are known in advance: the
+    derivatives of a reference (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`,
+    `die:ref:snap`), which `simulate` takes from the SetPoint, and forces (`u1:feedforward`), which
+    are given as references.
 
     Parameters
     ----------

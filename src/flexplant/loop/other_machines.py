@@ -288,7 +288,7 @@ class ModeTolerances(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """What the mode that is nearest to what is known of it holds to."""
+        """Text of the mode whose tolerance is smallest relative to its uncertainty."""
         found: dict[str, float] = {}
         if self.modes.size:
             known = np.ones_like(self.least) if self.known is None else self.known
@@ -352,11 +352,11 @@ def mode_tolerances(
     known: Any = None,
     limit: float | Mapping[int, float] = LIMIT,
 ) -> ModeTolerances:
-    """Return the smallest changes of each mode at which a stable loop fails, up to `limit`."""
-    # a mapping names the examined modes, each with a separate limit at each point of the stability
-    # boundary, the condition that a pole lies there is an equation for a complex change of one mode
-    # (`mode_crossings`); where its imaginary part changes its sign along the boundary, a pole
-    # crosses it at a real change. The sampled plant's matrices are exact
+    """Return the smallest changes of each mode that make a stable loop fail, up to `limit`."""
+    # a mapping names the examined modes, each with its own limit. At each point of the stability
+    # boundary, a complex change of one mode can place a pole there (`mode_crossings`). Where the
+    # imaginary part of this change has a zero along the boundary, a real change makes a pole cross
+    # it. The sampled plant's matrices are exact
     modal_realisation(standard_plant(plant))
     margin = positive(margin, "margin")
     if margin >= 1.0:

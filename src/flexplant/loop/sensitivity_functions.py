@@ -363,8 +363,8 @@ def modulus_margin(loop: Loop) -> float:
     if count.unstable is None:
         raise AssumptionError(
             f"it is not known whether the closed loop is stable: {count.reason}. Only a stable "
-            "loop has a modulus margin. Pass what is known of the plant to fx.loop.report_loops"
-            "(loop, rigid=, unstable=), which also says how far the loop is judged."
+            "loop has a modulus margin. Pass further knowledge of the plant to fx.loop.report_loops"
+            "(loop, rigid=, unstable=), which also reports the limits of its judgement."
         )
     if count.unstable:
         warn(
