@@ -36,18 +36,19 @@ class Sensor(SensorPort):
         filters and simulation refuse: shape the disturbance, let it be held over each
         sample (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
-        One-sided amplitude spectral density of its white noise; a sample has variance
-        asd^2 rate / 2. It is added to the samples, after dynamics and latency; what passes through
-        them is an OutputDisturbance.
+        One-sided amplitude spectral density of its white noise; a sample has variance asd^2 rate /
+        2. It is added to the samples, after dynamics and latency; use an OutputDisturbance for
+        noise that passes through them.
     dynamics : StateSpace, optional
         Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
     latency : float [s]
-        Delay of the signal, in seconds. Exact, also between samples, once the plant is sampled; a
-        continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
+        Delay of the signal, in seconds. In a sampled plant it is exact, also between samples; a
+        continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
     absolute : bool, optional
-        Whether a BaseAcceleration moves it too: True of inertial sensors, as of a geophone
-        (absolute velocity), False of what measures against the floor. When not given,
-        accelerations are absolute, displacements and velocities are relative to the floor.
+        Whether the sensor also measures the motion of the floor (BaseAcceleration): True for
+        inertial sensors such as a geophone (absolute velocity), False for sensors that measure
+        relative to the floor. By default accelerations are absolute, displacements and velocities
+        are relative.
 
     Raises
     ------
@@ -91,15 +92,16 @@ class Poi(Value):
     ----------
     name : str
     at : str, (3,) array [m] or mapping {place: weight}
-        A DOF label (whose direction is replaced by the axes) or any point of the structure. Or a
-        weighted sum of places, ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``, which has one axis.
+        A DOF label (the axes replace its direction), any point of the structure, or a weighted sum
+        of places, ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``, which has one axis.
     axes : sequence of str
-        Motions among x, y, z [m], rx, ry, rz [rad]; a Reference follows the first one unless it
-        names others. Labels in a weighted sum keep their own directions.
+        Motions among x, y, z [m], rx, ry, rz [rad]; a Reference uses the first one unless it names
+        others. Labels in a weighted sum keep their own directions.
     absolute : bool
-        Whether a BaseAcceleration moves it too; its motion relative to the floor otherwise.
+        Whether its motion is absolute (with that of a BaseAcceleration) or relative to the floor.
     moves : mapping {position: (3,) array} or PlaceTable, optional
-        How its point follows the positions of `Ports`; `at` is where all of them are zero.
+        How its point moves with the positions of `Ports`; `at` is its place when all positions are
+        zero.
 
     Examples
     --------
@@ -179,14 +181,14 @@ class Reference(Value):
     """Set-points for the axes of a POI.
 
     Each adds `die:ref` to w, the error `die:error` (reference minus POI) to z, and a noise-free
-    `die:ref` to y, so that a controller that uses it has two degrees of freedom. Those of the axes
-    after the POI's first one are `die:rx:ref` and `die:rx:error`.
+    `die:ref` to y, so that a controller that uses it has two degrees of freedom. The names for the
+    other axes of the POI are `die:rx:ref` and `die:rx:error`.
 
     Parameters
     ----------
     poi : str
     axes : sequence of str, optional
-        Which of the POI's axes get one; its first when not given.
+        Axes of the POI that get a set-point; by default its first axis.
 
     Examples
     --------
@@ -213,12 +215,12 @@ class Reference(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ports(Value):
-    """All channels of one machine, for every model of it: nominal, updated, truth.
+    """All channels of one machine, for all of its models: nominal, updated, virtual machine.
 
     Parameters
     ----------
     w : sequence of Disturbance, BaseAcceleration and OutputDisturbance
-        Disturbances; those of amplifiers, sensor noises and references are added to them.
+        Disturbances; noises of amplifiers and sensors, and references, are added automatically.
     u : sequence of Actuator
         Actuators; each adds an effort `name:effort` to z.
     z : sequence of Poi
@@ -228,15 +230,15 @@ class Ports(Value):
     references : sequence of Reference
         Set-points.
     positions : sequence of Position
-        Where the machine may stand, for ports that move (`moves`).
+        Positions of the machine, for ports that move (`moves`).
     values : mapping {name: float} [m or rad]
-        Where it stands: ports are put there. Each position's start when not given.
+        Values of the positions, which place the ports; by default the start of each position.
 
     Raises
     ------
     LabelError
-        When a name is used twice, a Reference names no POI, an OutputDisturbance no sensor, or a
-        port moves with a position that is not there.
+        When a name is used twice, the POI of a Reference or the sensor of an OutputDisturbance does
+        not exist, or a port moves with an unknown position.
     ModelError
         When an entry has the wrong type, or a value is out of its range.
 
@@ -293,7 +295,7 @@ class Ports(Value):
                 self.sensor(port.added_to)
 
     def _place(self) -> None:
-        """Put ports that move where they are at the present values of the positions."""
+        """Place the moving ports at the present values of the positions."""
         positions = members(
             self.positions,
             Position,
@@ -326,14 +328,14 @@ class Ports(Value):
 
     @property
     def standing(self) -> str:
-        """Where the machine stands, in words; nothing where it does not move."""
+        """Text of the positions of the machine; empty if it does not move."""
         return ", ".join(
             f"{one.name} = {self.values[one.name]:g} ({one.range[0]:g} to {one.range[1]:g})"
             for one in self.positions
         )
 
     def at(self, values: Mapping[str, float]) -> Ports:
-        """Return the ports where the machine stands elsewhere; positions not named stay.
+        """Return the ports at other positions of the machine; positions not named stay.
 
         LabelError when no position has such a name, ModelError when a value is out of its range.
         """
@@ -341,7 +343,7 @@ class Ports(Value):
 
     @property
     def forces(self) -> tuple[ForcePort, ...]:
-        """All ports that bring something in: disturbances, then actuators."""
+        """All input ports: disturbances, then actuators."""
         return (*self.w, *self.u)
 
     @property
@@ -357,7 +359,7 @@ class Ports(Value):
 
     @property
     def units(self) -> dict[str, str]:
-        """The SI units of all channels that have one, and of what is derived from them.
+        """The SI units of all channels that have one, and of derived channels.
 
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
         sensors, references, errors and estimates like their POI, efforts like their actuator. A sum
@@ -414,7 +416,7 @@ class Ports(Value):
     def with_pade(self, order: int = 2) -> Ports:
         """Return the ports with every latency as an all-pass filter, for continuous designs.
 
-        `order`, 1 or more: states of each; the phase is right up to ``order / (6 latency)`` Hz.
+        `order`, 1 or more: states of each; the phase is correct up to ``order / (6 latency)`` Hz.
         """
 
         def late(port: Any) -> Any:

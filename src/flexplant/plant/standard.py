@@ -49,14 +49,14 @@ class StandardPlant(Partition):
     asd : mapping {str: float}
         One-sided amplitude spectral density of the w channels that are white noise.
     origin : Assembled or Foreign
-        Where it came from: `plant.assembled` holds ports, modes, noise and delay of a plant that
+        Origin of the plant: `plant.assembled` holds ports, modes, noise and delay of a plant that
         was assembled from a structure.
     uncertainty : UncertainPlant, optional
-        By what its modes may be off: of ``plant.uncertain(...).nominal``, kept by weights.
+        Uncertainty of its modes, in ``plant.uncertain(...).nominal``; kept when weights are added.
     evaluation : EvaluationModel, optional
-        The larger model of the same machine that answers are judged on, as `assemble_plant` takes
-        it. ``plant.replace(evaluation=model)`` gives the plant another one,
-        ``plant.replace(evaluation=None)`` takes it away.
+        Larger model of the same machine, on which results are checked; see `assemble_plant`.
+        ``plant.replace(evaluation=model)`` changes it, ``plant.replace(evaluation=None)`` removes
+        it.
 
     Raises
     ------
@@ -122,11 +122,11 @@ class StandardPlant(Partition):
         Parameters
         ----------
         weights : StageWeights, optional
-            Of `stage_weights`: its z and w, which those that are given replace.
+            Result of `stage_weights`, with z and w; the arguments `z` and `w` replace its entries.
         z, w : mapping {name: weight}
-            A weight is a number or a system with one input and one output, of this plant's dt or
-            continuous: then it is sampled at the plant's rate (Tustin). None leaves the channel
-            out; a channel that is not named is kept as it is.
+            A weight is a number or a system with one input and one output, with the plant's dt or
+            continuous (then it is sampled at the plant's rate by Tustin). None removes the channel;
+            channels that are not named are unchanged.
 
         Returns
         -------
@@ -143,8 +143,8 @@ class StandardPlant(Partition):
     def through(self, block: System) -> GeneralizedPlant:
         """Return the plant whose measurements are the outputs of a block that reads y.
 
-        What the controller then reads may be errors, decoupled motions or filtered sensors; close
-        the loop with the same block before the controller.
+        The controller may then read errors, decoupled motions or filtered sensors; close the loop
+        with the same block before the controller.
 
         Parameters
         ----------
@@ -176,8 +176,9 @@ class StandardPlant(Partition):
     ) -> StandardPlant:
         """Return the plant with some of its channels, in the order of the plant.
 
-        A channel that belongs to another one comes and goes with it and needs no name: the noise
-        of a sensor, the effort of an actuator, the reference and the error of an axis of a POI.
+        A channel that belongs to another one is kept or removed with it and needs no name: the
+        noise of a sensor, the effort of an actuator, the reference and the error of an axis of a
+        POI.
 
         Parameters
         ----------
@@ -200,11 +201,11 @@ class StandardPlant(Partition):
     def at(
         self, poi: Place | Mapping[str, Place] | None = None, **positions: float
     ) -> StandardPlant:
-        """Return the plant where ports are elsewhere: only rows of C, columns of B, and D change.
+        """Return the plant with ports at other places: only rows of C, columns of B, and D change.
 
-        ``plant.at(x=0.03)`` is the plant where the machine stands at x = 0.03 m: all ports that
-        move with the position x are put there. The modes, and with them A, are the same: a family
-        of plants over the positions costs rows, not models.
+        ``plant.at(x=0.03)`` is the plant at the position x = 0.03 m: all ports that move with x are
+        placed there. The modes and A are the same, so that plants for many positions need only new
+        rows and columns.
 
         Parameters
         ----------
@@ -212,7 +213,7 @@ class StandardPlant(Partition):
             A new point of the POI; a mapping when there are several POIs, or to move other ports
             too: actuators (columns of B), disturbances, sensors.
         **positions : float [m or rad]
-            Where the machine stands, by the names of its positions; those not named stay.
+            Values of the positions by name; positions not named stay.
 
         Raises
         ------
@@ -237,7 +238,7 @@ class StandardPlant(Partition):
         return self._known(found)
 
     def _known(self, found: StandardPlant) -> StandardPlant:
-        """Return a plant of the same modes with what is not known of this one."""
+        """Return a plant of the same modes with the uncertainty of this one."""
         return found if self.uncertainty is None else self.uncertainty.on(found).nominal
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
@@ -249,7 +250,7 @@ class StandardPlant(Partition):
             Function of the plant at each position that returns a number: ``{"margin": lambda p:
             fx.modulus_margin((p, controller))}``.
         points : int or mapping {name: int or array}
-            How many values of each position are taken over its range, or which [m or rad].
+            Number of values of each position over its range, or the values [m or rad].
 
         Raises
         ------
@@ -262,8 +263,8 @@ class StandardPlant(Partition):
     def along(self, name: str, points: npt.ArrayLike) -> PortPath:
         """Return the rows of a POI (or the columns of a force) at many points at once.
 
-        All that depends on where a POI is are its rows of C, and of D where the plant has a
-        feedthrough: for positions that change with time.
+        For positions that change with time. Only the rows of C depend on the place of a POI, and
+        rows of D if the plant has a feedthrough.
 
         Parameters
         ----------
@@ -282,19 +283,19 @@ class StandardPlant(Partition):
     def uncertain(
         self, *kinds: Any, frequency: Any = None, damping: Any = None
     ) -> UncertainPlant[StandardPlant]:
-        """Return the plant with what is not known of it, in any combination.
+        """Return the plant with its uncertainty, of one or several kinds.
 
-        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``: each kind is a
-        value, opened as Deltas with ``|delta| <= 1`` and drawn for machines. The order does not
+        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``: each kind gives
+        Deltas with ``|delta| <= 1``, and random values for drawn machines. The order does not
         matter.
 
         Parameters
         ----------
         *kinds : Uncertainty, UpdateResult, ModalUncertainty or MeasuredModes
             `Frequencies`, `Dampings`, `Shapes` of modes, `Parameters` of the model, `Gains`,
-            `Delay`, `Neglected` modes, `UnmodelledDynamics`, or what a `Fit` leaves open: a fit,
-            its uncertainty or measured modes may be given as they are. A user's own kind derives
-            from `Uncertainty`.
+            `Delay`, `Neglected` modes, `UnmodelledDynamics`, or the remaining uncertainty of a
+            `Fit`: a fit, its uncertainty or measured modes may be given directly. Your own kind
+            derives from `Uncertainty`.
         frequency, damping : float, (m,) array or {mode: float}, optional
             Short for `Frequencies` and `Dampings`.
 
@@ -302,7 +303,7 @@ class StandardPlant(Partition):
         -------
         UncertainPlant
             `.system`, `.deltas`, `.lft(values)`, `.machines`. Functions that take a plant take it
-            too: designs and loops then say by what each mode may be off.
+            too: designs and loops then report the allowed error of each mode.
 
         Raises
         ------
@@ -330,11 +331,11 @@ class StandardPlant(Partition):
 
     @cached_property
     def machines(self) -> PlantMachines | None:
-        """The machines that this plant may be, drawn once; None where nothing says which.
+        """Possible machines of this plant, drawn once; None without a stated uncertainty.
 
-        Those that the measurement allows, of a plant of ``fit.calibrated(measured)`` or of
-        ``plant.uncertain(fit.machines(measured))`` with an evaluation model; else those of what is
-        stated by ``plant.uncertain(...)``.
+        Machines that agree with the measurement, for a plant made from ``fit.calibrated(measured)``
+        or from ``plant.uncertain(fit.machines(measured))`` with an evaluation model; otherwise
+        machines drawn from the uncertainty stated by ``plant.uncertain(...)``.
         """
         fit = fitted_machines(self)
         if fit is None and self.uncertainty is None:
@@ -360,7 +361,7 @@ class StandardPlant(Partition):
         return self.system.to_control()
 
     def check(self) -> AssumptionReport:
-        """Return which standard assumptions hold, in physical words, rigid-body modes first."""
+        """Return which standard assumptions hold, in physical terms, rigid-body modes first."""
         return self._report
 
     @cached_property
@@ -376,7 +377,7 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
     Parameters
     ----------
     given : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
-        The plant; of an uncertain one the nominal plant, with its `uncertainty`.
+        The plant; for an uncertain plant its nominal plant, with its `uncertainty`.
 
     Raises
     ------
@@ -395,7 +396,7 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
     return StandardPlant.of(given)
 
 
-#: what synthesis and loops take
+#: plants that synthesis and loops accept
 AnyPlant: TypeAlias = StandardPlant | GeneralizedPlant
 
 
@@ -439,16 +440,17 @@ def assemble_plant(
     Parameters
     ----------
     model : FEModel, Modes or ReducedModel
-        The structure. A plant's `realisation` serves too: the modes are then not solved again.
+        The structure. The `realisation` of a plant is also accepted: the modes are then not solved
+        again.
     ports : Ports
     evaluation : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The model of the same machine that answers are judged on, with the modes that `model` lacks.
-        Every plant made from this one has it too, and every filter, controller, loop, score and
-        budget accounts for it. A structure gets the ports, a plant must have their channels. When
-        not given: the modes that a reduced `model` still knows beyond those it kept.
+        Larger model of the same machine, on which results are checked, with the modes that `model`
+        lacks. Every plant made from this one has it too, and every filter, controller, loop, score
+        and budget accounts for it. A structure gets the ports; a plant must have their channels. By
+        default: the truncated modes that a reduced `model` still knows.
     residual : FastStates or Feedthrough, optional
-        What residual attachment vectors of Modes become: fast modes (when not given), or a
-        compliance that answers at once.
+        Form of residual attachment vectors of Modes: fast modes (the default), or a compliance that
+        responds at once.
 
     Returns
     -------
@@ -469,10 +471,9 @@ def assemble_plant(
     -----
     FlexplantWarning
         When damping couples the modes so that blocks cannot hold it: an overdamped pair, two poles
-        that (nearly) coalesce, or a damper to ground that drags rigid-body motion at more than
-        1e-4 of the first elastic frequency (what drags less is left out: rigid-body modes are
-        undamped by convention). The undamped modes are then kept with all of D between them, the
-        dense form.
+        that (nearly) coalesce, or a damper to ground that drags rigid-body motion at more than 1e-4
+        of the first elastic frequency (smaller drag is neglected: rigid-body modes are undamped by
+        convention). The undamped modes are then coupled by all of D (dense form).
 
     References
     ----------
