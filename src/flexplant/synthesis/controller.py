@@ -1,4 +1,4 @@
-"""The answer of every controller design, with the certificate that was checked after it."""
+"""The result of every controller design, with its certificate."""
 
 from __future__ import annotations
 
@@ -38,15 +38,16 @@ class Controller(Value):
     Parameters
     ----------
     system : StateSpace
-        From measurements, references or estimates to actuators; the sign of the feedback is in it.
+        From measurements, references or estimates to actuators; it includes the sign of the
+        feedback.
     method : str
         Method of the design.
     gamma : float, optional
-        The norm that its closed loop was verified to stay below: H-infinity, of `design_h2` the H2.
+        Verified upper bound on the norm of its closed loop: H-infinity, or H2 for `design_h2`.
     lower : float, optional
-        A bound from below on what controllers reach; see the method for its conditions.
+        Lower bound on the norm that any controller reaches; see the method for its conditions.
     certificate : Certificate
-        Numbers computed after the design by another computation.
+        Numbers that verify the design by a second computation.
     reached : mapping {str: float}
         For a weighted design: the norm from each group of w to each group of z; the weights require
         at most 1, and the largest is close to gamma. For `design_lmi`: the norm of each objective,
@@ -57,11 +58,11 @@ class Controller(Value):
         For an uncertain plant: the error of each mode at which the loop becomes unstable, compared
         with its uncertainty; and machines drawn at random.
     notes : sequence of str
-        What the certificate does not cover, and what else is worth knowing.
+        Remarks, such as what the certificate does not cover.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
-        Of `design_structured`: what it was given, with the numbers that it found.
+        For `design_structured`: the given structure, with the parameters found.
     tried : mapping {str: float}
-        What was tried, in turn, and the gamma that each reached; infinite where it failed.
+        Attempts in their order, with the gamma that each reached; infinite where it failed.
 
     Examples
     --------
@@ -140,7 +141,7 @@ AGREEMENT = 1e-3
 _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 
 
-#: what may be wrong where a controller, given or found, does not stabilise its loop
+#: possible reasons why a controller, given or found, does not stabilise its loop
 _SIGN = "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
 
 
@@ -156,7 +157,7 @@ def required_stability(loop: StateSpace, cause: str = _SIGN) -> float:
 
 
 def certified_norm(loop: StateSpace, claim: float, respond: Responder | None = None) -> Certificate:
-    """Return what was verified of a closed loop: its norm by two routes, and its stability."""
+    """Return the verified figures of a closed loop: its norm by two methods, and its stability."""
     least = required_stability(loop)
     norm, _ = peak_gain(loop)
     if not np.isfinite(norm):
@@ -231,9 +232,9 @@ CLOSE = ", and one that differs a little from the model may be unstable"
 
 
 def checked_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
-    """Return a design's loop, with warnings of what modes do to it; None: nothing to check it by.
+    """Return the loop of a design, with warnings of the effect of modes; None if it is not checked.
 
-    With the modes left out, where they are known, and with what the plant's own modes hold to.
+    Includes truncated modes, if they are known, and the tolerances of the plant's own modes.
     """
     plain, reading = plant.machine, plant.reading
     whole = plain.evaluation_plant
@@ -260,14 +261,14 @@ def checked_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
 def with_left_out(
     answer: Controller, plant: AnyPlant, block: StateSpace | None = None
 ) -> Controller:
-    """Return an answer with its check on the modes left out, or the note that none are known."""
+    """Return a result with its check on the truncated modes, or a note that they are not known."""
     # the block is its part from the plant's y to u, unless all of its system is
     loop = checked_loop(plant, [answer.system if block is None else block])
     return with_checks(answer, plant, loop)
 
 
 def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) -> Controller:
-    """Return an answer with what its loop says of modes left out and of uncertain ones."""
+    """Return a result with the checks of its loop on truncated and on uncertain modes."""
     left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
     verified = answer.certificate
     for found in (left_out, tolerances):

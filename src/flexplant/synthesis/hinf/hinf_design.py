@@ -67,28 +67,30 @@ def design_hinf(
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
-    Weights say what small is. For a stage they follow from a bandwidth: ``weights =
-    fx.stage_weights(plant, 60.0)``, then ``K = fx.design_hinf(plant.weighted(z=weights.z,
-    w=weights.w))``; below a `K.gamma` of 1 all that they ask for holds. (`design_stage` does both
-    and searches the bandwidth.) `mixed_sensitivity` builds a plant from weights of S, KS and T.
-    The controller is judged by its own closed loop, on the user's channels: stability, and the
-    norm by two routes; ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
+    Weights define the required norms. For a stage they follow from a bandwidth:
+    ``weights = fx.stage_weights(plant, 60.0)``, then
+    ``K = fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``; if `K.gamma` is below 1, all
+    their requirements are satisfied. (`design_stage` does both and finds the bandwidth.)
+    `mixed_sensitivity` builds a plant from weights of S, KS and T. The controller is verified with
+    its closed loop in the original channels: stability, and the norm by two methods;
+    ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant or mapping {position: StandardPlant}
-        Usually weighted; continuous or sampled. By position, of a machine that moves
-        (``{x: plant.at(x=x) for x in places}``): one controller for all, the mean plant with
-        channels that tolerate the motion; `gamma` is then the worst norm, the certificate has
-        those of all positions and half way between. A labelled StateSpace (ours or
-        python-control's) serves too: by the names of its channels, or with u and y named.
+        Usually weighted; continuous or sampled. For a moving machine, a mapping by position
+        (``{x: plant.at(x=x) for x in places}``): one controller for all positions is designed on
+        the mean plant, with channels that tolerate the motion; `gamma` is then the worst norm, and
+        the certificate has those of all positions and half way between. A StateSpace (also of
+        python-control) is accepted too, if its channels are named as in a StandardPlant, or if u
+        and y are given.
     method : Riccati or Lmi, optional
         By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
         singular, and a little disturbance where w or z misses an undamped mode. `Lmi()`
         needs neither and suits up to 30 states.
     bandwidth : float [Hz], optional
         For a stage without weights: those of `stage_weights` are used, for the POI's only
-        reference. `design_stage` finds the largest that holds.
+        reference. `design_stage` finds the largest possible one.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
@@ -110,25 +112,25 @@ def design_hinf(
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches,
-        `certificate` what was checked, `reached` what is reached of each block of the weights,
-        `left_out` the check with the modes left out.
+        `gamma` is the verified norm, `lower` a lower bound for any controller, `certificate` holds
+        the checks, `reached` the norm of each block of the weights, `left_out` the check with
+        truncated modes.
 
     Raises
     ------
     AssumptionError
-        When an assumption of the method fails; the message says which, in physical words.
+        When an assumption of the method fails; the message names it in physical terms.
     InfeasibleError, SolverError
         When no stabilising controller was found, or gamma has the infimum zero.
     CertificateError
-        When the closed loop misses the norm that was claimed, or its norm is not finite.
+        When the closed loop exceeds the claimed norm, or its norm is not finite.
     ModelError
         When the plant or the method is of another type, or a sampled plant has a pole at z = -1.
 
     Warns
     -----
     FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When truncated modes make the loop unstable, or raise |S| at u above 8 dB; it names them.
 
     References
     ----------
@@ -219,7 +221,7 @@ def evened(
 ) -> Evened:
     """Return channels for the modes, their scales evened out in closed loop."""
     channels, first = mode_channels(plant, uncertain, damped_below), np.inf
-    # only the scales hang on it: where it fails, the design itself says all
+    # only the scales depend on it: if it fails, the design itself reports why
     with attempted("evening out the scales of modes"):
         opened = with_mode_channels(plant, channels)
         loop, found = solved(opened, method or Riccati(progress=progress))
@@ -247,7 +249,7 @@ def _design_one(
         method = method.replace(progress=progress)
     try:
         require_reach(problem)
-        if plant.modal_blocks.size:  # whatever a method makes of it: this motion would drift
+        if plant.modal_blocks.size:  # for any method: this motion would drift
             require_shown(problem)
         if found is None:
             found = method.solve(problem)
@@ -290,7 +292,7 @@ def _require_resolved(P: StateSpace, K: StateSpace) -> None:
 
 
 def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
-    """Return the error, or one that blames the coordinates of the states where these are bad."""
+    """Return the error, or one that names badly scaled states as the reason."""
     if problem.departure < _MIXED:
         return error
     return SolverError(
@@ -310,10 +312,10 @@ def _verified(plant: AnyPlant, problem: Prepared, name: str, found: SolvedContro
     try:
         certificate = certified_norm(loop, found.gamma, respond)
     except CertificateError:
-        _require_resolved(plant.system, K)  # the cause, where it is rounding
+        _require_resolved(plant.system, K)  # the cause, if it is rounding
         raise
     gamma = certificate["norm"]
-    # the method's loop and the plant's are one: by as much as they differ rounding is felt
+    # the loops of the method and of the plant are equal: their difference is the effect of rounding
     if problem.departure >= _MIXED or abs(gamma - found.gamma) > _FELT * gamma:
         _require_resolved(plant.system, K)
     return Controller(

@@ -50,11 +50,11 @@ _KEPT = 0.875
 #: them where the loop is not stable on the machines drawn: a tolerated mode may depend on its shape
 #: (a margin of 0.43 became 0.33 on a machine by 1 % of other shapes in one mode's)
 _DAMPED = (3.5, 6.0)
-#: machines on which a loop must hold before it is promised
+#: number of machines on which a loop is tested
 _DRAWS = 20
-#: by what share dampings may be off where nothing measured or stated says it: two usual deviations
+#: relative error of dampings that are neither measured nor stated: two usual deviations
 _DAMPING = 2.0 * USUAL[1]
-#: most of the rate at which the weights can be sampled
+#: largest bandwidth, relative to the rate, at which the weights can be sampled
 _OF_RATE = 0.1
 
 
@@ -70,14 +70,15 @@ def design_stage(
 ) -> Controller:
     """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
 
-    `stage_weights` of rising bandwidths on ``plant.through(reference_errors(plant))`` (on the plant
-    itself where nothing is followed), each solved
-    by ``design_hinf(uncertain=)``; the largest bandwidth is kept at which the modulus margin at u
-    is at least `margin`, also with the modes left out where they are known, and 7/8 of it with the
-    frequency of any one mode of the plant off as far as it is uncertain, and on each of 20 machines
-    (`StandardPlant.machines`): those that the measurement allows where the plant is of a calibrated
-    fit, else machines on which all frequencies are off at once, shapes with them, and dampings by
-    30 % where nothing is stated of these.
+    The weights are `stage_weights` of rising bandwidths on
+    ``plant.through(reference_errors(plant))`` (without references, on the plant itself); each
+    problem is solved by ``design_hinf(uncertain=)``. The result is the design of largest bandwidth
+    that satisfies three conditions. The modulus margin at u is at least `margin`, also with
+    truncated modes if they are known. It is at least 7/8 of `margin` if the frequency of any one
+    mode is off by its uncertainty. The same holds on each of 20 machines
+    (`StandardPlant.machines`): machines that agree with the measurement if the plant comes from a
+    calibrated fit; otherwise machines in which all frequencies and shapes change at once, and
+    dampings by 30 % unless stated.
 
     Parameters
     ----------
@@ -85,11 +86,11 @@ def design_stage(
         Plant of a machine that follows references, or of one that is held at rest (without
         references); continuous or sampled. A plant without stated uncertainty is taken with all its
         frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})`` and
-        ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
+        ``plant.uncertain(fit)`` are more accurate. Only Deltas of frequencies are used.
     bandwidth : float [Hz], optional
-        Bandwidth of the loop: where |S| from reference to error crosses 1 on the slowest axis. The
-        weights are moved until it does, within 1 %; without a reference they are those of 1.5 times
-        the bandwidth. The largest bandwidth that holds when not given.
+        Bandwidth of the loop: frequency at which |S| from reference to error crosses 1 on the
+        slowest axis. The weights are adjusted to reach it within 1 %; without a reference they are
+        those of 1.5 times the bandwidth. By default the largest possible bandwidth.
     margin : float
         Least modulus margin, broken at u.
     poi : str, optional
@@ -102,16 +103,16 @@ def design_stage(
     -------
     Controller
         From the sensors and the reference to the actuators: ``close_loop(plant, controller)``.
-        `tried` lists each bandwidth of the weights and the modulus margin that came with it, 0
-        where the loop does not tolerate its modes; `certificate` has the one kept, and the least
-        modulus margin of the machines drawn.
+        `tried` lists the bandwidths of the weights with their modulus margins, 0 where the loop
+        does not tolerate the errors of its modes; `certificate` has the margin of the final design,
+        and the least modulus margin of the machines drawn.
 
     Raises
     ------
     AssumptionError, LabelError
         As for `stage_weights` and `reference_errors`.
     InfeasibleError
-        When no bandwidth that was tried holds; the message lists them.
+        When all bandwidths that were tried fail; the message lists them.
     ModelError
         When a number is out of range, or the plant was not assembled from a structure.
 
@@ -137,7 +138,7 @@ def design_stage(
 
 
 class _StageTask:
-    """The designs of rising bandwidths, and what came of each."""
+    """The designs of rising bandwidths and their results."""
 
     def __init__(
         self,
@@ -163,7 +164,7 @@ class _StageTask:
         self.plant: AnyPlant = uncertain.plant
         #: with the modes left out: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
-        #: what the controller reads: the sensors themselves where nothing is followed
+        #: inputs of the controller: the sensors themselves without references
         followed = self.plant.assembled.ports.references
         self.errors = reference_errors(self.plant, poi=poi) if followed else None
         self.through = self.plant if self.errors is None else self.plant.through(self.errors)
@@ -369,7 +370,7 @@ def _next(known: Sequence[tuple[float, float]], wanted: float, ends: Sequence[fl
     if len(known) > 1:
         before, there = known[-2]
         slope = float(np.log(reached / there) / np.log(at / before))
-    # weights that are faster without a faster loop say nothing of how far to go
+    # faster weights that do not give a faster loop cannot be extrapolated
     step = float(np.log(wanted / reached)) / slope if slope > 0.0 else np.inf
     step = np.sign(wanted - reached) * min(abs(step), twice)
     guess = at * float(np.exp(step))
@@ -383,8 +384,8 @@ class _StageTry(NamedTuple):
     weighted: StandardPlant
     given: Evened
     system: StateSpace
-    #: what was verified of it, where other methods than `Riccati` found it
+    #: verified figures, if another method than `Riccati` found it
     found: Controller | None = None
-    #: what `Riccati` found, not verified
+    #: result of `Riccati`, not verified
     solution: SolvedController | None = None
     drawn: float = 0.0

@@ -37,7 +37,7 @@ class DesignedLoops(Value):
     report : LoopReport
         Crossovers and margins of each axis, the others closed, and stability.
     left_out : SpillOver, optional
-        How the loop stands on a model with the modes left out, where these are known.
+        Stability and margins on the plant with the truncated modes, where these are known.
     notes : sequence of str
         Remarks on the design.
     tolerances : ModeTolerances, optional
@@ -86,7 +86,7 @@ def axes_of(
             axes = decouple(given.machine)
             before, after = axes.to_actuators, axes.to_motions
             errors = [f"{name}:error" for name in after.inputs]
-            if set(errors) <= set(given.y):  # seen as reference minus measurement
+            if set(errors) <= set(given.y):  # measured as reference minus measurement
                 after = (-after).replace(inputs=errors)
         plant = given.Gyu
     if isinstance(plant, Frf):
@@ -128,8 +128,8 @@ def design_loops(
 ) -> DesignedLoops:
     """Return the controller of laws made by hand, ``u = -before diag(laws) after y``, and a report.
 
-    Each law is a product of elements, `Pid`, `Lead`, `Notch`, `LowPass`. The plant may be known by
-    its measured Frf alone; stability follows by the Nyquist count then.
+    Each law is a product of elements, `Pid`, `Lead`, `Notch`, `LowPass`. The plant may be a
+    measured Frf; stability then follows from the Nyquist count.
 
     Parameters
     ----------
@@ -156,14 +156,14 @@ def design_loops(
     Raises
     ------
     ModelError, ShapeError
-        When plant, transformations, laws and rate do not go together.
+        When plant, transformations, laws and rate do not fit.
     AssumptionError
         When the axes cannot be decoupled.
 
     Warns
     -----
     FlexplantWarning
-        When the loop is unstable, or is with the modes left out.
+        When the loop is unstable, or is unstable with the truncated modes.
 
     References
     ----------

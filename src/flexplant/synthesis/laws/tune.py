@@ -52,19 +52,19 @@ def tune_loops(
     For a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds
     the law of each axis (PID, low-pass and notches), `design.report` its margins; `close_loop`
     takes `design.system`, and `write_c` exports it. ``before=`` and ``after=`` decouple several
-    axes, as `decouple` finds. Where lines do not resolve a resonance, or have variance, the loop
-    gain is kept small. The best of many starts is returned, without proof that no other law does
-    better, and with a warning where the peak is not kept. How: `algorithms`.
+    axes; `decouple` computes them. Where the lines do not resolve a resonance, or have variance,
+    the loop gain is kept small. The result is the best of many starts, without proof that it is
+    optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
 
     Parameters
     ----------
     plant, before, after, rate, delay, hold : as for `design_loops`
     peak : float
-        Bound on |S|, at u, of each axis, and at y where there are as many sensors as axes; 2 is a
-        modulus margin of 6 dB.
+        Bound on |S| at u and of each axis, and at y if each axis has one sensor; 2 is a modulus
+        margin of 6 dB.
     rigid : int, optional
-        Rigid-body modes; unless given as many as axes, of a model those that it has. 0 on springs
-        whose modes lie within the lines.
+        Number of rigid-body modes; by default the number of axes, or those of a model. 0 if the
+        machine is on springs and the suspension modes lie within the lines.
     notches : int
         Largest number of notches of each axis; each has to raise the bandwidth by 2 %.
     progress : bool, optional
@@ -74,21 +74,21 @@ def tune_loops(
     Returns
     -------
     DesignedLoops
-        Verified in all axes together, each broken with the others closed.
+        Laws and their margins, verified with all loops closed.
 
     Raises
     ------
     SolverError
-        When no bandwidth within the lines holds the peak, with the axis; or when no laws that were
-        found are stable together.
+        When no bandwidth within the lines keeps the peak of an axis, which is named; or when the
+        laws found are not stable together.
     ModelError, ShapeError, LabelError, AssumptionError
         As for `design_loops`; ModelError when peak is not above 1.
 
     Warns
     -----
     FlexplantWarning
-        When the peak was not reached: the largest |S|, where, and at which frequency. The note is
-        in `notes` too.
+        When the peak is exceeded: it states the largest |S|, its place and frequency, also in
+        `notes`.
 
     Examples
     --------
@@ -163,7 +163,7 @@ _RESTING, _STEP_AT_REST = 1e-6, 2.0
 
 def _lines(axes: Axes, rigid: int) -> list[tuple[bool, tuple[int, ...]]]:
     """Return whether each axis is free at rest, and powers of 1 / s of lines of its bandwidth."""
-    # a mass, always but of velocities; below its springs' frequency it is a spring
+    # always a mass, except for velocities; below the frequency of its springs it is a spring
     if isinstance(axes.plant, Frf):
         return [(rigid > 0, (2,) if rigid else (2, 0))] * len(axes.names)
     found: list[tuple[bool, tuple[int, ...]]] = []
@@ -233,7 +233,7 @@ class JointPlant:
     @property
     def places(self) -> tuple[str, ...]:
         """Where |S| counts: at u and at y where these have one unit, and in each axis."""
-        # sensors that see one axis twice differ at modes between them, whatever its law is
+        # two sensors of one axis differ at modes between them, for any law
         sides = {"u": self.plant.inputs}
         if len(self.plant.outputs) == len(self.axes):
             sides["y"] = self.plant.outputs
@@ -258,7 +258,7 @@ class JointPlant:
         return lambda freq: np.moveaxis(find(freq), -1, 0)
 
     def coupling(self, freq: FloatArray) -> Coupling:
-        """Return what couples the axes at some frequencies [Hz]."""
+        """Return the coupling of the axes at some frequencies [Hz]."""
         G = self.respond(freq)
         seen, felt = G @ self.before, self.after @ G
         su, sy = self.sizes
@@ -266,7 +266,7 @@ class JointPlant:
 
     @cached_property
     def sizes(self) -> tuple[FloatArray, FloatArray]:
-        """The size of each input and output, by its part in the axes: |S| counts in these units."""
+        """The size of each input and output from the axes: |S| is computed in these units."""
         forces = np.linalg.norm(self.before, axis=1)
         shown = np.linalg.norm(np.linalg.pinv(self.after), axis=1)
         return (
@@ -368,7 +368,7 @@ class Coupling(NamedTuple):
         return np.asarray(np.einsum("fy,fyk->fk", v, self.seen) * (w @ of.own_after.T))
 
     def rows(self, rows: IntArray) -> Coupling:
-        """Return what couples the axes at some of the frequencies."""
+        """Return the coupling of the axes at some of the frequencies."""
         parts = (self.seen[rows], self.felt[rows], self.inner[rows])
         return Coupling(self.freq[rows], *parts, self.of)
 

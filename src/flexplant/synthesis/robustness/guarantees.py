@@ -1,4 +1,4 @@
-"""What a loop keeps on every machine of an uncertainty: `robust_stability`, `worst_case_gain`."""
+"""Guarantees for all machines of an uncertainty: `robust_stability`, `worst_case_gain`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _BAND = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 20), -np.geomspace(1e-4, 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RobustStability(Value):
-    """Bounds on the uncertainty under which a loop is stable, and the smallest that is not.
+    """Bounds on the uncertainty under which a loop is stable, and the worst machine.
 
     Parameters
     ----------
@@ -53,25 +53,25 @@ class RobustStability(Value):
         mu: every machine with Deltas smaller than ``1 / upper`` is stable; below 1, all machines
         of the uncertainty are. Values below 0.05 are not resolved.
     lower : float
-        A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found, or none was
-        sought because all machines of the uncertainty are stable.
+        A machine with Deltas of ``1 / lower`` is not stable; 0 if none was found, or if the search
+        was not needed because all machines of the uncertainty are stable.
     freq : float [Hz]
-        Where mu is largest; NaN where it is not resolved.
+        Frequency at which mu is largest; NaN if mu is not resolved.
     values : mapping {str: float}
         The Deltas of that machine.
     machine : StandardPlant, optional
         That machine, a little beyond its edge of stability; it can be simulated. None when none was
         found, or the one found could not exist (without stiffness or damping).
     frequencies, bounds : (k,) arrays [Hz, 1]
-        Upper bounds at single frequencies; where they are not near the largest they need not be
-        the smallest.
+        Upper bounds at single frequencies; only those near the largest are tight.
     certificate : Certificate
-        Machines that were drawn and closed exactly, and how stable the least stable was; the
-        distance of sampled channels from sampled machines; how many intervals between frequencies
-        were proven by Hamiltonian matrices (0 above 260 states: sampled); the check with modes
-        left out.
+        Stability of the least stable of the machines that were drawn and closed exactly; distance
+        of sampled channels from sampled machines; number of intervals between frequencies that were
+        proven by Hamiltonian matrices (0 above 260 states: sampled instead); check with truncated
+        modes.
     left_out : SpillOver, optional
-        How the nominal loop stands on the plant with the modes left out, where these are known.
+        Stability and margins of the nominal loop on the plant with the truncated modes, where these
+        are known.
     """
 
     upper: float
@@ -134,10 +134,9 @@ def robust_stability(
     *blocks : StateSpace, or values with a `system`
         The controller, as for `close_loop`.
     quick : bool
-        Where all Deltas are frequencies, first a bound with one channel a mode, the change of a
-        sampled mode to first order, on a grid through the resonances: a fraction of a second for
-        ten modes. Where it is below 1 it is the answer; else the whole
-        search follows.
+        If all Deltas are frequencies, first compute a simpler bound: one channel for each mode, to
+        first order, on a grid through the resonances (a fraction of a second for ten modes). If it
+        is below 1, it is the result; otherwise the full search follows.
     machines : int
         Number of machines drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
@@ -155,8 +154,8 @@ def robust_stability(
     AssumptionError
         When the nominal loop is not stable.
     CertificateError
-        When a machine is unstable for which stability was proven, or sampled machines are too far
-        from affine in their Deltas.
+        When a machine is unstable although stability was proven, or sampled machines are not affine
+        enough in their Deltas.
     SolverError
         When intervals do not cover the frequency axis.
 
@@ -247,7 +246,7 @@ def _worst_machine(
 def _quick(
     uncertain: UncertainPlant[Any], blocks: tuple[Any, ...], count: int, rng: np.random.Generator
 ) -> RobustStability | None:
-    """Return the answer of one channel a mode where it shows stability, None where it does not."""
+    """Return the result with one channel for each mode if it proves stability, otherwise None."""
     if not uncertain.is_of_frequencies:
         return None
     loop = close_loop(uncertain.plant, *blocks)
@@ -314,7 +313,7 @@ class WorstCaseGain(Value):
     values : mapping {str: float}
         The Deltas of that machine.
     machine : StandardPlant
-        It can be simulated.
+        Machine with this gain; it can be simulated.
     frequencies, bounds : (k,) arrays [Hz, gain]
         Upper bounds at single frequencies.
     """
@@ -346,9 +345,9 @@ def worst_case_gain(
 ) -> WorstCaseGain:
     """Return bounds on the largest gain from w to z over an uncertainty, and the worst machine.
 
-    From above by skewed mu: ``|Delta| <= 1`` is kept and the size of the performance block grows,
-    on intervals that cover all frequencies. From below by the machine that a search found, closed
-    exactly, sampled and delayed as the plant is.
+    The upper bound is skewed mu: ``|Delta| <= 1`` is fixed and the performance block grows, on
+    intervals that cover all frequencies. The lower bound is the gain of a machine that a search
+    found, closed exactly, with the sampling and delay of the plant.
 
     Parameters
     ----------
