@@ -57,8 +57,8 @@ def design_ncf(
     plant : StandardPlant or StateSpace
         Its u -> y; a StateSpace is taken as it is.
     before, after : StateSpace or array, optional
-        Shaping at u and at y, of the plant's sampling time: what gives the loop its slope, and
-        transformations to decoupled axes (`decouple`: accelerations and to_motions).
+        Shaping at u and at y, with the plant's sampling time: filters that give the loop its slope,
+        and transformations to decoupled axes (`decouple`: accelerations and to_motions).
     bandwidth : float [Hz], optional
         Recipe: each channel of the square ``after G before`` is multiplied further by
         ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with gain 1 at the bandwidth.
@@ -75,11 +75,12 @@ def design_ncf(
     Raises
     ------
     AssumptionError
-        When an undamped or unstable mode is not reached or seen, or hidden by the shaping.
+        When u does not move, or y does not show, an undamped or unstable mode, or the shaping hides
+        one.
     CertificateError
-        When the closed loop misses the norm that was claimed.
+        When the closed loop exceeds the claimed norm.
     ModelError, ShapeError
-        When plant, shaping and bandwidth do not go together.
+        When plant, shaping and bandwidth do not fit.
 
     References
     ----------
@@ -146,7 +147,7 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     Raises
     ------
     ModelError, ShapeError
-        When the two do not go together.
+        When plant and controller do not fit.
 
     Examples
     --------

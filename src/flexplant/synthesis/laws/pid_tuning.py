@@ -41,7 +41,7 @@ class PidTuning(Value):
     Parameters
     ----------
     controller : StateSpace
-        From y to u, the sign of the feedback in it: for `close_loop`, `write_c`, ...
+        From y to u, including the sign of the feedback: for `close_loop`, `write_c`, ...
     gain : float
         k, in the unit of u over that of y.
     integral, lead, roll_off : float [Hz]
@@ -86,17 +86,17 @@ def tune_pid(
 ) -> PidTuning:
     """Return a PI or PID controller of a plant with one input and one output.
 
-    The loop gain is 1 at the bandwidth; of corner frequencies of integral action and lead the ones
-    with the largest integral gain are taken that keep the modulus margin. Both are verified on the
-    closed loop.
+    The loop gain is 1 at the bandwidth; the corner frequencies of integral action and lead are
+    those with the largest integral gain that keep the modulus margin. Bandwidth and margin are
+    verified on the closed loop.
 
     Parameters
     ----------
     plant : StateSpace, or a system of python-control or SciPy
         Any plant: with or without integrators, of either sign.
     bandwidth : float [Hz], optional
-        Where the loop gain crosses 1; the largest that keeps the margin when not given. In
-        continuous time nothing may limit it: then it is a thousand times the fastest pole.
+        Frequency at which the loop gain crosses 1; by default the largest that keeps the margin. In
+        continuous time it may be unlimited: then it is a thousand times the fastest pole.
     margin : float
         Modulus margin, between 0 and 1.
     rate : float [Hz], optional
@@ -183,7 +183,7 @@ def _tuned(g: StateSpace, freq: float, margin: float) -> PidTuning | None:
         k = sign / float(abs(L[-1]))
         if np.min(np.abs(1.0 + k * L)) >= margin:
             kept.append((k, choice))
-    # the most integral gain first: what the grid shows is verified on the closed loop
+    # the largest integral gain first; results on the grid are verified on the closed loop
     for k, choice in sorted(kept, key=lambda one: -abs(one[0]) * one[1].integral):
         found = _verified(g, k, choice, freq, margin)
         if found is not None:

@@ -58,57 +58,57 @@ def design_servo(
 ) -> Controller:
     """Return a controller with one law for each axis that the actuators move.
 
-    ``u = -T C(z) (hat - ref)``. T decouples the axes on the real axis, ``T = pinv(G(sigma)) /
-    sigma^2`` at sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). The law of an axis follows
-    from the line on which its response lies at the bandwidth w_b: on a mass line (a free body, or
-    above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``, on that of a
-    damper ``k (1 + w_i / s) F(s)``, of a spring ``k F(s) / s``, and ``k F(s)`` where the response
-    vanishes at rest. F is a second-order roll-off and the notches; with k the loop of the axis
-    crosses 1 at the bandwidth, by the exact response of the plant. Where two lines are near, the
-    exact |S| at u decides; it also decides, where a mode lies above the bandwidth within a factor
-    of 4, whether the lead of a mass line is wide: 16 instead of 4. A wide lead suppresses the error
-    up to a higher frequency, but less at low ones: give `integrator` where errors must settle soon.
-
-    Certified is the loop that will run: with observer, flexible modes and delay, and with the modes
-    left out where they are known. `servo_bandwidth` gives the largest bandwidth that holds 6 dB.
+    ``u = -T C(z) (hat - ref)``. T decouples the axes on the real axis,
+    ``T = pinv(G(sigma)) / sigma^2`` at sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). The
+    law of an axis follows from the slope of its response at the bandwidth w_b: on a mass line (a
+    free body, or above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``,
+    on a damper line ``k (1 + w_i / s) F(s)``, on a spring line ``k F(s) / s``, and ``k F(s)`` if
+    the response is zero at rest. F is a second-order roll-off and the notches. The gain k makes the
+    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. If two lines
+    are close, the one with the smaller peak of |S| at u is used. In the same way the lead of a mass
+    line is chosen wide (16 instead of 4) if a mode lies above the bandwidth within a factor of 4. A
+    wide lead suppresses the error up to a higher frequency, but less at low frequencies: pass
+    `integrator` if errors must settle soon. The certificate is for the loop that will run: with
+    observer, flexible modes and delay, and with the truncated modes if they are known.
+    `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled.
     bandwidth : float or mapping {axis: float} [Hz]
-        Where the loop of each axis crosses 1; below a fifth of the rate. The error is suppressed
-        up to a lower frequency where the plant resonates: the certificate has both.
+        Frequency at which the loop of each axis crosses 1; below a fifth of the rate. If the plant
+        resonates, the error is suppressed only up to a lower frequency: the certificate has both.
     poi : str, optional
-        The POI whose axes are controlled; those of all POIs when not given.
+        The POI whose axes are controlled; by default all POIs.
     axes : sequence of str, optional
         Channels of z (axes of POIs) or y (sensors) to control, as for
         `flexplant.plant.driven_axes`.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths (16 with
-        a wide lead, 3 of an axis on a spring), or 0.4 of the rate where that is less.
+        Corner of the second-order low-pass, below half the rate; by default 8 bandwidths (16 with a
+        wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
     integrator : float [Hz], optional
-        Corner of the integral action; a tenth of the bandwidth unless given, with a wide lead a
+        Corner of the integral action; by default a tenth of the bandwidth, with a wide lead a
         fiftieth.
     notches : sequence of float [Hz], optional
-        Frequencies of resonances to notch, each below half the rate. Unless given they are placed
-        at the plant's modes, one by one, while |S| at u is above 6 dB (or the loop unstable) and a
-        notch lowers it; an empty sequence means none.
+        Frequencies of resonances to notch, each below half the rate. By default they are placed at
+        the plant's modes, one by one, while |S| at u is above 6 dB (or the loop is unstable) and a
+        notch lowers it. An empty sequence means no notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
-        What will give the estimates `die:hat`, ...; unless given, the POI itself.
+        Block that gives the estimates `die:hat`, ...; by default the POI itself is used.
 
     Returns
     -------
     Controller
-        From the references `die:ref`, ... where there are some and the estimates `die:hat`,
-        `die:rx:hat`, ... to the actuators. The certificate holds spectral radius and modulus margin
-        of the plant with the observer, and with the modes left out; the frequency up to which |S|
-        of every reference is below 1; where |S| at u exceeds 6 dB, the largest bandwidth.
+        From the references `die:ref`, ... (if any) and the estimates `die:hat`, `die:rx:hat`, ...
+        to the actuators. The certificate holds spectral radius and modulus margin of the plant with
+        the observer, and with the modes left out; the frequency up to which |S| of every reference
+        is below 1; where |S| at u exceeds 6 dB, the largest bandwidth.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous, or the actuators do not move the axes apart.
+        When the plant is continuous, or the actuators cannot move the axes independently.
     LabelError
         When the POI or an axis is unknown, or the observer does not give its estimates.
     ModelError
@@ -208,11 +208,11 @@ def servo_bandwidth(
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
-    Plant and observer are swept once over a grid through their resonances. The loop is broken at
-    the plant's input, as by `modulus_margin`: what the observer reads of u stays closed. What holds
-    there is accepted when its eigenvalues are stable and `modulus_margin` holds the peak, with the
-    modes left out too where they are known. Bandwidths are tried in steps of 9 %, from the top
-    down, then between the first that holds and the one above it.
+    Plant and observer are swept once over a grid that includes their resonances. The loop is broken
+    at the plant's input, as in `modulus_margin`; the observer still reads u. A bandwidth that keeps
+    the peak on this grid is accepted if its eigenvalues are stable and `modulus_margin` keeps the
+    peak, also with truncated modes if they are known. Bandwidths are tried in steps of 9 %, from
+    the top down, then between the first success and the step above it.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def servo_bandwidth(
     AssumptionError, LabelError, ModelError
         As `design_servo`; ModelError when peak is not above 1.
     SolverError
-        When no bandwidth holds it; the message says what comes nearest, and what limits it.
+        When no bandwidth keeps the peak; the message states the closest result, and its limit.
 
     Examples
     --------
@@ -415,7 +415,7 @@ class ServoTask:
             if size > peak:
                 return False
             closed = self.closed(law)
-            # the loop on the evaluation model, which costs most, only where the smaller one is fine
+            # the loop on the evaluation model, which costs most, only if the smaller loop is good
             return fine(closed) and (closed.left_out is None or fine(closed.left_out))
 
         trials = np.geomspace(0.19 * self.rate, _SLOWEST * self.rate, _TRIALS)

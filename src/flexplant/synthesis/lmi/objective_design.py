@@ -49,22 +49,22 @@ def design_lmi(
     """Return a controller that keeps several norms below bounds and makes one of them small.
 
     Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. All objectives
-    share one Lyapunov matrix, which makes the problem convex and its optimum an upper bound: a
-    controller may exist that does better. What is reached is found anew from the closed loop:
+    share one Lyapunov matrix. This makes the problem convex, but its optimum is only an upper
+    bound: a better controller may exist. The results are computed again from the closed loop:
     H-infinity by `hinf_norm`, H2 by Gramians, peaks by the impulse response, poles as eigenvalues.
 
     Parameters
     ----------
     plant : StandardPlant
-        Usually weighted; at most max_states states. Of a sampled one damping and bandwidth of a
-        PoleRegion are not convex: the poles are held in a polygon and a disc inside the region.
+        Usually weighted; at most max_states states. For a sampled plant, damping and bandwidth of a
+        PoleRegion are not convex: the poles are kept in a polygon and a disc inside the region.
     minimize : H2, Hinf or PeakGain
         Without `below`.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
-        What has to hold.
+        Constraints.
     back_off : float
-        Relative distance of what is minimised from its optimum, where gains may be infinite;
-        more where no controller keeps the bounds there: the certificate says how much.
+        Relative distance of the minimised norm from its optimum, at which gains may be infinite. It
+        is increased if no controller keeps the bounds; the certificate states the value.
     max_states : int
         Larger problems are refused: the time grows with the sixth power.
     u, y : sequence of str, optional
@@ -73,8 +73,8 @@ def design_lmi(
     Returns
     -------
     Controller
-        `gamma` is the verified norm of what was minimised, `reached` that of every objective, the
-        certificate holds the bound of the LMIs for comparison.
+        `gamma` is the verified norm of the minimised objective, `reached` that of every objective,
+        the certificate holds the bound of the LMIs for comparison.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def design_lmi(
     CertificateError
         When the closed loop does not keep a bound.
     InfeasibleError
-        When a bound is below what any controller reaches for it alone, or the solver proves that
-        none keeps them all with one Lyapunov matrix.
+        When a bound is too small even without the others, or the solver proves that no controller
+        keeps all of them with one Lyapunov matrix.
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError

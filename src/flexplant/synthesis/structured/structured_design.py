@@ -76,29 +76,31 @@ def design_structured(
 ) -> Controller:
     """Return the controller of a structure with the least norm found from w to z.
 
-    From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
-    the norm, the largest over all plants (of several objectives in multiples of their `below`).
-    At a minimum of the H-infinity norm several peaks are equally high: each step takes the gains
-    at all high frequencies together, with their gradients (``d|T| = Re u* dT v``, u and v the
-    singular vectors there) and second derivatives. The best ends are continued. The problem is not
-    convex: another start may do better.
+    From several starts, first the spectral abscissa of the closed loop is lowered until the loop is
+    stable, then the largest norm over all plants (for several objectives, each in multiples of its
+    `below`). At a minimum of the H-infinity norm several peaks are equally high: each step takes
+    the gains at all high frequencies together, with their gradients (``d|T| = Re u* dT v``, u and v
+    the singular vectors there) and second derivatives. The best ends are continued. The problem is
+    not convex: another start may do better.
 
     Parameters
     ----------
     plant : StandardPlant, sequence of StandardPlant, or mapping {position: StandardPlant}
-        Continuous or sampled; one controller for several plants with the same u, y and rate, by
-        position judged half way between them too (the plant linear there). A labelled StateSpace
-        serves.
+        Continuous or sampled; one controller for several plants with the same u, y and rate; plants
+        by position are also checked half way between positions (interpolated linearly). A labelled
+        StateSpace is accepted.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
-        What the controller looks like, and where the search begins.
+        Structure of the controller, and start of the search.
     objective : Hinf, H2, PeakGain, or sequence of these
-        What is minimised; of several, each with `below`, the one farthest above it. Anything with
-        the methods of `LoopObjective` serves. H2 of a continuous plant is finite for controllers
-        without feedthrough where D12 and D21 are: ``FixedOrder(n, direct=False)``.
+        Objective to be minimised; of several objectives, each with `below`, the largest ratio to
+        it. Any object with the methods of `LoopObjective` is accepted. H2 of a continuous plant is
+        finite for controllers without feedthrough where D12 and D21 are:
+        ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     starts : int
-        The first is the structure's own, the others are drawn around it and around the best end.
+        Number of starts. The first is that of the structure; the others are drawn around it and
+        around the best result.
     rng : int, SeedSequence or Generator
         Random generator of the starts, or its seed.
     evaluations : int
@@ -112,28 +114,29 @@ def design_structured(
     -------
     Controller
         `structure` is the one given with the numbers found: a further design can begin there.
-        `gamma` is the largest verified norm (over `below`), `tried` what each start reached. The
-        certificate holds the norm of each plant, each objective, by position the worst, between
-        them too, and of the local minimum `slope`, the norm of the smallest convex combination of
-        the gradients (of log gamma, by the parameters), and `decrease left`, by which part a step
-        of the length `radius` would still lower gamma, to first order.
+        `gamma` is the largest verified norm (over `below`), `tried` the result of each start. The
+        certificate holds the norm of each plant and objective (for plants by position the worst
+        one, also between positions), and two figures of the local minimum: `slope`, the norm of the
+        smallest convex combination of the gradients of log gamma, and `decrease left`, the relative
+        decrease of gamma by a step of length `radius`, to first order.
 
     Raises
     ------
     AssumptionError
         When u does not reach, or y does not see, a mode that is not stable.
     InfeasibleError
-        When no start is stabilised; with the frequency of the pole that stays unstable.
+        When no start is stabilised; the message has the frequency of the pole that remains
+        unstable.
     CertificateError
-        When the norm of a loop is not the one that the search claims, or the loop is unstable
-        between positions.
+        When the norm of a loop differs from that of the search, or the loop is unstable between
+        positions.
     ModelError, ShapeError, LabelError
-        When plants and structure do not go together.
+        When plants and structure do not fit.
 
     Warns
     -----
     FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When truncated modes make the loop unstable, or raise |S| at u above 8 dB; it names them.
 
     References
     ----------
