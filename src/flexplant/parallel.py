@@ -304,6 +304,8 @@ _AGAIN = 1.0
 LONG = 20.0
 #: a promise that is wrong by this factor is corrected
 _OFF = 2.0
+#: share of the work from which on its time tells that of all
+_TELLS = 0.05
 #: the bars that a thread is inside of
 _open = threading.local()
 
@@ -450,6 +452,8 @@ class Progress:
         own = self.done - self._known
         if not (self._total and self._counts) or own <= 0:
             return 0.0
+        if own < _TELLS * self._total and self.elapsed < LONG:  # the first ones may take longer
+            return 0.0
         since = self.elapsed - self._last  # of the item under way, which may take longer
         each = max(self._last / own, since)
         return max(each * (self._total - self.done) - since, 1e-9)
@@ -508,10 +512,6 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0, more: bool = F
         bars[0].expects(seconds)
     else:
         bars[0].expects(bars[0].elapsed + seconds, at_least=True)
-
-
-#: share of the work from which on its time tells that of all
-_TELLS = 0.05
 
 
 def so_far(done: float, expected: float) -> None:

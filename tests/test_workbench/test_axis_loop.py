@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import median_filter
 
 import flexplant as fx
 from bench_plants import RATE, closed_poles, coupled, design, law, light, lines, measured
 from flexplant.workbench import LoopLimits
 from flexplant.workbench.evaluation import BenchMachine, Evaluator, coupling
 from flexplant.workbench.verdict import of_fleet, stability_verdict
+from flexplant.workbench.views import Views, _is_noise, _ratio, _wrapped
 
 SAMPLED = {"rate": RATE, "hold": False}
 
@@ -98,7 +100,11 @@ def test_a_notch_on_a_mode_of_a_thousandth_makes_it_stable_also_by_its_lines():
         assert loop.is_stable is bool(size < 1.0)
         states.append(loop.is_stable)
     assert states == [False, True]
-    assert stability_verdict(loop)[0] == "stable"
+    word, how = stability_verdict(loop)
+    assert word == "stable"
+    assert how.startswith("Nyquist criterion on the measured lines: no unstable poles.")
+    if loop.count.narrowest:
+        assert f"misses only a mode narrower than {loop.count.narrowest:.2g} Hz" in how
 
 
 def test_the_other_axes_count_too(frf, made):
@@ -168,3 +174,40 @@ def test_limits_are_met_or_not():
     bad = design(plant, law())
     wild = Evaluator().loop(on(plant, bad), bad, "y1")
     assert not any(one.met for one in limits.judged(wild))
+
+
+@pytest.mark.parametrize("level", [1e-3, 1e-1])
+def test_the_phase_is_drawn_where_it_is_above_the_noise(level):
+    """Resonances of two lines stay, wherever they are; of lines of noise alone next to nothing."""
+    rng = np.random.default_rng(int(1e4 * level))
+    freq = np.linspace(1.0, 1000.0, 4000)
+    s, L = 1j * freq, 0.0
+    for at, zeta in zip(rng.uniform(20.0, 300.0, 6), rng.uniform(5e-4, 2e-2, 6), strict=True):
+        L = L + at**2 / (s**2 + 2 * zeta * at * s + at**2)
+    noise = level * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000))
+    size = np.abs(L)
+    clear = median_filter(size, 15, mode="nearest") > 6.0 * level
+    assert clear.sum() > 300 and _is_noise(L + noise)[clear].mean() < 0.02
+    assert np.isfinite(_wrapped(noise)).mean() < 0.05
+    assert np.isfinite(_wrapped(L + noise))[clear].mean() > 0.9, "gaps at turns of 360 deg alone"
+    phase = _wrapped(L)
+    assert np.nanmax(phase) <= 0.0 and np.nanmin(phase) > -360.0
+    there = np.isfinite(phase)
+    np.testing.assert_allclose(np.exp(1j * np.radians(phase[there])), (L / size)[there], atol=1e-9)
+
+
+def test_gains_say_what_0_db_is():
+    """N/m of a translation, N m/rad of a rotation, SI where units are not known."""
+    assert [_ratio("N", "m"), _ratio("m", "N"), _ratio("N m", "rad"), _ratio("rad", "N m")] == [
+        "N/m", "m/N", "N m/rad", "rad/(N m)",
+    ]  # fmt: skip
+    plant = light()
+    for known, zero in (({}, "1 in SI units"), ({"u1": "N", "y1": "m"}, "1 N/m")):
+        made = design(plant.replace(units=known), law())
+        loop = Evaluator().loop(on(plant.replace(units=known), made), made, "y1")
+        views = Views(LoopLimits())
+        views.update(loop, made.axes["y1"])
+        own = loop.machine.axes.plant
+        if not own.units:
+            zero = "1 in SI units"
+        assert views.figures["KS"].title.text == f"|KS|: noise to command [dB, 0 dB = {zero}]"

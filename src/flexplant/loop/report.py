@@ -165,7 +165,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     def __repr__(self) -> str:
         state = {True: "stable", False: f"unstable, {self.poles}", None: "stability not judged"}
         limit = (
-            f" if no mode is narrower than {self.narrowest:.2g} Hz (near {self.near:.4g} Hz)"
+            f" unless a mode between the lines near {self.near:.4g} Hz is narrower than "
+            f"{self.narrowest:.2g} Hz"
             if self.narrowest and self.is_stable
             else ""
         )
@@ -192,8 +193,8 @@ def report_loops(
     ``S = (I - L)^-1``. Stability of a model follows from the poles; that of a measured plant from
     the Nyquist count, with the poles at zero and outside the stability region that are stated for
     the plant and known of the controller. Modes between the lines are included as far as the lines
-    show them; otherwise the result is conditional, "stable if no mode is narrower than 0.02 Hz", or
-    stability is not judged.
+    show them; otherwise the result is conditional, "stable unless a mode between the lines near 80
+    Hz is narrower than 0.02 Hz", or stability is not judged.
 
     Parameters
     ----------

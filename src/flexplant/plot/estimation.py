@@ -95,7 +95,7 @@ def predictions(
         color = (colors or {}).get(name, str(CYCLE[i % len(CYCLE)]["color"]))
         _draw_row(ax, len(names) - 1 - i, table / factor, color)
     ax.set_xscale("log")
-    _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
+    _name_cases(ax, cases, [table[:, :2] / factor for table in tables.values()])
     ax.set_yticks(range(len(names)), names[::-1])
     ax.set_ylim(-0.6, len(names) - 0.4)
     handles = [
@@ -222,13 +222,19 @@ def estimate(
     return finish(ax, x=named("time", time), y=named(label, unit), given=given)
 
 
-def _name_cases(ax: Axes, cases: Sequence[str], found: FloatArray, place: float) -> None:
-    """Write the names of cases above the row of the first design, within the axes."""
+def _name_cases(ax: Axes, cases: Sequence[str], errors: Sequence[FloatArray]) -> None:
+    """Write the names of cases above each of their pairs of errors, row by row, within the axes."""
     texts = name_list(cases, "cases")
-    if texts and len(texts) != found.size:
-        raise ShapeError(f"{len(texts)} names of cases are given for {found.size}. Name each.")
-    for name, size in zip(texts, found, strict=False):
-        ax.annotate(name, (size, place), (0, 11), textcoords="offset points", ha="center")
+    count = len(errors[0])
+    if texts and len(texts) != count:
+        raise ShapeError(f"{len(texts)} names of cases are given for {count}. Name each.")
+    for i, pairs in enumerate(errors):
+        for name, (predicted, found) in zip(texts, pairs, strict=False):
+            middle = np.sqrt(predicted * found)
+            ax.annotate(
+                name, (middle, len(errors) - 1 - i), (0, 11),
+                textcoords="offset points", ha="center", fontsize="small",
+            )  # fmt: skip
     ends = [text.get_window_extent().transformed(ax.transAxes.inverted()) for text in ax.texts]
     beyond = max((max(-box.x0, box.x1 - 1.0) for box in ends), default=0.0)
     ax.margins(x=0.05 + 1.5 * max(beyond, 0.0))

@@ -37,6 +37,9 @@ from ._axes import (
     plan,
 )
 
+#: what a map of sensors shows
+_RATIO = "POI error with / without a further sensor [-], lower is better"
+
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
     """Draw the benefit of one more sensor by place, seen from above.
@@ -80,7 +83,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     factor = plan(ax, found.points)
     x, y = found.points[:, :2].T / factor
     contours = ax.tricontourf(x, y, ratio, levels=20, cmap="viridis_r")
-    ax.figure.colorbar(contours, ax=ax, label="POI error with / without a further sensor [-]")
+    ax.figure.colorbar(contours, ax=ax, label=_RATIO)
     ax.plot(x, y, ".", color="white", markersize=1.5)
     for i, zone in enumerate(found.excluded):
         style = {"facecolor": "white", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}

@@ -86,8 +86,8 @@ class Page:
             name: pn.widgets.Button(label=text, variant="outline", description=tip, **small)
             for name, text, tip in (
                 ("undo", "↶ undo", "one step back"), ("redo", "↷ redo", "one step forward"),
-                ("keep", "keep", "keep this design as a pale curve"),
-                ("fit", "fit", "choose the ranges of all pictures anew"),
+                ("keep", "keep to compare", "draw this design pale, with a button to return to it"),
+                ("fit", "fit axes", "choose the ranges of all pictures again"),
             )
         }  # fmt: skip
         self.kept_row = pn.Row(margin=0)
@@ -267,7 +267,7 @@ class Page:
 
     def _keep(self) -> None:
         """Keep the design as a pale curve, and a button to go back to it."""
-        first = f"design {len(self.kept) + 1}", self.design, self.answer
+        first = f"kept {len(self.kept) + 1}", self.design, self.answer
         self.kept = [first, *self.kept][: len(KEPT)]
         self._show_kept()
 
@@ -278,7 +278,7 @@ class Page:
         for (name, design, _), color in zip(self.kept, KEPT, strict=False):
             button = pn.widgets.Button(
                 label=name, margin=(0, 3, 0, 0), height=28, variant="outline",
-                description="go back to this design",
+                description="return to this design, drawn as pale curves in this color",
                 stylesheets=[COMPACT, f".bk-btn{{border-color:{color};color:{color}}}"],
             )  # fmt: skip
             button.on_click(lambda _, design=design: self.take(design))

@@ -113,10 +113,13 @@ def stability_verdict(loop: AxisLoop) -> tuple[str, str]:
     count, measured = loop.count, loop.machine.is_measured
     if count.unstable is None:
         return "stability not judged", count.reason
-    how = "the Nyquist count" if measured else "the poles"
-    said = f"{count.unstable} unstable pole{'' if count.unstable == 1 else 's'} by {how}"
+    how = "Nyquist criterion on the measured lines" if measured else "Poles of the closed loop"
+    said = f"{how}: {count.unstable or 'no'} unstable pole{'' if count.unstable == 1 else 's'}."
     if measured and count.narrowest and not count.unstable:
-        said += f", if no mode is narrower than {count.narrowest:.2g} Hz (near {count.near:.4g} Hz)"
+        said += (
+            f" This misses only a mode narrower than {count.narrowest:.2g} Hz between the lines "
+            f"near {count.near:.4g} Hz: finer lines there would show it."
+        )
     return ("UNSTABLE" if count.unstable else "stable"), said
 
 

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..synthesis import Notch, ShapedAxis
@@ -67,9 +68,10 @@ class Views:
         self.freq_range = Range1d(1.0, 1e3)
         self.figures: dict[str, Any] = {}
         for name, title in (
-            ("magnitude", "loop gain |L| [dB]"), ("phase", "phase of L [deg]"),
-            ("S", "|S| blue, |T| orange [dB]"), ("KS", "|KS|: noise to command [dB]"),
-            ("PS", "|PS|: force to motion [dB]"), ("coupling", "coupling |G_i / G_own| [dB]"),
+            ("magnitude", "loop gain |L| [dB]"),
+            ("phase", "phase of L [deg], without lines of noise"),
+            ("S", "|S| blue, |T| orange [dB]"), ("KS", "|KS|: noise to command"),
+            ("PS", "|PS|: force to motion"), ("coupling", "coupling |G_i / G_own| [dB]"),
         ):  # fmt: skip
             self.figures[name] = self._figure(title, height=170 if name == "phase" else 250)
         self.figures["magnitude"].height = 300
@@ -272,6 +274,7 @@ class Views:
             high, low = np.abs(L) + wide, np.maximum(np.abs(L) - wide, 1e-3 * np.abs(L))
             self._put("band", x=f, low=magnitude_db(low), high=magnitude_db(high))
         i = loop.machine.axes.names.index(loop.name)
+        self._name_units(loop, i)
         marked = loop.machine.unresolved(i)
         self._put("unresolved", x=f[marked], y=magnitude_db(L[marked]))
         freq = loop.margins.freq
@@ -279,6 +282,18 @@ class Views:
         self._put("closest", x=[closest.real], y=[closest.imag], text=[f"{freq:.4g} Hz"])
         if handles:
             self._handles(loop, axis)
+
+    def _name_units(self, loop: AxisLoop, i: int) -> None:
+        """Write what 0 dB is on the gains that have a unit."""
+        plant = loop.machine.axes.plant
+        force, motion = plant.units.get(plant.inputs[i]), plant.units.get(plant.outputs[i])
+        known = bool(force and motion)
+        for name, said, above, below in (
+            ("KS", "|KS|: noise to command", force, motion),
+            ("PS", "|PS|: force to motion", motion, force),
+        ):
+            zero = f"1 {_ratio(above or '', below or '')}" if known else "1 in SI units"
+            self.figures[name].title.text = f"{said} [dB, 0 dB = {zero}]"
 
     def _handles(self, loop: AxisLoop, axis: ShapedAxis) -> None:
         """Show where elements can be dragged: on the curve at their frequency."""
@@ -376,11 +391,30 @@ class Views:
         (fig.x_range.start, fig.x_range.end), (fig.y_range.start, fig.y_range.end) = _NYQUIST
 
 
+def _ratio(above: str, below: str) -> str:
+    """Return the unit of a ratio: N/m, N m/rad, m/(N m)."""
+    return f"{above}/({below})" if set(" /") & set(below) else f"{above}/{below}"
+
+
 def _wrapped(L: Any) -> FloatArray:
-    """Return the phase between -360 and 0 deg, with gaps where it is wrapped."""
+    """Return the phase between -360 and 0 deg, with gaps where it is wrapped or noise."""
     phase = -np.mod(-np.degrees(np.angle(L)), 360.0)
     jump = np.abs(np.diff(phase, prepend=phase[:1])) > 270.0
-    return np.asarray(np.where(jump, np.nan, phase))
+    return np.asarray(np.where(jump | _is_noise(L), np.nan, phase))
+
+
+#: lines among which the middle change of the phase tells noise from a loop, and that change [deg]:
+#: of noise it is 90 deg on average, at a resonance few lines change by more than 45 deg
+_AMONG, _TURNED = 9, 45.0
+
+
+def _is_noise(L: Any) -> NDArray[np.bool_]:
+    """Return where the phase of most neighbouring lines is random."""
+    from scipy.ndimage import median_filter
+
+    ratio = L[1:] * np.conj(L[:-1])
+    turned = np.abs(np.degrees(np.angle(np.append(ratio, ratio[-1:]))))
+    return np.asarray(median_filter(turned, _AMONG, mode="nearest") > _TURNED)
 
 
 def _visible_part(loop: AxisLoop) -> tuple[Any, Any]:
