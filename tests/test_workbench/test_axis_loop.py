@@ -198,9 +198,9 @@ def test_the_phase_is_drawn_where_it_is_above_the_noise(level):
 
 def test_gains_say_what_0_db_is():
     """N/m of a translation, N m/rad of a rotation, SI where units are not known."""
-    assert [_ratio("N", "m"), _ratio("m", "N"), _ratio("N m", "rad"), _ratio("rad", "N m")] == [
-        "N/m", "m/N", "N m/rad", "rad/(N m)",
-    ]  # fmt: skip
+    pairs = ("N", "m"), ("m", "N"), ("N m", "rad"), ("rad", "N m"), ("m/s^2", "m")
+    texts = ["N/m", "m/N", "N m/rad", "rad/(N m)", "(m/s^2)/m"]
+    assert [_ratio(*pair) for pair in pairs] == texts
     plant = light()
     for known, zero in (({}, "1 in SI units"), ({"u1": "N", "y1": "m"}, "1 N/m")):
         made = design(plant.replace(units=known), law())

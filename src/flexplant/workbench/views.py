@@ -392,8 +392,9 @@ class Views:
 
 
 def _ratio(above: str, below: str) -> str:
-    """Return the unit of a ratio: N/m, N m/rad, m/(N m)."""
-    return f"{above}/({below})" if set(" /") & set(below) else f"{above}/{below}"
+    """Return the unit of a ratio: N/m, N m/rad, m/(N m), (m/s^2)/m."""
+    top = f"({above})" if "/" in above else above
+    return f"{top}/({below})" if set(" /") & set(below) else f"{top}/{below}"
 
 
 def _wrapped(L: Any) -> FloatArray:
@@ -405,7 +406,7 @@ def _wrapped(L: Any) -> FloatArray:
 
 #: lines among which the middle change of the phase tells noise from a loop, and that change [deg]:
 #: of noise it is 90 deg on average, at a resonance few lines change by more than 45 deg
-_AMONG, _TURNED = 9, 45.0
+_AMONG, _TURNED = 21, 45.0
 
 
 def _is_noise(L: Any) -> NDArray[np.bool_]:
