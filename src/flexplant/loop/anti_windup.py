@@ -41,7 +41,7 @@ def recovery_gain(A: FloatArray, C: FloatArray, recovery: float, dt: float) -> F
         rest = A - L @ C
     if not _slowest(rest, dt) <= _REACHED * wanted:
         raise ModelError(
-            f"{counted(slow, 'slow state')} of the blocks that drive actuators cannot be "
+            f"{counted(slow, 'slow state')} of the blocks that drive actuators cannot all be "
             f"determined from the {counted(len(C), 'command')}, so that anti-windup cannot "
             "correct them. Use fewer integrators for each actuator, or leave the recovery time "
             "out and use blocks with separate anti-windup."
