@@ -297,10 +297,10 @@ class _Tracking(NamedTuple):
 
     def moved(self, forced: ClosedLoop, along: npt.ArrayLike | None) -> OfS:
         """Return the function of s that gives [G_u, G_r] (p, r, r + 1) of a loop at p places."""
-        # a place changes what is seen of the states and of u, which the feedback does not read
+        # a place changes only outputs that the feedback does not read
         g, plant, poi, axes = forced.monitored, forced.machine, self.poi, self.axes
         r = self.T.shape[1]
-        # the reference, and those of its derivatives that the blocks read
+        # the reference, and its derivatives that the blocks read
         signals = [self.name, *(f"{self.name}:{term}" for term in DERIVATIVES)]
         orders = [m for m, name in enumerate(signals) if name in plant.w]
         acts = np.zeros((len(plant.w), r + len(orders)))

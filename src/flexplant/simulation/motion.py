@@ -15,7 +15,7 @@ from ..store import Value
 from ..tolerances import RANK
 from ..words import instance
 
-#: [samples] a time this close to the grid is on it
+#: [samples] distance from the grid below which a time counts as on the grid
 ON_GRID = 1e-6
 
 
@@ -169,8 +169,8 @@ class SetPointProfile(Value):
 class Phase(NamedTuple):
     """A stretch of time in which the highest derivative is constant.
 
-    `state` is position, velocity, acceleration, jerk and snap at its beginning or, with
-    `from_end`, at its end: expanded from there, what begins or ends at rest does so exactly.
+    `state` is position, velocity, acceleration, jerk and snap at its beginning or, with `from_end`,
+    at its end: expanded from there, motions begin and end exactly at rest.
     """
 
     length: float
@@ -207,9 +207,10 @@ def shortest(distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
 
 def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[float, ...]:
     """Return the durations in whole samples: the shortest motion near the optimum off the grid."""
-    # any durations give the distance exactly with one level of the highest derivative. For those of
-    # the levels 1 to n - 1 the last one, a constant velocity, is as short as all bounds allow:
-    # `w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))`. So every bound holds for every choice
+    # with any durations, one level of the highest derivative gives the distance exactly. For given
+    # durations of the levels 1 to n - 1, the last duration (constant velocity) is the shortest that
+    # all bounds allow: `w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))`. So every bound holds
+    # for every choice
     off = shortest(distance, bounds)
     choices = []
     for level, length in enumerate(off[:-1]):
@@ -257,7 +258,7 @@ def flank(t: tuple[float, ...], change: float) -> list[Phase]:
 
 
 def mirrored(rows: list[Phase], total: float) -> list[Phase]:
-    """Return phases in reversed time: what rises from rest comes to rest, at the position total."""
+    """Return phases in reversed time: a rise from rest becomes a stop at the position total."""
     return [
         Phase(length, not from_end, np.array([total - p, v, -a, j, -s]))
         for length, from_end, (p, v, a, j, s) in reversed(rows)
@@ -340,15 +341,15 @@ def setpoint(
 ) -> SetPointProfile:
     """Return the fastest motion from rest to rest within the bounds, in closed form.
 
-    Second order (acceleration jumps), third with `jerk` (jerk jumps) or fourth with `snap`. Bounds
-    that the distance is too short to reach are not reached. The second and third order are
-    time-optimal; so is the fourth where the velocity bound is reached. Where it is not,
-    acceleration and jerk still return to zero between speeding up and slowing down, which takes at
-    most 7.5 % longer than the optimum.
+    Second order (acceleration jumps), third with `jerk` (jerk jumps) or fourth with `snap`. For a
+    short distance some bounds are not reached. The second and third order are time-optimal; so is
+    the fourth where the velocity bound is reached. Where it is not, acceleration and jerk still
+    return to zero between speeding up and slowing down, which takes at most 7.5 % longer than the
+    optimum.
 
-    With `rate` all switching times are samples of a grid: the motion is a few samples longer, the
-    levels a little lower, so that all bounds hold and the end is exact; the samples of all
-    derivatives then belong together without any interpolation.
+    With `rate` all switching times are samples of a grid: the motion is a few samples longer and
+    its levels a little lower, so that all bounds are kept and the end is exact. The samples of all
+    derivatives are then consistent without interpolation.
 
     Parameters
     ----------
@@ -365,7 +366,7 @@ def setpoint(
     settle, exposure : float [s]
         Time to settle after the motion, and length of the exposure window after that.
     rate : float, optional [Hz]
-        Rate of the controller, if the motion shall switch at its samples; rests are rounded up to
+        Rate of the controller, if the motion is to switch at its samples; rests are rounded up to
         whole samples.
 
     Returns
@@ -468,7 +469,7 @@ def scan(
 
 
 class _Grid:
-    """The samples that a motion switches on; false without any."""
+    """The sample grid on which a motion switches; false without a grid."""
 
     def __init__(self, rate: float | None) -> None:
         self.tick = 1.0 if rate is None else 1.0 / positive(rate, "rate")
