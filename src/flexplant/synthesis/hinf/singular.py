@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
+from ...lti.modal_map import eigenvalues_with_error
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING
@@ -43,6 +44,9 @@ _GROWTH = 3.0
 #: at this distance from the limit of stability stand apart by a hundred times that root. Modes of
 #: isolators (0.5 Hz, 0.3 %) in loops of 60 Hz decay at 3e-5
 _SLOW, _SHOWN = 1e-6, 1e-8
+#: the same of poles in a chain (equal lags in a row), which rounding splits by its third root; and
+#: the uncertainty of a pole by rounding that tells them: single ones have 1e-16 to 1e-13
+_SLOW_CHAIN, _CHAIN = 1e-4, 1e-12
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
     "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
@@ -90,11 +94,11 @@ def lacking(p: Prepared) -> Lacking:
                 f"{name} has rank {rank} of {D.shape[1]}: a combination of {', '.join(names)} "
                 f"{little}"
             )
-    return Lacking(tuple(ranks), missed_modes(p, _SLOW, _SHOWN), is_full)
+    return Lacking(tuple(ranks), missed_modes(p, _SHOWN), is_full)
 
 
-def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
-    """Return in words which modes that decay so slowly z or w misses, or shows by less than a size.
+def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
+    """Return in words which slow modes z or w misses, or shows by less than a size.
 
     Zeros of u -> z and of w -> y so close to the limit of stability count like such modes.
     """
@@ -105,8 +109,10 @@ def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
         # [A - s I, B2; C1, D12] loses rank at poles of A, or of A without what D12 can hide: its
         # least singular value on the limit of stability is at most the distance to that pole then
         inner = A - B @ np.linalg.pinv(D) @ C
-        poles = np.concatenate([la.eigvals(A), la.eigvals(inner)])
-        for s, distance in _limit(p, poles, decay):
+        (own, _, error), (hidden, _, its) = map(eigenvalues_with_error, (A, inner))
+        chained = np.concatenate([error, its]) > _CHAIN
+        decay = np.where(chained, _SLOW_CHAIN, _SLOW)
+        for s, distance in _limit(p, np.concatenate([own, hidden]), decay):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
             if la.svdvals(pencil)[-1] <= max(distance, shown):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
@@ -115,22 +121,24 @@ def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _limit(p: Prepared, poles: ComplexArray, decay: float) -> list[tuple[complex, float]]:
+def _limit(p: Prepared, poles: ComplexArray, decay: FloatArray) -> list[tuple[complex, float]]:
     """Return the points of the limit of stability next to slow poles, and the distances there."""
     if p.direct:
-        decay *= abs(p.point - 1.0)
-        near = poles[np.abs(np.abs(poles) - 1.0) <= decay]
-        limit = np.where(np.abs(near - 1.0) <= decay, 1.0, near / np.abs(near))
+        decay = decay * abs(p.point - 1.0)
+        slow = np.abs(np.abs(poles) - 1.0) <= decay
+        near = poles[slow]
+        limit = np.where(np.abs(near - 1.0) <= decay[slow], 1.0, near / np.abs(near))
     else:
-        near = poles[np.abs(poles.real) <= decay]
-        limit = 1j * np.where(np.abs(near) <= decay, 0.0, near.imag)
+        slow = np.abs(poles.real) <= decay
+        near = poles[slow]
+        limit = 1j * np.where(np.abs(near) <= decay[slow], 0.0, near.imag)
     return [(complex(s), abs(s - pole)) for s, pole in zip(limit, near, strict=True)]
 
 
 def require_shown(p: Prepared) -> None:
     """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
     size = max(float(np.linalg.norm(p.A, 2)) if p.A.size else 0.0, 1.0)
-    for one in missed_modes(p, _SLOW, ROUNDING * size):
+    for one in missed_modes(p, ROUNDING * size):
         raise AssumptionError(one)
 
 
