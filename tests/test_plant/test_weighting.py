@@ -4,6 +4,8 @@ import control
 import numpy as np
 import pytest
 
+import flexplant as fx
+from driven_kinds import table
 from flexplant.errors import LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response, high_pass_filter, low_pass_filter, tustin
 from flexplant.plant import StandardPlant, assemble_plant, standard_plant
@@ -157,3 +159,11 @@ def test_steps_in_any_order_give_the_same_plant(seed):
     assert (plant.w, plant.u, plant.z, plant.y) == (wanted.w, wanted.u, wanted.z, wanted.y)
     assert plant.asd == wanted.asd
     assert plant.unweighted.dt == plant.dt == wanted.dt
+
+
+def test_disturbances_along_levers_have_sizes():
+    """A force by a combination of translation and rotation has no unit of its own."""
+    plant = table(np.random.default_rng([3, 4]))
+    found = fx.stage_weights(plant, 64.0)
+    forces = [found.w[name] for name in found.w if name.startswith("air")]
+    assert len(forces) == 4 and min(forces) > 0.0

@@ -312,7 +312,7 @@ def _capped(
     """
     found = {}
     for name, size in equal.items():
-        unit = units.get(name, "")
+        unit = units.get(name)
         if unit in shaken:
             found[name] = shaken[unit]
             continue
