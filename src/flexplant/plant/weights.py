@@ -313,7 +313,7 @@ def _capped(
     found = {}
     for name, size in equal.items():
         unit = units.get(name)
-        if unit in shaken:
+        if unit is not None and unit in shaken:
             found[name] = shaken[unit]
             continue
         alike = [force for own, force in forces.items() if units.get(own) == unit]
