@@ -135,9 +135,7 @@ def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
 def test_what_is_promised_holds_where_shapes_are_mixed_by_hand():
     """A mass of 20 g anywhere, of 26.5 kg: shapes of all modes differ, frequencies do too."""
     uncertain = plant().uncertain(frequency=SHARE)
-    with pytest.raises(InfeasibleError, match="no loop with weights for"):
-        fx.design_stage(uncertain, bandwidth=60.0)
-    found = fx.design_stage(uncertain, bandwidth=40.0)
+    found = fx.design_stage(uncertain, bandwidth=60.0)
     promised = found.certificate[PROMISED]
     model, rng = make_plate(), np.random.default_rng(4)
     for _ in range(3):
