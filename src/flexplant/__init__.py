@@ -28,7 +28,8 @@ and the names of the same functions in other tools.
   driven: u1
   monitored: die:hat
   not judged on a larger model
-  stays stable if any one modal frequency shifts by 1 %
+  not judged on a measurement
+  stays stable if one modal frequency (not its shape) shifts by 1 %
 
 **Conventions**
 

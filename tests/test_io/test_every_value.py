@@ -95,6 +95,8 @@ def made():
     yield fx.compare_loops({"servo": loop})
     yield from (loop.budget("die:error"), loop.mode_tolerances(known=1e-9))
     yield fx.modes.MeshError(np.array([4]), np.array([10.0]), np.array([10.1]), 2.0, np.array([3]))
+    yield fx.loop.OnMeasurement(0.5, 100.0)
+    yield fx.plant.MeasuredResponse(fx.frequency_response(plant.continuous.Gyu, [10.0, 20.0]))
     yield fx.loop.SpillOver(0.99, True, 0.5, 0.6, 100.0, 490)
     yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)

@@ -215,6 +215,7 @@ def test_repr_is_short(loop):
         "  driven: u1 u2",
         "  monitored: die:hat",
         "  not judged on a larger model",
+        "  not judged on a measurement",
     ]
 
 

@@ -1,5 +1,6 @@
 """Every filter, controller, loop, score and budget accounts for the evaluation model, unasked."""
 
+import numpy as np
 import pytest
 
 import flexplant as fx
@@ -59,3 +60,55 @@ def test_scores_are_those_of_the_filters_that_are_judged():
         assert scores.values[0] == pytest.approx(wanted, rel=1e-6, abs=0)
         assert [repr(found).count(SAID) for found in (scores, placed)] == [plant is FEW] * 2
     assert wanted > 2.0 * fx.design_kalman(FEW).variances[0]
+
+
+def response(gain=1.0):
+    """The response of a machine with all modes, from actuators to sensors, not held."""
+    g = JUDGED.continuous.evaluation_plant.Gyu.select(outputs=YS)
+    lines = np.concatenate([np.arange(1.0, 2500.0), np.arange(2500.0, 2e4, 5.0)])
+    frf = fx.frequency_response(g, lines)
+    return frf.replace(data=gain * frf.data)
+
+
+DESIGNED = ("servo", "H2", "H-infinity", "coprime factors", "loop")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DESIGNED)
+@pytest.mark.filterwarnings("ignore:with the modes that the plant left out")
+def test_a_design_is_judged_on_the_measured_response_or_says_that_it_is_not(name):
+    alone, measured = (ANSWERS[name](one) for one in (JUDGED, JUDGED.measured(response())))
+    assert repr(alone).count("not judged on a measurement") == 1
+    assert "not judged on a measurement" not in repr(measured)
+    assert "on the measured response: stable, modulus margin" in repr(measured)
+
+
+@pytest.mark.slow
+def test_the_margin_on_the_measured_response_is_that_of_its_lines():
+    made = loop(JUDGED.measured(response()))
+    found = made.on_measurement
+    f = np.arange(1.0, 2500.0)
+    law = made.controller.select(made.driven, YS)
+    K = fx.frequency_response(law, f).data
+    # the machine behind a zero-order hold, 1.5 samples late, and what folds back from above
+    every, P = response(), 0.0
+    for k in (-1, 0, 1):
+        at = np.abs(f + k * 10e3)
+        data = np.array([[np.interp(at, every.freq, one) for one in row] for row in every.data])
+        data = np.where(f + k * 10e3 < 0, data.conj(), data)
+        held = np.sinc((f + k * 10e3) / 10e3) * np.exp(-1j * np.pi * (f + k * 10e3) / 10e3)
+        P = P + data * held * np.exp(-2j * np.pi * (f + k * 10e3) * 1.5 / 10e3)
+    S = np.linalg.inv(np.eye(4) - np.einsum("uyf,yvf->fuv", K, P))
+    assert found.margin == pytest.approx(1.0 / np.linalg.norm(S, 2, axis=(1, 2)).max(), rel=0.01)
+    assert found.margin == pytest.approx(made.completed.modulus_margin, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_loop_that_is_unstable_on_the_measured_response_warns():
+    with pytest.warns(fx.errors.FlexplantWarning, match="unstable on the measured response"):
+        found = loop(JUDGED.measured(response(gain=8.0)))
+    assert found.is_stable and found.on_measurement.is_unstable
+    with pytest.raises(fx.errors.LabelError, match="no sensor"):
+        JUDGED.measured(response().replace(outputs=("a", "b", "c", "d")))
+    # another rate, another position: the machine is the same
+    assert JUDGED.measured(response()).at((0.1, 0.1, 0.0)).measurement is not None

@@ -9,7 +9,8 @@ import scipy.stats
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.plant.machine_draws import MachineFamily
+from flexplant.estimation.machine_noise import _difference, _driven_modes
+from flexplant.plant.machine_draws import MachineFamily, _exponential
 from flexplant.plant.machine_plants import interval_of
 from flexplant.plant.realisation import realise
 from flexplant.updating.machines import Draw
@@ -145,6 +146,47 @@ def test_scatter_moves_frequencies_and_shapes_together(case):
     assert gain.std() == pytest.approx(2 * s, rel=0.35)
 
 
+def test_elastic_shapes_move_the_rigid_body_where_nobody_weighed_it(case):
+    """Momentum of a hidden mass: the rigid part of a shape has the deviation of the scatter."""
+    family = MachineFamily(realise(case.whole), case.machines)
+    found = np.array([own(drawn(family, s=2e-3, seed=i))[1] for i in range(60)])
+    at = unmeasured(case)
+    part = found[:, :2, at] * np.sign(np.diagonal(found, axis1=1, axis2=2))[:, None, at]
+    assert part.std() == pytest.approx(np.sqrt(2) * 2e-3, rel=0.15)
+
+
+@pytest.mark.parametrize("angle", [-1.2, 0.3, 0.9])
+def test_close_pairs_turn_to_their_measured_shapes(case, angle):
+    """What was measured is a pair turned by an angle, each shape with any factor."""
+    points = np.array([[x, 0.0, 0.0] for x in (0.0, 0.2, 0.55, 0.7)])
+    rows = np.array([case.whole.at(tuple(p)) for p in points.tolist()])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shapes = np.zeros((4, len(case.measured)), dtype=complex)
+    shapes[:, 2:] = 1.0
+    shapes[:, :2] = rows[:, 2:4] @ turn * [2.0, -0.3j]
+    named = {f"s{i}": tuple(point) for i, point in enumerate(points.tolist())}
+    measured = case.measured.replace(shapes=shapes, dofs=list(named))
+    known = measured.replace(xyz=points, directions=("z",) * 4)
+    family = MachineFamily(realise(case.whole), case.fit.machines(known))
+    assert family.pairs == []  # a beam has none
+    family.pairs = [(0, 1)]
+    V = family._turned(np.eye(family.omega.size), family.measured)
+    np.testing.assert_allclose(np.abs(V[2:4, 2:4]), np.abs(turn), atol=5e-3)
+    np.testing.assert_allclose(V.T @ V, np.eye(len(V)), atol=1e-12)
+    # the points come with the numbers
+    with warnings.catch_warnings(action="ignore"):
+        found = fx.numbered(measured.replace(modes=None), case.whole, at=named, least_mac=0.0)
+    np.testing.assert_array_equal(found.xyz, points)
+    assert MachineFamily(realise(case.whole), case.machines).pairs == []
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.03])
+def test_the_exponential_is_that_of_scipy(size):
+    E = size * np.random.default_rng(2).normal(size=(30, 30))
+    E = E + E.T
+    np.testing.assert_allclose(_exponential(E), la.expm(E), rtol=1e-12, atol=1e-13)
+
+
 def test_measured_poles_are_put_back():
     case = Case(covariance=False)
     for modes in machines_of(case, 5):
@@ -227,6 +269,33 @@ def test_an_observer_says_where_its_error_lies(plant):
     assert "on 95 % of such machines" in repr(observer)
 
 
+def test_densities_scatter_as_stated_or_are_said_to_be_as_given(case, plant):
+    """Without scatter of the structure the error is that of the densities alone: log-normal."""
+    observer = fx.design_kalman(plant)
+    assert observer.interval("die").sentence.endswith("such machines, densities as given")
+    sure = plant.uncertain(frequency=1e-9).plant.replace(evaluation=None)
+    own = sure.assembled.ports
+
+    def loud(ports, off):
+        return [port.replace(asd_deviation=off) for port in ports]
+
+    ports = own.replace(w=loud(own.w, 0.2), y=loud(own.y, 0.1))
+    unsure = sure.with_ports(ports).uncertain(frequency=1e-9)
+    machines = unsure.machines.drawn(200, rng=2)
+    spread = {
+        name: np.std(np.log([one.asd[name] / plant.asd[name] for one in machines]))
+        for name in plant.asd
+    }
+    assert spread["amp1"] == pytest.approx(0.2, rel=0.2)
+    assert spread["y1:noise"] == pytest.approx(0.1, rel=0.2)
+    found = fx.design_kalman(unsure.nominal)
+    assert found.interval("die").sentence.endswith("of such machines")
+    each = [found.rms("die", on=one) for one in unsure.machines.plants]
+    assert np.std(np.log(each)) > 0.05  # the noise that a filter meets is that of its machine
+    low, high, _ = found.interval("die")
+    assert low < np.median(each) < high
+
+
 def test_a_loop_says_where_its_figures_lie(plant):
     observer = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
@@ -248,6 +317,56 @@ def test_a_loop_says_where_its_figures_lie(plant):
     assert "modulus margin" in repr(loop).split("such machines")[1]
     with pytest.raises(ModelError, match="figure"):
         loop.interval("margins")
+
+
+def test_what_machines_do_beyond_a_model_is_the_covariance_of_the_difference(plant):
+    """Two models side by side under the same noise: a Lyapunov equation of both."""
+    one, other = plant.machines.plants[2], plant.machines.plants[5]
+    parts = []
+    for each in (one, other):
+        g, r = each.continuous.system, 2 * each.n_rigid
+        B = g.B[r:, [g.inputs.index(f"amp{i}") for i in (1, 2)]] * 1e-3 / np.sqrt(2)
+        rows = [g.outputs.index(name) for name in ("die:z", "die:ry", "y1", "y2")]
+        parts.append((g.A[r:, r:], B, g.C[rows, r:]))
+    (A, B, C), (F, G, H) = parts
+    X = la.solve_continuous_lyapunov(la.block_diag(A, F), -np.vstack([B, G]) @ np.vstack([B, G]).T)
+    wanted = np.hstack([C, -H]) @ X @ np.hstack([C, -H]).T
+    found = _difference(_driven_modes(one), _driven_modes(other))
+    size = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    assert np.abs((found - wanted) / size).max() < 1e-6
+
+
+def test_a_filter_that_weighs_modes_by_their_uncertainty_has_lower_upper_ends(plant):
+    plain = fx.design_kalman(plant)
+    weighed = fx.design_kalman(plant, machines=plant.machines)
+    ends = [[one.interval(name).high for name in ("die:z", "die:ry")] for one in (plain, weighed)]
+    assert np.log(ends[1]).mean() <= np.log(ends[0]).mean()
+    assert weighed.rms("die") >= 0.99 * plain.rms("die")  # the model alone is known best by plain
+
+
+def test_places_are_compared_machine_by_machine(plant):
+    """Is a place of a sensor better? The ratio of errors varies less than the errors do."""
+    own = plant.assembled.ports
+    near = plant.with_ports(own.replace(y=[own.y[0], own.y[1].replace(at=(0.2, 0.0, 0.0))]))
+    far, close = fx.design_kalman(plant), fx.design_kalman(near)
+    low, high, sentence = far.compared(close, "die")
+    pairs = zip(plant.machines.plants, near.machines.plants, strict=True)
+    ratios = [far.rms("die", on=a) / close.rms("die", on=b) for a, b in pairs]
+    assert low < np.median(ratios) < high
+    assert f"smaller on {np.count_nonzero(np.less(ratios, 1.0))} of 40" in sentence
+    width = np.std(np.log(ratios))
+    assert np.log(high / low) == pytest.approx(2 * 2.02 * width, rel=0.1)
+    alone = fx.design_kalman(plant.replace(evaluation=None))
+    assert "evaluation=" in alone.compared(close, "die").sentence
+
+
+def test_budgets_and_comparisons_have_intervals(plant):
+    observer = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    assert loop.interval("die:z").sentence in repr(loop.budget("die:z"))
+    text = repr(fx.compare_loops({"servo": loop}, reference="die:ref"))
+    assert "servo on 95 % of such machines:" in text and "modulus margin" in text
 
 
 def test_a_sentence_stands_where_something_is_missing():

@@ -181,3 +181,28 @@ def test_plants_are_as_uncertain_as_the_fit_says():
         plant.uncertain(fit.uncertainty(data))
     with pytest.raises(LabelError, match="elastic mode"):
         calibrated.uncertain(fx.plant.Fit(fit.uncertainty(data), modes=[2]))
+
+
+def test_measured_shapes_are_compared_mode_by_mode():
+    """A shape that is measured as another one is named, with its MAC by its definition."""
+    model = fx.chain(masses=[1.0, 1.2, 0.9, 1.1], stiffnesses=[4e5, 3e5, 5e5])
+    modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
+    rom = fx.reduce(modes, fx.DesiredDofs(modes.dofs.labels))
+    shapes = np.array(modes.phi[:, 1:], dtype=complex) * [2.0, -1j, 0.3]
+    poles = 1.001 * modes.omega[1:] * (-0.01 + 1j)
+    measured = fx.MeasuredModes(poles, shapes=shapes, dofs=modes.dofs.labels)
+    measured = fx.numbered(measured, rom)
+    np.testing.assert_array_equal(measured.xyz, modes.dofs.xyz)
+    unknown = [fx.MatrixParameter("k", dK=rom.K)]
+    fit = fx.update(rom, unknown, [fx.Eigenvalues(measured)])
+    assert min(fit.likeness().values()) > 1.0 - 1e-9
+    assert "another shape" not in repr(fit)
+    other = shapes.copy()
+    other[:, 1] = [1.0, 1.0, -1.0, 0.2]
+    found = fit.likeness(measured.replace(shapes=other))
+    own = modes.phi[:, 2]
+    mac = (other[:, 1].real @ own) ** 2 / (own @ own) / (other[:, 1].real @ other[:, 1].real)
+    assert found[3] == pytest.approx(mac, rel=1e-6)
+    wrong = fx.update(rom, unknown, [fx.Eigenvalues(measured.replace(shapes=other))])
+    assert f"mode 3 has another shape than measured (MAC {mac:.2f})" in repr(wrong)
+    assert fit.likeness(measured.replace(shapes=None, dofs=None)) == {}

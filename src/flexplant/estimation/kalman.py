@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..plant import AnyPlant
 from ..plant.partitioned import require_sampled
 from .error import error_variances
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, read_alike
+from .estimator_channels import checked_plant, poi_channels, read_alike
 from .filter_models import (
     AGREEMENT,
     LEFT_OUT,
@@ -36,13 +36,14 @@ from .filter_models import (
     weigh,
 )
 from .left_out_modes import LeftOut, left_out
+from .machine_noise import unsure_noise
 
 #: least fraction of R from the sensors: with less, covariances lose six digits and more
 _OWN = 1e-10
 
 
 @one_thread()
-def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
+def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
@@ -58,6 +59,10 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
         Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`, also read `through` a
         static block, for example to decoupled motions, whose noise is then correlated. A system
         with labels has no noise densities: the error says how to add them.
+    machines : PlantMachines, optional
+        ``plant.machines``: modes are weighed by their uncertainty. What the machines do beyond the
+        filter's model counts as noise, as much of it as lowers the upper ends of the intervals of
+        the errors most.
 
     Returns
     -------
@@ -69,7 +74,7 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     AssumptionError
         When the plant is continuous, a sensor has no noise, a disturbance that is not held over
         each sample reaches a sensor directly, w does not excite a rigid-body mode or y does not
-        see it.
+        see it; when the machines have no intervals.
     ModelError
         When the plant is weighted, its noise is not known, or the evaluation model has fewer modes.
     LabelError
@@ -97,6 +102,21 @@ def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
+    observer = _judged(plant, whole, found)
+    if machines is None or found is None:
+        return observer
+    others = [_judged(plant, whole, noise) for noise in unsure_noise(found, plant, machines)]
+    return min([observer, *others], key=_upper_ends)
+
+
+def _upper_ends(observer: KalmanEstimator) -> float:
+    """Return the mean logarithm of the upper ends of the intervals of a filter's errors."""
+    ends = [observer.interval(name).high for name in poi_channels(observer.plant)]
+    return float(np.mean([np.inf if end is None else np.log(end) for end in ends]))
+
+
+def _judged(plant: AnyPlant, whole: AnyPlant | None, found: LeftOut | None) -> KalmanEstimator:
+    """Return the filter of a plant and of modes left out, with its errors on the larger plant."""
     observer = _observer(plant, found)
     if whole is None:
         return observer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -428,21 +429,28 @@ class NoiseLevels(Value):
 
     @property
     def plant(self) -> AnyPlant:
-        """The plant with the estimated densities."""
+        """The plant with the estimated densities and their deviations, which machines draw."""
         given = self.given
         if PROCESS in self.channels:
             factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]
             origin = given.machine.origin.replace(noise_factor=factor)
             return given.replace(asd={**given.asd, **self.asd}, origin=origin)
-        return with_densities(given, self.asd)
+        return with_densities(given, self.asd, self.relative)
 
 
-def with_densities(plant: AnyPlant, asd: Mapping[str, float]) -> AnyPlant:
+def with_densities(
+    plant: AnyPlant, asd: Mapping[str, float], relative: Mapping[str, float] = MappingProxyType({})
+) -> AnyPlant:
     """Return an assembled plant with other densities of some of the noises that it has."""
 
     def changed(ports: Sequence[Any], ending: str = "") -> list[Any]:
-        given = [asd.get(f"{port.name}{ending}", port.asd) if port.asd else 0.0 for port in ports]
-        return [port.replace(asd=level) for port, level in zip(ports, given, strict=True)]
+        found = []
+        for port in ports:
+            name = f"{port.name}{ending}"
+            level = asd.get(name, port.asd) if port.asd else 0.0
+            known = {"asd_deviation": relative[name]} if name in relative else {}
+            found.append(port.replace(asd=level, **known))
+        return found
 
     own = plant.assembled.ports
     w, u, y = changed(own.w), changed(own.u, ":disturbance"), changed(own.y, ":noise")

@@ -37,6 +37,10 @@ class MeasuredModes(Value):
         Mode shapes at n measured DOFs; conjugated where the pole is.
     dofs : sequence of n str, optional
         Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
+    xyz : (n, 3) array [m], optional
+        Points of these DOFs, which `numbered` takes from sensors and points.
+    directions : sequence of n str, optional
+        Their directions there.
 
     Raises
     ------
@@ -56,6 +60,8 @@ class MeasuredModes(Value):
     covariance: FloatArray | None = field(default=None, kw_only=True)
     shapes: ComplexArray | None = field(default=None, kw_only=True)
     dofs: tuple[str, ...] | None = field(default=None, kw_only=True)
+    xyz: FloatArray | None = field(default=None, kw_only=True)
+    directions: tuple[str, ...] | None = field(default=None, kw_only=True)
 
     if TYPE_CHECKING:  # the input is any array-like object
 
@@ -67,6 +73,8 @@ class MeasuredModes(Value):
             covariance: npt.ArrayLike | None = None,
             shapes: npt.ArrayLike | None = None,
             dofs: Iterable[str] | None = None,
+            xyz: npt.ArrayLike | None = None,
+            directions: Iterable[str] | None = None,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -389,7 +397,35 @@ def numbered(
     _sort_families(pairs, measured.freq, modes.omega)
     kept = sorted(pairs)
     chosen = measured if len(kept) == len(measured) else measured.select(kept)
-    return chosen.replace(modes=tuple(pairs[i] for i in kept))
+    return chosen.replace(modes=tuple(pairs[i] for i in kept), **_points(measured, modes, at))
+
+
+def _points(measured: MeasuredModes, modes: Modes, at: Any) -> dict[str, Any]:
+    """Return points and directions of the rows of shapes, nothing where one is not at a point."""
+    if measured.shapes is None:
+        return {}
+    xyz, directions = [], []
+    for place in _places(measured, at):
+        point, direction = getattr(place, "at", place), getattr(place, "direction", "z")
+        if isinstance(point, str) and point in modes.dofs.labels:
+            row = modes.dofs.index(point)
+            point, direction = modes.dofs.xyz[row], modes.dofs.directions[row]
+        if isinstance(point, str | Mapping) or np.shape(point) != (3,):
+            return {}
+        xyz.append([float(x) for x in point])
+        directions.append(direction)
+    return {"xyz": np.array(xyz), "directions": tuple(directions)}
+
+
+def _places(measured: MeasuredModes, at: Any) -> list[Any]:
+    """Return the place of each row of the shapes: a sensor, a point or a label."""
+    given = {port.name: port for port in at.y} if hasattr(at, "y") else at
+    given = {} if given is None else given
+    if not isinstance(given, Mapping):
+        raise LabelError(
+            f"at is Ports, or a mapping from the labels of shapes to places, got {at!r:.60}."
+        )
+    return [given.get(label, label) for label in measured.dofs or ()]
 
 
 def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
@@ -412,13 +448,7 @@ def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
     if measured.shapes is None or measured.dofs is None:
         return np.ones((len(measured), elastic.size))
-    given = {port.name: port for port in at.y} if hasattr(at, "y") else at
-    given = {} if given is None else given
-    if not isinstance(given, Mapping):
-        raise LabelError(
-            f"at is Ports, or a mapping from the labels of shapes to places, got {at!r:.60}."
-        )
-    places = [given.get(label, label) for label in measured.dofs]
+    places = _places(measured, at)
     rows = [
         modes.at(place.at, place.direction) if hasattr(place, "direction") else modes.at(place)
         for place in places

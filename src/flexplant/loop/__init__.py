@@ -33,6 +33,7 @@ from .budget import Spectrum as Spectrum
 from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop
 from .measured_loop import in_axes as in_axes
+from .on_measurement import OnMeasurement as OnMeasurement
 from .other_machines import ModeTolerances as ModeTolerances
 from .other_machines import SpillOver as SpillOver
 from .report import LoopComparison as LoopComparison

@@ -61,6 +61,9 @@ class ErrorBudget(Value):
         loop is unstable with them.
     certificate : Certificate
         Relative differences of the variance computed in other ways.
+    interval : str
+        Where the rms lies on the machines that are known of the plant, or what is missing for that;
+        empty where none are known.
 
     Examples
     --------
@@ -81,6 +84,7 @@ class ErrorBudget(Value):
     cumulative: FloatArray
     left_out: float
     certificate: Certificate
+    interval: str = ""
 
     def __getitem__(self, source: str) -> float:
         """Return the rms that one source causes."""
@@ -121,6 +125,7 @@ class ErrorBudget(Value):
             lines.append(NOT_JUDGED)
         else:
             lines.append(f"with the modes left out of the model: {self.left_out / size:.5g}")
+        lines += [f"total: {self.interval}"] if self.interval else []
         return "\n".join(lines)
 
 

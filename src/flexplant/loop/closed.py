@@ -37,6 +37,7 @@ from .budget import (
     stationary_row,
 )
 from .machine_figures import MachineLoops, interval_line, loop_interval
+from .on_measurement import NOT_MEASURED, OnMeasurement, judged
 from .other_machines import (
     MARGIN,
     ModeTolerances,
@@ -104,6 +105,8 @@ class ClosedLoop(Value):
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         elif self.plant.unjudged:
             lines.append(f"  {self.plant.unjudged}")
+        measured = self.on_measurement
+        lines.append(f"  {NOT_MEASURED if measured is None else measured.summary}")
         if self.obstacle is None and self.plant.dt and (intervals := interval_line(self)):
             lines.append(f"  {intervals}")
         if self.tolerances is not None:
@@ -303,6 +306,11 @@ class ClosedLoop(Value):
         return self.broken.margin()
 
     @cached_property
+    def on_measurement(self) -> OnMeasurement | None:
+        """Stability and margin on the response of ``plant.measured(frf)``; None: not measured."""
+        return judged(self)
+
+    @cached_property
     def on_machines(self) -> MachineLoops:
         """The same controller around machines that agree with the measurement.
 
@@ -455,9 +463,11 @@ class ClosedLoop(Value):
         left_out, whole = float("nan"), self.completed
         if whole is not None:
             left_out = whole.rms(channel) if whole.is_stable else float("inf")
-        return error_budget(
+        found = error_budget(
             self.monitored, row, noises, residue=residue, start=start, left_out=left_out
         )
+        known = self.plant.machine.machines is not None
+        return found.replace(interval=self.interval(channel).sentence) if known else found
 
     @cached_property
     def _white(self) -> list[Source]:
@@ -559,6 +569,13 @@ def close_loop(
             "the loop is stable on its plant, but with the modes left out it is "
             f"{found.summary}. The machine has these modes: lower the bandwidth, keep them in "
             "the plant, or let the controller roll off (or notch) below them."
+        )
+    measured = loop.on_measurement
+    if loop.is_stable and measured is not None and measured.is_unstable:
+        warn(
+            "the loop is stable on its plant but unstable on the measured response of the machine: "
+            "the model's shapes, gains or delay are wrong there. Compare both: "
+            "plant.frequency_response(frf.freq) with the measured one."
         )
     if plant.uncertainty is not None and loop.tolerances is not None:
         loop.tolerances.warn_of_critical()

@@ -91,7 +91,8 @@ def loop_interval(loop: Any, figure: str, level: float) -> FigureInterval:
     if figure == BANDWIDTH and not axis_sensitivities(loop):
         return FigureInterval(None, None, "no interval: the loop has no reference")
     unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
-    found = interval(known, partial(loops.values, figure), level, unit)
+    given = "" if figure in FIGURES else known.densities
+    found = interval(known, partial(loops.values, figure), level, unit, given)
     if figure != RADIUS or found.low is None or found.high is None:
         return found
     low, high = 1.0 - found.high, 1.0 - found.low

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, positive
-from ..errors import ModelError, ShapeError, counted
-from ..lti.frequency import Frf
+from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
+from ..lti.frequency import Frf, frequency_response
 from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
@@ -98,6 +98,38 @@ def in_axes(
     return Frf(
         freq, data, first.inputs, last.outputs,
         quantity=frf.quantity, variance=variance, units=units,
+    )  # fmt: skip
+
+
+def measured_between(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:
+    """Return a measured plant and a controller, taken apart between u and y."""
+    for name in controller.inputs:
+        if name not in plant.outputs:
+            error = unknown_label("measured output", name, plant.outputs, "the Frf")
+            raise LabelError(
+                f"{error} Select what was measured: controller.select(inputs=[...]); references "
+                "do not belong to the loop."
+            )
+        wanted = quantities.get(name, plant.quantity)
+        if plant.quantity is not None and wanted != plant.quantity:
+            raise ModelError(
+                f"the Frf was measured as {plant.quantity}, the controller reads {name!r} as "
+                f"{wanted}: convert it, frf.converted({wanted!r})."
+            )
+    driven = [name for name in controller.outputs if name in plant.inputs]
+    if not driven:
+        raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
+    controller = controller.select(driven)
+    # at 0 Hz a free body and an integrator are infinite
+    lines, P = np.array(plant.freq), plant.select(controller.inputs, driven).data
+    lines, P = lines[lines > 0], P[:, :, lines > 0]
+    if not lines.size:
+        raise ModelError("the Frf has no line above 0 Hz, which a loop needs: measure more lines.")
+    return BrokenLoop(
+        tuple(driven), tuple(controller.inputs),
+        lambda freq: frequency_response(controller, freq).data,
+        lambda freq: on_lines(lines, P, freq),
+        controller.poles, controller.dt, lines, {**controller.units, **plant.channel_units},
     )  # fmt: skip
 
 

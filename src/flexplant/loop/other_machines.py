@@ -237,7 +237,7 @@ class ModeTolerances(Value):
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> fx.close_loop(plant, observer, servo).mode_tolerances()
-    <ModeTolerances of 2 modes: stays stable if any one modal frequency shifts by 5 %
+    <ModeTolerances of 2 modes: stays stable if one modal frequency (not its shape) shifts by 5 %
       mode      Hz  |S| at u of 2.86   unstable
       2     100.66         ->5 +>5 %  ->5 +>5 %
       3     174.35         ->5 +>5 %  ->5 +>5 %>
@@ -271,9 +271,8 @@ class ModeTolerances(Value):
             return "no elastic mode"
         worst = int(np.argmin(self.least))
         if not np.isfinite(self.least[worst]):
-            return (
-                f"stays stable if any one modal frequency shifts by {100 * self.limit.min():.2g} %"
-            )
+            off = f"{100 * self.limit.min():.2g} %"
+            return f"stays stable if one modal frequency (not its shape) shifts by {off}"
         to = f"a modulus margin of {self.margin:.3g}"
         side = int(np.argmin(np.abs(self.within[worst])))
         change = self.within[worst, side]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..tolerances import SPLIT
 from ..words import mapping
 from .broken import BrokenLoop, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
-from .machine_figures import crossing
+from .machine_figures import crossing, interval_line
 from .measured_loop import broken_count
 from .sensitivity_functions import Loop, taken_apart
 
@@ -378,12 +378,15 @@ class LoopComparison(Value):
         Whether `decay` of the rows is a spectral radius.
     unjudged : sequence of str
         Loops whose plants have no evaluation model.
+    intervals : mapping {name: str}
+        Of loops whose machines are known: where margin and bandwidth lie, or what is missing.
     """
 
     rows: Mapping[str, LoopFigures]
     channel: str
     sampled: bool = True
     unjudged: tuple[str, ...] = ()
+    intervals: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> LoopFigures:
         require_known("loop", [name], self.rows)
@@ -400,6 +403,7 @@ class LoopComparison(Value):
         if self.unjudged:
             every = len(self.unjudged) == len(self.rows)
             lines.append(NOT_JUDGED + ("" if every else f": {', '.join(self.unjudged)}"))
+        lines += [f"{name} {line}" for name, line in self.intervals.items()]
         return "\n".join(lines)
 
 
@@ -444,6 +448,8 @@ def compare_loops(
     hint = "Pass {'servo': close_loop(plant, observer, servo)}."
     mapping(loops, "loops", hint, least=1, kind=ClosedLoop)
     alone = tuple(name for name, loop in loops.items() if loop.plant.unjudged)
+    stable = {name: loop for name, loop in loops.items() if loop.plant.dt and loop.is_stable}
+    intervals = {name: line for name, loop in stable.items() if (line := interval_line(loop))}
     loops = {name: loop.completed or loop for name, loop in loops.items()}
     pair = reference_pair(next(iter(loops.values())), reference, error)
     for name, loop in loops.items():
@@ -472,7 +478,8 @@ def compare_loops(
         name: _figures(loop, curves[name], reached[name], low_freq, pair)
         for name, loop in loops.items()
     }
-    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled, alone)
+    channel = f"{pair[0]} to {pair[1]}" if pair else ""
+    return LoopComparison(rows, channel, sampled, alone, intervals)
 
 
 def _figures(

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from ..arrays import ComplexArray, FloatArray
 from ..errors import (
     AssumptionError,
-    LabelError,
     ModelError,
     ShapeError,
     counted,
@@ -21,9 +20,8 @@ from ..errors import (
     unknown_label,
     warn,
 )
-from ..lti.frequency import Frf, frequency_response, sampled_freq
+from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import loop_poles
-from ..lti.measured_lines import on_lines
 from ..lti.response_solvers import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import AnyPlant, SensorPort
@@ -31,7 +29,7 @@ from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, movable_outputs
 from .closed import ClosedLoop
 from .machine_figures import first_crossing
-from .measured_loop import broken_count
+from .measured_loop import broken_count, measured_between
 
 #: types of loops: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a
 #: controller; a loop gain
@@ -187,7 +185,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     if hasattr(plant, "frdata"):  # python-control's
         plant = Frf.from_control(plant)
     if isinstance(plant, Frf):
-        return _measured_loop(plant, controller, _quantities(loop[1]))
+        return measured_between(plant, controller, _quantities(loop[1]))
     if isinstance(plant, AnyPlant):
         require_known("y for the controller", controller.inputs, plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
@@ -259,39 +257,6 @@ def _quantities(law: Any) -> dict[str, str]:
     plant = getattr(law, "plant", None)
     ports = plant.ports.y if isinstance(plant, AnyPlant) else ()
     return {port.name: port.quantity for port in ports if isinstance(port, SensorPort)}
-
-
-def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:
-    for name in controller.inputs:
-        if name not in plant.outputs:
-            error = unknown_label("measured output", name, plant.outputs, "the Frf")
-            raise LabelError(
-                f"{error} Select what was measured: controller.select(inputs=[...]); references "
-                "do not belong to the loop."
-            )
-        wanted = quantities.get(name, plant.quantity)
-        if plant.quantity is not None and wanted != plant.quantity:
-            raise ModelError(
-                f"the Frf was measured as {plant.quantity}, the controller reads {name!r} as "
-                f"{wanted}: convert it, frf.converted({wanted!r})."
-            )
-    driven = [name for name in controller.outputs if name in plant.inputs]
-    if not driven:
-        raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
-    controller = controller.select(driven)
-    # at 0 Hz a free body and an integrator are infinite
-    lines, P = np.array(plant.freq), plant.select(controller.inputs, driven).data
-    lines, P = lines[lines > 0], P[:, :, lines > 0]
-    if not lines.size:
-        raise ModelError(
-            "the Frf has no line above 0 Hz, but a loop needs one: measure more lines."
-        )
-    return BrokenLoop(
-        tuple(driven), tuple(controller.inputs),
-        lambda freq: frequency_response(controller, freq).data,
-        lambda freq: on_lines(lines, P, freq),
-        controller.poles, controller.dt, lines, {**controller.units, **plant.channel_units},
-    )  # fmt: skip
 
 
 def _loop_and_grid(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:

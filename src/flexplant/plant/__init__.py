@@ -100,6 +100,7 @@ from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled
 from .origins import Foreign as Foreign
+from .partitioned import MeasuredResponse as MeasuredResponse
 from .port import ForcePort as ForcePort
 from .port import MeasuredRow as MeasuredRow
 from .port import SensorPort as SensorPort

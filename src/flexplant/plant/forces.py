@@ -48,6 +48,8 @@ class Disturbance(_PlacedForce):
         direction.
     asd : float [N/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for a force that is not noise.
+    asd_deviation : float
+        Relative deviation of the density, by which machines that are drawn differ.
     shape : StateSpace, optional
         A stable filter that the channel goes through on its way to the structure: the asd is then
         that of the white noise at its input, and its states join the plant's.
@@ -72,6 +74,7 @@ class Disturbance(_PlacedForce):
     shape: StateSpace | None = None
     held: bool = False
     moves: Any = None
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,8 @@ class BaseAcceleration(ForcePort):
         Direction of the acceleration: x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
     asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
+    asd_deviation : float
+        Relative deviation of the density, by which machines that are drawn differ.
     shape : StateSpace, optional
         A stable filter between the channel and the base: the floor's spectrum.
     about : (3,) array [m]
@@ -116,6 +121,7 @@ class BaseAcceleration(ForcePort):
     asd: float = 0.0
     shape: StateSpace | None = None
     about: tuple[float, ...] | FloatArray = (0.0, 0.0, 0.0)
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,6 +157,8 @@ class OutputDisturbance(ForcePort):
         Names of the channel and of the sensor.
     asd : float [unit of the sensor/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
+    asd_deviation : float
+        Relative deviation of the density, by which machines that are drawn differ.
     shape : StateSpace, optional
         A stable filter between the channel and the sensor: drift, mains hum.
 
@@ -165,6 +173,7 @@ class OutputDisturbance(ForcePort):
     sensor: str
     asd: float = 0.0
     shape: StateSpace | None = None
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     @property
     def added_to(self) -> str:
@@ -193,6 +202,8 @@ class Actuator(_PlacedForce):
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
         `name:disturbance` of w. It passes the same `dynamics` as the command, not its latency.
+    asd_deviation : float
+        Relative deviation of the density, by which machines that are drawn differ.
 
     Raises
     ------
@@ -217,6 +228,7 @@ class Actuator(_PlacedForce):
     latency: float = 0.0
     asd: float = 0.0
     moves: Any = None
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     @property
     def filter(self) -> StateSpace | None:
@@ -375,7 +387,7 @@ class RigidForce(ForcePort):
 
     Parameters
     ----------
-    name, asd, shape : as for `Disturbance`
+    name, asd, shape, asd_deviation : as for `Disturbance`
     direction : str
         Direction of the force: x, y, z [N] or rx, ry, rz [N m].
 
@@ -390,6 +402,7 @@ class RigidForce(ForcePort):
     direction: str = "z"
     asd: float = 0.0
     shape: StateSpace | None = None
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     @property
     def unit(self) -> str | None:

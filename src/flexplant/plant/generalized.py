@@ -23,7 +23,7 @@ from .partitioned import PartitionedSystem
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 #: fields of the machine, which `replace` changes there
-_OF_MACHINE = ("origin", "uncertainty", "evaluation")
+_OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

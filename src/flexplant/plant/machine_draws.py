@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned
 from ..sparse.symmetric import dense
+from ..tolerances import TINY
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.residuals.modal_residuals import ZETA
@@ -24,6 +26,13 @@ from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, cha
 _PLACES = 300
 #: after this number of refused draws in a row an error says that no such machine was found
 _REFUSED = 50
+#: gap of a pair, in deviations of a frequency, below which measured shapes say how its modes mix:
+#: the mixing of others, sqrt(2) over the gap, is below a tenth
+_MIXED = 14.0
+#: angles at which a pair is compared with its measured shapes, a quarter of a degree apart
+_ANGLES = 721
+#: terms of the series of exp(E / 2): relative rounding for norms of E up to 0.3
+_TERMS = 9
 #: a drawn mode swings
 _MOST_DAMPING = 0.9
 
@@ -51,12 +60,48 @@ class MachineFamily:
         located = zip(machines.located(), machines.fit.values.tolist(), strict=True)
         self.changes = [self._change(q, value) for q, value in located]
         self.measured = self._measured_places()
+        self.pairs = self._close_pairs()
 
     def _measured_places(self) -> IntArray:
         """Return the places of the measured modes among the evaluation model's, by frequency."""
         first = self.whole.n_rigid
         gap = np.log(np.abs(self.machines.measured.poles)[:, None] / self.omega[first:])
         return np.asarray(first + assigned(np.abs(gap)))
+
+    def _close_pairs(self) -> list[tuple[int, int]]:
+        """Return places, among the measured modes, of neighbours whose shapes scatter mixes."""
+        if self.machines.measured.xyz is None:
+            return []
+        freq = np.abs(self.machines.measured.poles)
+        order = np.argsort(freq)
+        near = np.diff(np.log(freq[order])) < _MIXED * self.machines.trend.deviation
+        return [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(near)]
+
+    @cached_property
+    def _seen(self) -> FloatArray:
+        """Rows (n, b) of the evaluation model's modes where shapes were measured."""
+        known = self.machines.measured
+        points = zip(known.xyz, known.directions or (), strict=True)  # type: ignore[arg-type]
+        rows = [self.whole.row(tuple(at.tolist()), direction) for at, direction in points]
+        return np.asarray(np.array(rows) @ self.over)
+
+    def _turned(self, V: FloatArray, own: IntArray) -> FloatArray:
+        """Return shapes whose close pairs are turned in their plane to the measured shapes."""
+        # two modes of almost one frequency mix by the ratio of scatter to gap: what was measured
+        # of their shapes says by how much. Turned in their plane they keep their mass
+        shapes: Any = self.machines.measured.shapes
+        angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _ANGLES)
+        for pair in self.pairs:
+            at = own[list(pair)]
+            seen = self._seen @ V[:, at]
+            turns = np.array([[np.cos(angles), -np.sin(angles)], [np.sin(angles), np.cos(angles)]])
+            turned = np.einsum("np,pqa->nqa", seen, turns)
+            likeness = np.abs(np.einsum("nq,nqa->qa", shapes[:, list(pair)].conj(), turned)) ** 2
+            size = np.maximum(np.sum(turned**2, axis=0), TINY)
+            mac = likeness / size / np.sum(np.abs(shapes[:, list(pair)]) ** 2, axis=0)[:, None]
+            best = int(np.argmax(mac.sum(axis=0)))
+            V[:, at] = V[:, at] @ turns[:, :, best]
+        return V
 
     def _change(self, parameter: Parameter, value: float) -> _Change:
         b = self.omega.size
@@ -136,6 +181,7 @@ class MachineFamily:
         else:
             zeta[r:] = self.zeta[parent[r:]]
         own = r + assigned(-(V[self.measured, r:] ** 2))
+        V = self._turned(V, own)
         omega[own] = np.abs(draw.poles)
         zeta[own] = -draw.poles.real / np.abs(draw.poles)
         return self.space.realisation(omega, zeta, V, np.zeros((0, 2, 2)))
@@ -146,11 +192,13 @@ class MachineFamily:
         g = self.omega / (2.0 * np.pi * self.machines.trend.highest)
         trend = 0.5 * np.sign(draw.slope) * np.log1p(2.0 * abs(draw.slope) * g)
         E = draw.deviation * _symmetric(rng, b)
-        mass = np.eye(b)
-        mass[:r, :r] = la.expm(E[:r, :r])
-        E[:r], E[:, :r] = 0.0, 0.0
+        # nothing holds rigid-body motions: their rows are mass, which nobody weighed
+        unweighed = np.zeros((b, b))
+        unweighed[:r], unweighed[:, :r] = E[:r], E[:, :r]
+        mass = _exponential(unweighed)
+        E -= unweighed
         E += np.diag(2.0 * (1.0 - draw.as_mass) * trend)
-        K = self.omega[:, None] * la.expm(E) * self.omega
+        K = self.omega[:, None] * _exponential(E) * self.omega
         for change, amount in zip(self.changes, draw.parameters.tolist(), strict=True):
             mass += amount * change.mass
             K += amount * change.stiffness
@@ -163,6 +211,14 @@ def _symmetric(rng: np.random.Generator, b: int) -> FloatArray:
     """Return N + N' (b, b) of standard normal N: deviations 2 on the diagonal, sqrt(2) off it."""
     N = rng.standard_normal((b, b))
     return np.asarray(N + N.T)
+
+
+def _exponential(E: FloatArray) -> FloatArray:
+    """Return exp(E) of a small symmetric matrix: the square of a series, five times as fast."""
+    found = unit = np.eye(len(E))
+    for k in range(_TERMS, 0, -1):
+        found = unit + (0.5 / k) * (E @ found)
+    return np.asarray(found @ found.T)
 
 
 class StatedFamily:
@@ -197,7 +253,7 @@ class StatedFamily:
         root = np.sqrt(0.5 * self.scatter[FrequencyDelta][space.own])
         E = root[:, None] * _symmetric(rng, root.size) * root
         np.fill_diagonal(E, stiffer[space.own])
-        K = space.omega[:, None] * la.expm(E) * space.omega
+        K = space.omega[:, None] * _exponential(E) * space.omega
         mixed = space.mixed(np.eye(root.size), 0.5 * (K + K.T))
         if mixed is None:
             raise ModelError("what is stated of the frequencies leaves no stiffness.")

@@ -136,7 +136,7 @@ class PlantMachines:
             return self._base
         of_modes = [one for one in drawn if isinstance(one[0], ModeDelta)]
         others = [one for one in drawn if not isinstance(one[0], ModeDelta | ParameterDelta)]
-        machine = MachineParts.of(self._base)
+        machine = MachineParts.of(self._base).replace(loudness=self._loudness(apart))
         for delta, x in sorted(others, key=lambda one: one[0].stage):
             machine = delta.changed(machine, delta.amount(x))
         if self.fit is not None:
@@ -155,6 +155,24 @@ class PlantMachines:
             return own
         found = own.evaluation_plant if uncertain is None else uncertain.larger
         return found if found is not None and found.has_own_modes else own
+
+    @property
+    def _unsure(self) -> dict[str, float]:
+        """Deviations of the densities of ports, where these are stated."""
+        ports = self.plant.ports
+        every = (*ports.w, *ports.u, *ports.y)
+        return {port.name: port.asd_deviation for port in every if port.asd_deviation > 0.0}
+
+    @property
+    def densities(self) -> str:
+        """What an interval of noise says where no density has a deviation; else empty."""
+        return "" if self._unsure else ", densities as given"
+
+    def _loudness(self, rng: np.random.Generator) -> dict[str, float]:
+        """Return drawn densities beside those given, log-normal."""
+        return {
+            name: float(np.exp(off * rng.standard_normal())) for name, off in self._unsure.items()
+        }
 
     def _of_fit(self, rng: np.random.Generator) -> DrawnModes:
         """Return the modes of one machine of the fit, shared by plants of one evaluation model."""
@@ -185,9 +203,16 @@ def interval_of(values: FloatArray, level: float = LEVEL) -> tuple[float, float]
 
 
 def interval(
-    machines: PlantMachines | None, figures: Callable[[], FloatArray], level: float, unit: str
+    machines: PlantMachines | None,
+    figures: Callable[[], FloatArray],
+    level: float,
+    unit: str,
+    given: str = "",
 ) -> FigureInterval:
-    """Return the interval of a figure over machines, or what is missing for one."""
+    """Return the interval of a figure over machines, or what is missing for one.
+
+    `given` is what the interval takes as it was given, in words.
+    """
     if machines is None:
         return FigureInterval(
             None,
@@ -202,7 +227,9 @@ def interval(
     except AssumptionError as error:  # a machine on which the figure has no value
         return FigureInterval(None, None, f"no interval: {error}")
     return FigureInterval(
-        low, high, f"{interval_text(low, high, unit)} on {100 * level:.3g} % of such machines"
+        low,
+        high,
+        f"{interval_text(low, high, unit)} on {100 * level:.3g} % of such machines{given}",
     )
 
 

@@ -21,6 +21,7 @@ from ..errors import (
     some_names,
     unknown_label,
 )
+from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..store import Value
 from ..structure import FEModel
@@ -330,6 +331,30 @@ def is_plant(given: object) -> TypeGuard[PartitionedSystem | System]:
     return isinstance(given, PartitionedSystem) or is_system(given)
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredResponse(Value):
+    """The measured response of a machine; see `StandardPlant.measured`.
+
+    Parameters
+    ----------
+    frf : Frf
+        From actuators to sensors.
+    hold : bool
+        False where it was measured from sample to sample.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> frf = fx.frequency_response(plant.continuous.Gyu, [10.0, 20.0])
+    >>> plant.measured(frf.select(outputs=["y1"])).measurement.hold
+    True
+    """
+
+    frf: Frf
+    hold: bool = True
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Partition(PartitionedSystem):
     """The data of a standard plant, in the fields of `StandardPlant`, and derived quantities."""
@@ -337,6 +362,7 @@ class Partition(PartitionedSystem):
     origin: Origin = ELSEWHERE
     uncertainty: Any = None
     evaluation: EvaluationModel | None = None
+    measurement: MeasuredResponse | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

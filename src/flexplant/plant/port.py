@@ -84,6 +84,7 @@ class ForcePort(Value):
     name: str
     direction: str
     asd: float = 0.0
+    asd_deviation: float = 0.0
 
     def __post_init__(self) -> None:
         self._set(**checked_port(self))
@@ -153,6 +154,7 @@ class SensorPort(Value):
     name: str
     at: Place
     asd: float = 0.0
+    asd_deviation: float = 0.0
     dynamics: StateSpace | None = None
     latency: float = 0.0
     quantity: Quantity = "displacement"
@@ -248,6 +250,7 @@ def checked_port(port: Any) -> dict[str, Any]:
         "direction": port_direction,
         "at": checked_place,
         "asd": lambda name, asd: positive(asd, f"asd of {name!r}", zero=True),
+        "asd_deviation": lambda name, off: positive(off, f"asd_deviation of {name!r}", zero=True),
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
         "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
         "latency": lambda name, late: positive(late, f"latency of {name!r}", zero=True),

@@ -39,6 +39,8 @@ class Sensor(SensorPort):
         One-sided amplitude spectral density of its white noise; a sample has variance asd^2 rate /
         2. It is added to the samples, after dynamics and latency; use an OutputDisturbance for
         noise that passes through them.
+    asd_deviation : float
+        Relative deviation of the density, by which machines that are drawn differ.
     dynamics : StateSpace, optional
         Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
     latency : float [s]
@@ -74,6 +76,7 @@ class Sensor(SensorPort):
     latency: float = 0.0
     absolute: bool | None = None
     moves: Any = None
+    asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     def row(self, realisation: ModalRealisation) -> FloatArray:
         """Return the row (n,) over the model's DOFs of its displacement."""

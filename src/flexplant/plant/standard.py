@@ -9,16 +9,18 @@ from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from ..errors import LabelError
+from ..errors import LabelError, require_known
 from ..labels import Place
+from ..lti.frequency import Frf
 from ..lti.statespace import System, as_statespace
+from ..words import flag, instance
 from .assumptions import AssumptionReport
 from .building import continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
 from .machine_plants import PlantMachines, fitted_machines
 from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
-from .partitioned import Partition
+from .partitioned import MeasuredResponse, Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .remade import check_channels, matched, own_plant, rebuilt, selected
@@ -57,6 +59,8 @@ class StandardPlant(Partition):
         Larger model of the same machine, on which results are checked; see `assemble_plant`.
         ``plant.replace(evaluation=model)`` changes it, ``plant.replace(evaluation=None)`` removes
         it.
+    measurement : MeasuredResponse, optional
+        The measured response on which loops are judged: of ``plant.measured(frf)``.
 
     Raises
     ------
@@ -239,7 +243,30 @@ class StandardPlant(Partition):
 
     def _known(self, found: StandardPlant) -> StandardPlant:
         """Return a plant of the same modes with the uncertainty of this one."""
+        if self.measurement is not None:
+            found = found.replace(measurement=self.measurement)
         return found if self.uncertainty is None else self.uncertainty.on(found).nominal
+
+    def measured(self, frf: Frf, *, hold: bool = True) -> StandardPlant:
+        """Return the plant with the measured response of its machine, on which loops are judged.
+
+        Parameters
+        ----------
+        frf : Frf
+            From actuators to sensors of this plant, by their names; some of them suffice.
+        hold : bool
+            False for a response that was measured from sample to sample: it has the zero-order
+            hold in it.
+
+        Raises
+        ------
+        LabelError
+            When a channel of the response is not an actuator or sensor of the plant.
+        """
+        instance(frf, Frf, "frf", "Pass the measured one, estimate_frf(...) say.")
+        require_known("actuator", frf.inputs, self.u)
+        require_known("sensor", frf.outputs, self.y)
+        return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold")))
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position changes: decoupling, modes seen and reached, the user's figures.

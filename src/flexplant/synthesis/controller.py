@@ -22,6 +22,7 @@ from ..certificates import (
 )
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
+from ..loop.on_measurement import NOT_MEASURED
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
@@ -273,10 +274,9 @@ def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) ->
     verified = answer.certificate
     for found in (left_out, tolerances):
         verified |= {} if found is None else found.certificate
-    alone = (plant.unjudged,) if left_out is None and plant.unjudged else ()
+    said = [plant.unjudged] if left_out is None and plant.unjudged else []
+    measured = None if loop is None else loop.on_measurement
+    said.append(NOT_MEASURED if measured is None else measured.summary)
     return answer.replace(
-        certificate=verified,
-        left_out=left_out,
-        tolerances=tolerances,
-        notes=(*answer.notes, *alone),
+        certificate=verified, left_out=left_out, tolerances=tolerances, notes=(*answer.notes, *said)
     )

@@ -13,6 +13,7 @@ from ..arrays import ComplexArray, FloatArray, between, positive, whole
 from ..errors import ModelError, attempted, counted, require_known, short
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
+from ..modes.matching import in_span
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..store import Value
 from ..words import with_deviation
@@ -27,6 +28,10 @@ from .trend import Trend, trend_of
 
 #: probability of the interval of two printed deviations
 SHARE = 0.95
+#: MAC below which two shapes are usually said to be of different modes
+_ALIKE = 0.9
+#: relative distance of frequencies of modes that mix in any machine
+_FAMILY = 0.02
 #: largest number of DOFs of a full model whose modes are solved for printing
 _DENSE = 1500
 
@@ -287,9 +292,44 @@ class UpdateResult(Value):
         found = None
         with attempted("the trend of the residual", ModelError):
             found = self.trend()
-        if found is None or found.dof < 1 or not found.missing:
-            return []
-        return [f"  {found.missing}"]
+        lines = [] if found is None or found.dof < 1 or not found.missing else [found.missing]
+        unlike = {mode: mac for mode, mac in self.likeness().items() if mac < _ALIKE}
+        lines += [
+            f"mode {mode} has another shape than measured (MAC {mac:.2f}): what is promised of it "
+            "does not hold"
+            for mode, mac in list(unlike.items())[:3]
+        ]
+        return [f"  {line}" for line in lines]
+
+    def likeness(self, measured: MeasuredModes | None = None) -> dict[int, float]:
+        """Return the MAC of each measured shape with that of the updated model.
+
+        Modes within 2 % of a frequency mix in any machine: of these it is the part of the measured
+        shape in the span of theirs.
+
+        Parameters
+        ----------
+        measured : MeasuredModes, optional
+            Measured modes with shapes, of ``numbered(..., at=...)``; the poles that were fitted
+            when not given.
+
+        Returns
+        -------
+        dict {mode: float}
+            Empty where no shapes were measured at points.
+        """
+        given = self.fitted_poles if measured is None else measured
+        if given is None or given.shapes is None or given.xyz is None:
+            return {}
+        modes, numbers = self.modes(), given.modes or ()
+        own = np.isin(np.arange(modes.n_modes) + 1, numbers)
+        points = zip(given.xyz.tolist(), given.directions or (), strict=True)
+        rows = np.array([modes.at(tuple(at), direction) for at, direction in points])
+        found = {}
+        for k, mode in enumerate(numbers):
+            near = np.abs(modes.omega / modes.omega[mode - 1] - 1.0) <= _FAMILY
+            found[mode] = float(in_span(rows[:, near & own], given.shapes[:, [k]])[0])
+        return found
 
     def interval(self, level: float = 0.95) -> FloatArray:
         """Return confidence (credible) intervals (q, 2) of the parameters for a level in 0 .. 1.

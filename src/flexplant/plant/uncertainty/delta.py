@@ -38,6 +38,8 @@ class MachineParts(Value):
         Changes of the gains of actuators and sensors, relative.
     late : float [samples]
         Change of the delay.
+    loudness : mapping {str: float}
+        Of the noises of ports, relative densities.
 
     Examples
     --------
@@ -54,6 +56,7 @@ class MachineParts(Value):
     model: Any = None
     gains: Mapping[str, float] = field(default_factory=dict)
     late: float = 0.0
+    loudness: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, plant: Partition) -> MachineParts:
@@ -71,17 +74,20 @@ class MachineParts(Value):
         elif not np.array_equal(self.pairs, realisation.pairs):
             realisation = realisation.replace(pairs=self.pairs)
         ports = None
-        if self.gains:
+        if self.gains or self.loudness:
             own = plant.assembled.ports
-            sides = {
-                side: [_times(port, self.gains.get(port.name, 1.0)) for port in getattr(own, side)]
-                for side in "uy"
-            }
+            sides = {side: [self._port(port) for port in getattr(own, side)] for side in "wuy"}
             ports = own.replace(**sides)
         if not self.late:
             return rebuilt(plant, ports=ports, realisation=realisation)
         fresh = rebuilt(plant.continuous, ports=ports, realisation=realisation)
         return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
+
+    def _port(self, port: Any) -> Any:
+        """Return a port of the machine."""
+        louder = self.loudness.get(port.name, 1.0)
+        found = port if louder == 1.0 else port.replace(asd=louder * port.asd)
+        return _times(found, self.gains.get(port.name, 1.0))
 
 
 def _times(port: Any, gain: float) -> Any:

@@ -1,0 +1,78 @@
+"""A designed loop on the measured response of the machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..store import Value
+from .measured_loop import broken_count, in_axes, measured_between
+
+#: what a loop says of which no measured response of the machine is known
+NOT_MEASURED = "not judged on a measurement"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OnMeasurement(Value):
+    """What a measured response of the machine says of a loop: no model is in it.
+
+    Parameters
+    ----------
+    margin : float
+        Modulus margin, broken at u; 0 where the loop is unstable, NaN where the lines do not show
+        whether it is stable.
+    freq : float [Hz]
+        Where |S| at u is largest.
+    reason : str
+        Why the stability is not known; else empty.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.loop.OnMeasurement(0.536, 176.2)
+    <OnMeasurement: on the measured response: stable, modulus margin 0.536 at 176.2 Hz>
+    """
+
+    margin: float
+    freq: float
+    reason: str = ""
+
+    @property
+    def is_unstable(self) -> bool:
+        """Whether the lines show an unstable loop."""
+        return self.margin == 0.0
+
+    @property
+    def summary(self) -> str:
+        """The finding in words."""
+        if self.reason:
+            return f"on the measured response: stability not known, {self.reason}"
+        if self.is_unstable:
+            return "on the measured response: unstable"
+        return (
+            f"on the measured response: stable, modulus margin {self.margin:.3g} at "
+            f"{self.freq:.4g} Hz"
+        )
+
+    def __repr__(self) -> str:
+        return f"<OnMeasurement: {self.summary}>"
+
+
+def judged(loop: Any) -> OnMeasurement | None:
+    """Return a loop on the measured response of its machine; None where that was not measured."""
+    plant = loop.plant
+    known = plant.machine.measurement
+    if known is None or not set(loop.fed_back) <= set(known.frf.outputs):
+        return None
+    if not set(loop.driven) <= set(known.frf.inputs):
+        return None
+    frf = known.frf.select(outputs=loop.fed_back, inputs=loop.driven)
+    if plant.dt:
+        frf = in_axes(frf, rate=1.0 / plant.dt, delay=plant.delay, hold=known.hold)
+    law = loop.controller.select(loop.driven, loop.fed_back)
+    parts = measured_between(frf, law, {})
+    count = broken_count(parts, None, 0)
+    peak, freq = parts.worst("u", bool(parts.mixed("u")))
+    if count.unstable is None:
+        return OnMeasurement(float("nan"), freq, count.reason)
+    return OnMeasurement(0.0 if count.unstable else 1.0 / peak, freq)
