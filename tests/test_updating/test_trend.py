@@ -136,3 +136,20 @@ def test_plates_are_told_to_lack_shear(make, lacks):
         assert trend.slope < -0.02
     else:
         assert abs(trend.slope) < 4e-3
+
+
+def test_a_mode_that_was_not_measured_beside_one_that_was_is_named():
+    """Two modes so near that scatter mixes them; of one that is far nothing is said."""
+    rng = np.random.default_rng(3)
+    model = np.array([100.0, 180.0, 260.0, 330.0, 470.0, 560.0])
+    freq = model * np.exp(2e-3 * rng.normal(size=6))
+    S = np.ones((6, 1))
+
+    def trend(other):
+        given = ((9,), np.array([other]))
+        return fx.updating.Trend((4, 5, 6, 7, 8, 10), freq, model, S, (0,), True, *given)
+
+    near = 260.0 * (1.0 + 5.0 * trend(400.0).deviation)
+    assert trend(400.0).half_measured_pairs == ()
+    assert trend(near).half_measured_pairs == ((6, 9),)
+    assert "mode 9 was not measured" in trend(near).missing

@@ -17,6 +17,7 @@ from ..tolerances import TINY
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.residuals.modal_residuals import ZETA
+from ..updating.trend import MIXED
 from .drawn_modes import DrawnModes, ModeSpace
 from .realisation import MODAL, ModalRealisation
 from .uncertainty.delta import Delta
@@ -26,9 +27,6 @@ from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, cha
 _PLACES = 300
 #: after this number of refused draws in a row an error says that no such machine was found
 _REFUSED = 50
-#: gap of a pair, in deviations of a frequency, below which measured shapes say how its modes mix:
-#: the mixing of others, sqrt(2) over the gap, is below a tenth
-_MIXED = 14.0
 #: angles at which a pair is compared with its measured shapes, a quarter of a degree apart
 _ANGLES = 721
 #: terms of the series of exp(E / 2): relative rounding for norms of E up to 0.3
@@ -74,7 +72,7 @@ class MachineFamily:
             return []
         freq = np.abs(self.machines.measured.poles)
         order = np.argsort(freq)
-        near = np.diff(np.log(freq[order])) < _MIXED * self.machines.trend.deviation
+        near = np.diff(np.log(freq[order])) < MIXED * self.machines.trend.deviation
         return [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(near)]
 
     @cached_property

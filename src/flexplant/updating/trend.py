@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +19,9 @@ from .sensitivities import eigenvalue_sensitivities
 
 #: probability of a false alarm for a correct model
 LEVEL = 0.003
+#: gap of two modes, in deviations of a frequency, below which scatter mixes their shapes by more
+#: than a tenth: sqrt(2) over the gap
+MIXED = 14.0
 #: probability of an interval of a frequency in the comparison of pairs
 _HELD = 0.95
 
@@ -47,6 +51,10 @@ class Trend(Value):
         Positions, among all parameters of the fit, of the q that change frequencies.
     shaped : bool
         Whether the modes were numbered by measured shapes.
+    unmeasured : sequence of int
+        Numbers of the model's modes below `highest` that were not measured.
+    unmeasured_freq : array [Hz]
+        Their frequencies.
 
     Examples
     --------
@@ -64,6 +72,8 @@ class Trend(Value):
     S: FloatArray
     moves: tuple[int, ...]
     shaped: bool = False
+    unmeasured: tuple[int, ...] = ()
+    unmeasured_freq: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def highest(self) -> float:
@@ -130,6 +140,19 @@ class Trend(Value):
         numbers = [self.modes[i] for i in order]
         return tuple((numbers[i], numbers[i + 1]) for i in np.flatnonzero(gaps < wide).tolist())
 
+    @property
+    def half_measured_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Pairs that scatter mixes, a measured mode and one that was not measured."""
+        if self.dof < 1:
+            return ()
+        near = MIXED * self.deviation
+        return tuple(
+            (mode, other)
+            for other, freq in zip(self.unmeasured, self.unmeasured_freq.tolist(), strict=True)
+            for mode, own in zip(self.modes, self.model_freq.tolist(), strict=True)
+            if abs(np.log(freq / own)) < near
+        )
+
     @cached_property
     def outlier(self) -> tuple[int, float] | None:
         """The mode that is an outlier, and its error relative to the others; or None.
@@ -171,6 +194,12 @@ class Trend(Value):
             return (
                 f"the model neglects an effect that grows with frequency ({self.text}): shear, "
                 "rotary inertia or smaller elements"
+            )
+        if self.half_measured_pairs:
+            mode, other = self.half_measured_pairs[0]
+            return (
+                f"mode {other} was not measured, and mode {mode} so near to it may be a mixture of "
+                "both: measure both, or number them with a smaller least_mac="
             )
         if self.unshaped_pairs:
             pairs = ", ".join(f"{a} and {b}" for a, b in self.unshaped_pairs)
@@ -229,7 +258,21 @@ def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
         relative[:, moves],
         tuple(moves.tolist()),
         measured.shapes is not None,
+        *_unmeasured(fit, numbers, float(np.max(np.abs(measured.poles))) / (2 * np.pi)),
     )
+
+
+def _unmeasured(
+    fit: Any, numbers: Sequence[int], highest: float
+) -> tuple[tuple[int, ...], FloatArray]:
+    """Return numbers and frequencies [Hz] of a reduced model's modes that were not measured."""
+    if not hasattr(fit.model, "T"):
+        return (), np.zeros(0)
+    freq = np.asarray(fit.model.modes().freq)
+    left = (freq > 0.0) & (freq < highest)
+    left[np.array(numbers) - 1] = False
+    found = np.flatnonzero(left)
+    return tuple((found + 1).tolist()), freq[found]
 
 
 def _amounts(fit: Any) -> FloatArray:
