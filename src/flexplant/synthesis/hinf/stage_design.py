@@ -27,6 +27,7 @@ from ...parallel import Progress
 from ...plant import AnyPlant, StandardPlant, reference_errors, stage_weights, standard_plant
 from ...plant.machine_plants import PlantMachines
 from ...plant.realisation import natural
+from ...plant.uncertainty.frequencies import Frequencies
 from ...plant.uncertainty.mode_delta import DampingDelta
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...updating.residuals.modal_residuals import USUAL
@@ -76,9 +77,9 @@ def design_stage(
     that satisfies three conditions. The modulus margin at u is at least `margin`, also with
     truncated modes if they are known. It is at least 7/8 of `margin` if the frequency of any one
     mode is off by its uncertainty. The same holds on each of 20 machines
-    (`StandardPlant.machines`): machines that agree with the measurement if the plant comes from a
-    calibrated fit; otherwise machines in which all frequencies and shapes change at once, and
-    dampings by 30 % unless stated.
+    (`StandardPlant.machines`): if frequencies are stated, or the plant does not come from a
+    calibrated fit, machines in which all frequencies and shapes change at once, and dampings by
+    30 % unless stated; otherwise machines that agree with the measurement.
 
     Parameters
     ----------
@@ -125,10 +126,10 @@ def design_stage(
     True
     """
     given = standard_plant(plant)
-    uncertain = given.uncertainty
-    if uncertain is None:
-        uncertain = given.uncertain(frequency=0.005)
-    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
+    known = given.uncertainty
+    stated = known is not None and any(isinstance(kind, Frequencies) for kind in known.kinds)
+    uncertain = given.uncertain(frequency=0.005) if known is None else known
+    task = _StageTask(uncertain, stated, positive(margin, "margin"), poi, disturbance, effort)
     with Progress(_MOST, "bandwidths", progress=progress) as bar:
         if bandwidth is not None:
             task.reaches(positive(bandwidth, "bandwidth"))
@@ -143,6 +144,7 @@ class _StageTask:
     def __init__(
         self,
         uncertain: UncertainPlant[Any],
+        stated: bool,
         margin: float,
         poi: str | None,
         disturbance: float | None,
@@ -150,7 +152,7 @@ class _StageTask:
     ) -> None:
         if margin >= 1.0:
             raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
-        self.uncertain, self.margin = uncertain, margin
+        self.uncertain, self.stated, self.margin = uncertain, stated, margin
         #: those of a bandwidth [Hz]
         self.weights = partial(
             stage_weights, uncertain.nominal, poi=poi, disturbance=disturbance, effort=effort
@@ -176,12 +178,12 @@ class _StageTask:
     def machines(self) -> list[AnyPlant]:
         """Machines on which a loop must hold, the same for all."""
         measured = self.uncertain.machines
-        if measured.fit is not None and not measured.missing:
+        if not self.stated and measured.fit is not None and not measured.missing:
             return list(measured.plants[:_DRAWS])
         known = {d.mode: d.scale for d in self.uncertain.deltas if isinstance(d, DampingDelta)}
         plant = self.plant.machine
-        stated = plant.uncertain(frequency=self.ranges, damping=known or _DAMPING)
-        return PlantMachines(stated.nominal).drawn(_DRAWS)
+        unsure = plant.uncertain(frequency=self.ranges, damping=known or _DAMPING)
+        return PlantMachines(unsure.nominal).drawn(_DRAWS)
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
