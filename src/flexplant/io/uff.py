@@ -197,7 +197,7 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     path : str or Path
         A .uff, .unv or .uf file. Needs pyuff: pip install 'flexplant[uff]'.
     modes : sequence of int, optional
-        Which of the file's modes, by their numbers there; all when not given.
+        Numbers of the modes in the file; by default all.
 
     Returns
     -------

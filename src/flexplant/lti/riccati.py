@@ -102,7 +102,7 @@ def filter_dare(
     R : (p, p) array
         Symmetric, non-singular, possibly indefinite.
     S : (n, p) array, optional
-        Cross term; zero when not given.
+        Cross term; by default zero.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def control_dare(
     R : (m, m) array
         Symmetric, non-singular, possibly indefinite; cost of u.
     S : (n, m) array, optional
-        Cross term; zero when not given.
+        Cross term; by default zero.
 
     Returns
     -------

@@ -183,7 +183,7 @@ def lsim(
     time : (n_time,) array [s]
         Equidistant from 0.
     start : (n,) array, optional
-        States at the first instant; 0 when not given.
+        States at the first instant; by default 0.
     between : {"held", "linear"}
         What u does between two instants; of a sampled system u is "held".
 
@@ -277,7 +277,7 @@ def step_info(
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
     output, input : str, optional
-        The channel; the only one when not given.
+        The channel; by default the only one.
     band : float
         The response has settled when it stays this close to the value at rest, as a part of it.
 

@@ -176,7 +176,7 @@ class PoiVariance(Criterion):
     poi : str, sequence of str or mapping {name: factor}, optional
         The POIs; when not given all whose first axis has the unit of the first one's.
     axes : str, sequence of str or mapping {axis: factor}, optional
-        Axes of each of them; its first when not given. A rotation is turned into a
+        Axes of each of them; by default its first. A rotation is turned into a
         displacement by a factor [m], such as half the width of the die.
     measure : {"sum", "max"}
         Whether the sum or the largest of the terms counts.

@@ -113,7 +113,7 @@ def score_sensors(
         A layout is a sequence of `Sensor` values, or of names: of the plant's sensors, of
         `candidates`, or of sensors in earlier layouts.
     criterion : PoiVariance or callable, optional
-        From a plant to a float, smaller is better; `PoiVariance()` when not given.
+        Function of a plant that returns a float, smaller is better; by default `PoiVariance()`.
     candidates : sequence of Sensor
         Candidates that names may stand for, in addition to the plant's own sensors.
     constraints : sequence of Constraint, optional
@@ -169,7 +169,7 @@ def score_actuators(
     plant, layouts, candidates, constraints, executor, progress
         As for `score_sensors`, of `Actuator` values.
     criterion : PoiLqr or callable, optional
-        From a plant to a float, smaller is better; `PoiLqr()` when not given.
+        Function of a plant that returns a float, smaller is better; by default `PoiLqr()`.
 
     Returns
     -------
@@ -311,7 +311,7 @@ def device_worth(
     placement : Placement
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
-        Criterion; that of the placement when not given.
+        Criterion; by default the criterion of the placement.
     executor, progress : as for `place_sensors`
 
     Raises

@@ -66,7 +66,7 @@ def place_sensors(
     count : int
         How many are chosen, `required` included.
     criterion : PoiVariance or callable, optional
-        From a plant to a float, smaller is better; `PoiVariance()` when not given.
+        Function of a plant that returns a float, smaller is better; by default `PoiVariance()`.
     required : sequence of str
         Candidates that any choice includes.
     constraints : sequence of Constraint, optional
@@ -137,7 +137,7 @@ def place_actuators(
         As for `place_sensors`, of `Actuator` values; OffPoi holds only where it is among the
         constraints.
     criterion : PoiLqr or callable, optional
-        From a plant to a float, smaller is better; `PoiLqr()` when not given.
+        Function of a plant that returns a float, smaller is better; by default `PoiLqr()`.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def place_both(
     counts : (int, int)
         How many sensors and how many actuators, `required` included.
     criterion : ClosedLoopH2 or callable, optional
-        From a plant to a float, smaller is better; `ClosedLoopH2()` when not given.
+        Function of a plant that returns a float, smaller is better; by default `ClosedLoopH2()`.
     required, constraints, method, executor, checkpoint, progress, rng : optional
         As for `place_sensors`, of candidates of either kind. Constraints see sensors and actuators
         alike: a minimum distance is also one between a sensor and an actuator.

@@ -84,7 +84,7 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     plant : StandardPlant
         Assembled from a free or suspended structure, continuous or sampled.
     axes : sequence of str, optional
-        Some of the rigid-body axes; all that the structure has when not given.
+        Selected rigid-body axes; by default all of the structure.
 
     Returns
     -------

@@ -451,7 +451,7 @@ class Partition(PartitionedSystem):
             left out when the channels are named like those of an assembled plant
             (`u1:effort`, `y1:noise`, `die:z`, `die:ref`), as in `plant.to_control()`.
         w, z : sequences of str, optional
-            Disturbances and performance; the remaining channels when not given.
+            Disturbances and performance; by default the remaining channels.
         asd : mapping, optional
             One-sided amplitude spectral densities of white w channels; the noise of a sensor y1
             is the w channel `y1:noise`.

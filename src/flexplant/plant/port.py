@@ -140,7 +140,7 @@ class SensorPort(Value):
     quantity : {"displacement", "velocity", "acceleration"}
         Measured quantity.
     absolute : bool, optional
-        Whether the motion of the ground is part of it; that of accelerations when not given.
+        Whether the motion of the ground is included; by default for accelerations only.
 
     Examples
     --------

@@ -355,7 +355,7 @@ class Feedthrough(ResidualForm):
     Parameters
     ----------
     above : float [Hz], optional
-        Also the modes above this frequency; only the attachment vectors when not given.
+        Modes above this frequency are included; by default only the attachment vectors.
 
     Examples
     --------

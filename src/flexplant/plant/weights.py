@@ -52,7 +52,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     plant : StandardPlant
         Assembled from a structure, with a reference and displacement sensors.
     poi : str, optional
-        The POI whose references the errors follow; all that have some when not given.
+        The POI whose references the errors follow; by default all that have some.
     order : int
         Highest derivative of the references that the errors read, 0 to 4.
 

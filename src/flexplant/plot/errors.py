@@ -113,7 +113,7 @@ def spectra(
     channel : str, optional
         Which signal of loops and runs; a Spectrum, from `loop.psd(channel)`, is of one already.
     unit : str, optional
-        SI unit of the signal; that of the channel when not given.
+        SI unit of the signal; by default that of the channel.
     colors : mapping {label: color}, optional
         Colours of some lines.
     ax : Axes, optional

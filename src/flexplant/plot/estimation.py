@@ -118,7 +118,7 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     report : LagReport
         From `observer.report()`.
     channel : str, optional
-        A POI's motion; the first when not given.
+        A POI's motion; by default the first.
     ax : Axes, optional
 
     Returns
@@ -180,7 +180,7 @@ def estimate(
     result : Estimate
         From `observer.estimate(records)`.
     channel : str, optional
-        `die:hat` or `y1:innovation`; the first estimate when not given.
+        `die:hat` or `y1:innovation`; by default the first estimate.
     truth : (N,) array, optional
         The motion, where it is known: then the error of the estimate is drawn.
     deviations : float

@@ -54,7 +54,7 @@ def inverse_forces(
     bandwidth : float [Hz]
         Frequency up to which the plant is inverted.
     reference : str, optional
-        The reference's channel; the plant's only one when not given.
+        The reference's channel; by default the plant's only one.
 
     Returns
     -------

@@ -92,7 +92,7 @@ def residual_vibration(
     reference : str, optional
         Reference that follows the move; needed where there are several.
     channel : str, optional
-        Channel of z; the error of the reference when not given.
+        Channel of z; by default the error of the reference.
     wait : float [s], optional
         Time after the end that is judged; ten periods of the slowest mode that vibrates, at most
         the duration of the move and at least a hundred samples, when not given.

@@ -102,7 +102,7 @@ class Spring(Value):
     direction : str
         Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
     to : place, optional
-        The other end; the ground when not given.
+        The other end; by default the ground.
 
     Examples
     --------
@@ -138,7 +138,7 @@ class Damper(Value):
     direction : str
         Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
     to : place, optional
-        The other end; the ground when not given. A grounded damper slows rigid-body motions down:
+        The other end; by default the ground. A grounded damper slows rigid-body motions down:
         hold the structure by springs too, or modes and plants refuse it.
 
     Examples

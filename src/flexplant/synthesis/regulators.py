@@ -75,7 +75,7 @@ def lqi(
         Weight on the states and then the integrals.
     R : (m, m) array
     outputs : iterable of str, optional
-        The p outputs that are integrated; all when not given.
+        The p outputs that are integrated; by default all.
 
     Returns
     -------

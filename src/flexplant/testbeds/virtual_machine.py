@@ -53,7 +53,7 @@ class WaferStage(Value):
     step : float [m]
         Step of its sensors; 0 for none.
     drawing : mapping
-        Size, thickness and material of its plate (or block) as drawn; the paper's when not given.
+        Size, thickness and material of its plate (or block) as drawn; by default the paper's.
     magnets : tuple of GroundSpring
         Those that a block floats on, as drawn; none: it is free.
 

@@ -59,7 +59,7 @@ def wafer_stage(
         In its place the drawing's own plate on such a mesh, without scatter, second mass or steps,
         and a delay of 1: a machine of its models' family. (8, 8) is the paper's with 243 DOFs.
     size : (float, float) [m]
-        Sides of the plate along x and y; the paper's when not given.
+        Sides of the plate along x and y; by default the paper's.
     thickness : float [m]
     damping : float
         Modal damping ratio of the bare plate's elastic modes; of a machine their mean.

@@ -228,9 +228,9 @@ def open_page(
     before, after, rate, delay, hold, rigid, unstable, references
         As for `design_loops`; by default those of the plant or model: the axes that it drives.
     channel : str, optional
-        The z whose rms is predicted; the first error of the plant when not given.
+        Channel of z whose rms is predicted; by default the first error of the plant.
     move : SetPointProfile, optional
-        The set-point whose error is drawn; a unit step when not given.
+        The set-point whose error is drawn; by default a unit step.
     limits : LoopLimits, optional
         What the page draws as forbidden, and judges.
     source : str

@@ -22,7 +22,7 @@ class Dampings(Uncertainty):
         By what share damping may be off at delta = 1: one for all, one for each of `modes`, or by
         mode.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; all elastic ones when not given.
+        Numbers from 1, rigid-body modes included; by default all elastic ones.
 
     Raises
     ------

@@ -23,7 +23,7 @@ class Frequencies(Uncertainty):
         by mode. 0.005 is what an updated model of a structure seldom does better than where it was
         not measured.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; all elastic ones when not given.
+        Numbers from 1, rigid-body modes included; by default all elastic ones.
 
     Raises
     ------

@@ -62,7 +62,7 @@ class UnmodelledDynamics(Uncertainty):
         channels of one side; "coprime" takes all u and y, whose units must be even (see
         `design_ncf`), and no `at`.
     name : str, optional
-        Name of the Delta; made of the channels when not given: `u1:dynamics`.
+        Name of the Delta; by default from the channels: `u1:dynamics`.
 
     Raises
     ------

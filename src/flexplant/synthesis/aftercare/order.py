@@ -95,7 +95,7 @@ def reduce_controller(
     controller : StateSpace or Controller
         From y to u; its integrators and unstable poles stay as they are.
     order : int, optional
-        States of the result; the fewest that keep the loop when not given.
+        States of the result; by default the fewest that keep the loop.
     loss : float
         Relative loss of the modulus margin, or growth of gamma, that is allowed.
 

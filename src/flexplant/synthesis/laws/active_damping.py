@@ -130,7 +130,7 @@ def damp_modes(
     u, y : str, optional
         Actuator and sensor, collocated or not; needed where the plant has several.
     damping : float, optional
-        Damping ratio, below 1; the largest when not given.
+        Damping ratio, below 1; by default the largest.
     margin : float
         Modulus margin of the loop, between 0 and 1.
 

@@ -34,7 +34,7 @@ class ShapedAxis(Value):
     gain : float
         A factor on all of them.
     on : sequence of bool, optional
-        Which elements act; all unless given.
+        Whether each element acts; by default all.
     feedforward : sequence of up to 5 float
         Command of the axis per position, velocity, acceleration, jerk and snap of its reference.
     closed : bool

@@ -47,7 +47,7 @@ class H2(MeasuredObjective):
     Parameters
     ----------
     w, z : sequences of str, optional
-        Channels; all when not given.
+        Channels; by default all.
     below : float, optional
         What it has to stay below; none for what is minimised.
 
@@ -106,7 +106,7 @@ class PeakGain(MeasuredObjective):
     ----------
     w, z, below : as for `H2`
     decay : float [rad/s], optional
-        Rate at which the reachable set is taken to shrink; several are tried when not given.
+        Assumed rate at which the reachable set shrinks; by default several are tried.
 
     Examples
     --------

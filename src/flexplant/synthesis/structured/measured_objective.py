@@ -30,7 +30,7 @@ class MeasuredObjective(Value):
     Parameters
     ----------
     w, z : sequences of str, optional
-        Channels; all when not given.
+        Channels; by default all.
     below : float, optional
         The number is counted in multiples of this bound.
 

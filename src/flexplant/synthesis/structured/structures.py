@@ -340,7 +340,7 @@ class TunedLaws(Value):
     before, after : as for `design_loops`, optional
     free : sequence of str
         Which numbers of the elements are free, of p, i, d, pole, freq, ratio, width, damping and
-        depth; all but the depth unless given.
+        depth; by default all but the depth.
 
     Examples
     --------
