@@ -212,7 +212,7 @@ def frf(
     band : (low, high) [Hz], optional
         Frequency range to draw; all by default.
     freq : (n_freq,) array [Hz], optional
-        Frequencies at which systems are evaluated; by default a grid of each, refined at resonances.
+        Frequencies; by default a grid of each system, refined at its resonances.
     also : sequence of str, optional
         "phase" [deg, within half a turn of 0] and "coherence", each in a panel below;
         "deviation", the standard deviation of measurements, as a line below them.

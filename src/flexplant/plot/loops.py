@@ -73,7 +73,7 @@ def nyquist(
     channel : (output, input), optional
         Channel of systems with several channels.
     freq : (n_freq,) array [Hz], optional
-        Frequencies at which systems are evaluated; by default a grid of each, refined at resonances.
+        Frequencies; by default a grid of each system, refined at its resonances.
     modulus : float
         Largest |S| of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
     reach : float

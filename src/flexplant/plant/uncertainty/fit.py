@@ -52,7 +52,7 @@ class Fit(Uncertainty):
         Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
         given.
     parameters : sequence of Parameter, optional
-        Residuals given to `update`, in the same order; by default those that the fit stores.
+        Parameters given to `update`, in the same order; by default those that the fit stores.
     deviations : float
         Standard deviations at which a delta is 1.
 
