@@ -236,5 +236,6 @@ def _format(path: Path) -> Format:
     raise FlexplantError(
         f"the format of {path.name!r} is not known, neither by its suffix {path.suffix!r} nor by "
         f"what it begins with. Known suffixes: {', '.join(s for f in FORMATS for s in f.suffixes)}."
-        " Readers of one format are in flexplant.io."
+        " Readers of one format are in flexplant.io. Numbers in a plain text: numpy.loadtxt, then "
+        "FEModel(M, K, dofs=DofSet(nodes, directions, xyz))."
     )

@@ -65,7 +65,8 @@ class Family:
         if not all(hasattr(model, part) for part in ("M", "D", "K", "dofs", "rigid_body")):
             raise ModelError(
                 f"the model must have M, D, K, a rigid_body basis and dofs, as FEModel and "
-                f"ReducedModel do, got {type(model).__name__}. Pass one of them."
+                f"ReducedModel do, got {type(model).__name__}. Pass one of them; for Modes: "
+                "reduce(modes, DesiredDofs(...))."
             )
         refuse_unstable(model, "updating")
         none = np.zeros(model.M.shape)

@@ -90,6 +90,8 @@ class PointParameter(Parameter):
     prior: tuple[float, float] | None = field(default=None, kw_only=True)
 
     quantity: ClassVar[str] = ""
+    #: of a translation and of a rotation
+    units: ClassVar[tuple[str, str]] = ("", "")
     acts_on: ClassVar[int] = 0
     #: directions that mean several motions
     together: ClassVar[tuple[str, ...]] = ()
@@ -111,6 +113,13 @@ class PointParameter(Parameter):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.name} [{self.unit}]>"
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """Return the unit: of a rotation where all motions of the place are rotations."""
+        labels = [self.at] if isinstance(self.at, str) else self.at
+        along = labels if isinstance(labels, Mapping | list) else [f":{self.direction}"]
+        return self.units[all(str(label).split(":")[-1].startswith("r") for label in along)]
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return (dM, dD, dK) of the model: r r^T in one of them, sparse where M is."""
@@ -167,7 +176,7 @@ class AddedMass(PointParameter):
     """
 
     quantity = "mass"
-    unit = "kg"
+    units = "kg", "kg m^2"
     acts_on = 0
     together = ("xyz",)
 
@@ -187,7 +196,7 @@ class AddedDamping(PointParameter):
     """
 
     quantity = "damping"
-    unit = "N s/m"
+    units = "N s/m", "N m s/rad"
     acts_on = 1
 
 
@@ -207,10 +216,12 @@ class AddedStiffness(PointParameter):
     --------
     >>> AddedStiffness({"14:z": 1.0, "15:z": -1.0}, name="crack")
     <AddedStiffness: crack [N/m]>
+    >>> AddedStiffness({"1:rz": 1.0, "2:rz": -1.0}, name="gear")
+    <AddedStiffness: gear [N m/rad]>
     """
 
     quantity = "stiffness"
-    unit = "N/m"
+    units = "N/m", "N m/rad"
     acts_on = 2
 
 
