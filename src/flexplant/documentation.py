@@ -38,6 +38,8 @@ _MORE = ("bibliography", "errors", "algorithms")
 _FIRST = ("wafer_stage", "gantry")
 #: texts of the folder `pages`, in the order in which they are listed
 _TEXTS = ("how_it_works", "my_matrices", "only_an_frf", "refused", "from_matlab")
+#: what runs are given: no browser, and sizes that leave time and memory for the others
+_ARGUMENTS = {"workbench": ("--no-browser",), "million_dofs": ("100000",), "fleet": ("4",)}
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
 _HOME = "@root@/"  # stands for the way from a page to the folder of the site
 
@@ -131,9 +133,6 @@ def _run(story: Path) -> None:
             raise SolverError(f"examples/{story.name} fails: {answer.stderr[-2000:]}")
         printed = answer.stdout.replace(str(copy), "examples")
         keep(story, printed, sorted(copy.rglob("out/**/*.png")))
-
-
-_ARGUMENTS = {"workbench": ("--no-browser",)}
 
 
 def _shown(story: Path) -> Shown | None:
@@ -274,7 +273,9 @@ def _story(path: Path, shown: Shown | None) -> str:
     else:
         text += [f"![{one.stem}]({_HOME}pictures/{one.name})" for one in shown.pictures]
         if shown.printed.strip():
-            text += ["### What it prints", f"```text\n{shown.printed.strip()}\n```"]
+            command = " ".join([f"examples/{path.name}", *_ARGUMENTS.get(path.stem, ())])
+            text += ["### What it prints", f"``python {command}``:"]
+            text.append(f"```text\n{shown.printed.strip()}\n```")
     for cell in cells:
         title, _, code = cell.partition("\n")
         text += [f"### {title}", f"```python\n{code.strip()}\n```"]
