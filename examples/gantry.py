@@ -202,7 +202,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
-    """Draw the measured response beside the model's, |S| of both, and the error in the move."""
+    """Draw the measured response, that of the model, |S|, and the error in the move."""
     import matplotlib.pyplot as plt
 
     figure, axs = plt.subplots(3, 1, figsize=(9, 11), layout="constrained")
