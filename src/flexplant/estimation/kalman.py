@@ -103,9 +103,10 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
     observer = _judged(plant, whole, found)
-    if machines is None or found is None:
+    if machines is None or found is None or whole is None:
         return observer
-    others = [_judged(plant, whole, noise) for noise in unsure_noise(found, plant, machines)]
+    noises = unsure_noise(found, plant, whole, machines)
+    others = [_judged(plant, whole, noise) for noise in noises]
     return min([observer, *others], key=_upper_ends)
 
 
