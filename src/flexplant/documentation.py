@@ -38,8 +38,8 @@ _MORE = ("bibliography", "errors", "algorithms")
 _FIRST = ("wafer_stage", "gantry")
 #: texts of the folder `pages`, in the order in which they are listed
 _TEXTS = ("how_it_works", "my_matrices", "only_an_frf", "refused", "from_matlab")
-#: what runs are given: no browser, and sizes that leave time and memory for the others
-_ARGUMENTS = {"workbench": ("--no-browser",), "million_dofs": ("100000",), "fleet": ("4",)}
+#: what runs are given: no browser, and a size that leaves time for the others
+_ARGUMENTS = {"workbench": ("--no-browser",), "fleet": ("4",)}
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
 _HOME = "@root@/"  # stands for the way from a page to the folder of the site
 
@@ -120,7 +120,17 @@ def _run(story: Path) -> None:
         copy = Path(place) / "examples"
         shutil.copytree(_EXAMPLES, copy, ignore=shutil.ignore_patterns("out", "*.png", "__*"))
         if story.stem.startswith("test_"):
-            command = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"]
+            command = [
+                "-m",
+                "pytest",
+                "-q",
+                "-n",
+                "0",
+                "-p",
+                "no:cacheprovider",
+                "-p",
+                "no:warnings",
+            ]
         else:
             command = []
         answer = subprocess.run(
@@ -292,7 +302,7 @@ def _gallery(stories: dict[Path, Shown | None]) -> str:
     ]
     text.append('<div class="gallery">')
     for path, shown in stories.items():
-        title = path.read_text(encoding="utf-8").strip('"').partition("\n")[0]
+        title = path.read_text(encoding="utf-8").strip('"').partition("\n")[0].replace("`", "")
         image = ""
         if shown and shown.pictures:
             image = f'<img src="pictures/{shown.pictures[0].name}" alt="{path.stem}"/>'
