@@ -258,7 +258,7 @@ class IdentifiedModes(MeasuredModes):
 
     Parameters
     ----------
-    poles, modes, covariance, shapes, dofs
+    poles, modes, covariance, shapes, dofs, xyz, directions
         As in `MeasuredModes`; shapes psi_k at the outputs.
     participation : (n_in, m) complex array
         Participation vectors l_k of the inputs.
