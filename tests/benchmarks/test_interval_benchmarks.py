@@ -1,13 +1,16 @@
 """How often the stated intervals hold on machines that share no code with the drawing.
 
 ``python -m pytest tests/benchmarks/test_interval_benchmarks.py -n 0 -m benchmark -s`` prints the
-table. Each machine is a Mindlin plate in polynomials with masses that no drawing shows, stiffness
-that varies by 2 % over it, and dampings that scatter by a quarter. It is drawn with `fx.plate`,
-updated with its measured poles, and its filter and servo are designed as the README does. No
-constant of the drawing of machines was chosen on these.
+table, ten seconds a machine. Each machine is a Mindlin plate in polynomials with masses that no
+drawing shows, stiffness that varies by 2 % over it, and dampings that scatter by a quarter; the
+third kind has uneven actuators and a weak strip that makes two modes of almost one frequency. It is
+drawn with `fx.plate`, updated with its measured poles (with the strip as a third parameter), and
+its filter and servo are designed as the README does. No constant of the drawing of machines was
+chosen on these; the seeds of the table were run once, after the code was final.
 
-Measured: 90 of 100 intervals are stated, of these 84 hold (die:rx of the first kind on 6 of 9,
-die:z of the second on 7 of 9). Where none is stated the model is said to lack something.
+Measured, ten machines a kind, 150 intervals of 150 stated: 48, 45 and 47 of 50 hold (of 30: die:z
+29, die:rx 26, die:ry 26, modulus margin 30, bandwidth 29); median widths of die:z 20, 29 and 82 %.
+Where nothing is stated the model is said to lack something.
 """
 
 import warnings
@@ -36,12 +39,12 @@ KINDS = {
     },
     "soft pair": {
         "size": (0.45, 0.3), "thickness": 0.02, "zeta": 0.003, "cells": (42, 28),
-        "known": (0.1, 0.2), "bandwidth": 40.0, "poles": 11, "soft": 0.7,
+        "known": (0.1, 0.2), "bandwidth": 40.0, "poles": 11, "soft": 0.53, "order": 19,
         "push": [(0.09, 0.06), (0.36, 0.075), (0.1, 0.24), (0.33, 0.22)],
     },
 }  # fmt: skip
-#: half-width [m] of the weak strip across the plate of the soft pair, at 417 and 421 Hz
-STRIP = 0.04
+#: half-width [m] of the weak strip across the plate, which makes a soft pair at 412 and 419 Hz
+STRIP = 0.07
 ALUMINIUM = {"density": 2702.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
 
 
@@ -100,7 +103,7 @@ def machine_of(kind, seed):
     young = modulus(kind, kind["soft"] * rng.normal(1.0, 0.03)) if "soft" in kind else 70e9
     return unlike_machines.plate_machine(
         rng, kind["size"], kind["thickness"], 2702.0, young, 0.33, forces=forces, sensors=corners,
-        poi=poi, zeta=kind["zeta"], masses=masses,
+        poi=poi, zeta=kind["zeta"], masses=masses, order=kind.get("order", unlike_machines.ORDER),
     )  # fmt: skip
 
 
@@ -169,7 +172,7 @@ def loop_figures(machine, blocks):
     return loop.modulus_margin, fx.compare_loops({"servo": loop}).rows["servo"].bandwidth
 
 
-def table(name, kind, make=fx.plate, count=COUNT, first=0):
+def table(name, kind, make=fx.plate, count=COUNT, first=3000):
     """Print how often intervals are stated and hold; return both shares."""
     with warnings.catch_warnings(action="ignore"):
         runs = [judged(kind, seed, make) for seed in range(first, first + count)]

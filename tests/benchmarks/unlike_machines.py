@@ -58,7 +58,20 @@ def _row(size, place, order, slope=None):
 
 
 def plate_machine(
-    rng, size, thickness, density, E, nu, *, forces, sensors, poi, zeta, masses, scatter=0.02
+    rng,
+    size,
+    thickness,
+    density,
+    E,
+    nu,
+    *,
+    forces,
+    sensors,
+    poi,
+    zeta,
+    masses,
+    scatter=0.02,
+    order=ORDER,
 ):
     """A free Mindlin plate whose stiffness varies by `scatter`, and its dampings by a quarter."""
     heights = rng.normal(size=(3, 3)) * scatter / 1.5
@@ -71,15 +84,15 @@ def plate_machine(
         own = 1.0 + np.einsum("...i,ij,...j->...", waves[0], heights, waves[1])
         return own * (E(x, y) if callable(E) else E)
 
-    M, K = mindlin_matrices(size, thickness, density, stiff, nu, order=ORDER, masses=masses)
+    M, K = mindlin_matrices(size, thickness, density, stiff, nu, order=order, masses=masses)
     values, phi = la.eigh(K, M, subset_by_index=(0, MODES - 1))
     omega = np.sqrt(np.maximum(values, 0.0))
     omega[:3] = 0.0
     damping = zeta * np.exp(0.25 * rng.normal(size=MODES))
     rows = {
-        "push": [_row(size, p, ORDER) for p in forces],
-        "sensors": [_row(size, p, ORDER) for p in sensors],
-        "poi": [_row(size, poi, ORDER, motion) for motion in (None, "rx", "ry")],
+        "push": [_row(size, p, order) for p in forces],
+        "sensors": [_row(size, p, order) for p in sensors],
+        "poi": [_row(size, poi, order, motion) for motion in (None, "rx", "ry")],
     }
     seen = {name: np.array(part) @ phi for name, part in rows.items()}
     return Machine(omega, damping, **seen)
