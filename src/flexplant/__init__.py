@@ -165,6 +165,9 @@ faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_p
 | ``simulation.certify_speed`` | gone: `simulation.rms_along(..., repeats=True)`, one path |
 | ``kirchhoff_plate(holes=, ribs=)`` | gone: a mesh of scikit-fem, `examples/from_skfem.py` |
 | ``structure.Disc``, ``structure.Rectangle`` | `placement.Disc`, `placement.Rectangle` |
+| ``io.write_fmu``, ``synthesis.write_c`` | `export.write_fmu`, `export.write_c` |
+| ``fx.workbench(...)`` | `workbench.open_page` |
+| ``KalmanCertificate`` and others of its kind | `loop.Certificate`, a sequence of `loop.Verified` |
 | ``placement.HinfLevel`` | ``lambda plant: fx.design_hinf(plant.weighted(...)).gamma`` |
 | ``structure.Hysteretic`` | `ModalDamping` of eta / 2; a complex K is read as that |
 | ``io.read_mat_values``, a ReducedModel in .mat | ``.save``, `load`; `io.read_mat` by name |
