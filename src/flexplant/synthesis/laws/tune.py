@@ -24,8 +24,10 @@ from ...plant import AnyPlant
 from ...plant.axes import real_gain
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
+from .controller_elements import Pid
 from .law import Axes, Law, decoupled, tustin_s
 from .loop_design import DesignedLoops, axes_of, made
+from .pid_tuning import tune_pid
 from .servo_loops import TARGET
 
 #: distance of a pole from zero frequency, relative to the farthest pole, below which it counts as
@@ -55,6 +57,9 @@ def tune_loops(
     axes; `decouple` computes them. Where the lines do not resolve a resonance, or have variance,
     the loop gain is kept small. The result is the best of many starts, without proof that it is
     optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
+
+    An axis is a mass, a velocity or a spring, whose line its law is made for. A single axis that
+    integrates an odd number of times, as motors do, or is unstable has the law of `tune_pid`.
 
     Parameters
     ----------
@@ -107,6 +112,9 @@ def tune_loops(
         rigid = int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
+    if _has_no_line(axes):
+        law = _pid_law(axes, float(peak))
+        return made(axes, {axes.names[0]: law}, 0, 0, None)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
     with Progress(len(axes.names), "axes", progress=progress) as bar:
@@ -134,6 +142,34 @@ def tune_loops(
         )
         warn(notes[-1])
     return design.replace(notes=(*design.notes, *notes))
+
+
+def _has_no_line(axes: Axes) -> bool:
+    """Return whether a single axis integrates an odd number of times, or has unstable poles."""
+    g = axes.plant
+    if isinstance(g, Frf) or len(axes.names) > 1 or not g.n_states:
+        return False
+    poles = g.poles()
+    rest = np.abs(poles - (1.0 if axes.rate else 0.0))
+    slow = rest <= _ZERO * np.max(rest)
+    grows = np.abs(poles) > 1.0 if axes.rate else poles.real > 0.0
+    return bool(np.count_nonzero(slow) % 2 or np.any(grows & ~slow))
+
+
+def _pid_law(axes: Axes, peak: float) -> Law:
+    """Return the law of `tune_pid`, whose loop is judged by its poles."""
+    found, rate = tune_pid(axes.plant, margin=1.0 / peak), axes.rate
+    # it keeps its response at the crossover when it is sampled: Tustin's rule of shifted corners
+    half = np.pi * found.crossover / rate if rate else 0.0
+    moved = float(np.tan(half) / half) if half else 1.0
+    lead = np.isfinite(found.lead)
+    pid = Pid.corners(
+        found.gain,
+        integrator=moved * found.integral,
+        zero=moved * found.lead if lead else None,
+        pole=moved * found.roll_off if lead else None,
+    )
+    return Law((pid,), rate=rate or 0.0)
 
 
 def _joint_plants(
