@@ -159,6 +159,8 @@
    reconstruction, IEEE Control Systems 38, 2018.
 .. [McFarlaneGlover1992] McFarlane, Glover, A loop-shaping design procedure using H-infinity
    synthesis, IEEE Trans. Autom. Control 37, 1992.
+.. [Michiels2014] Michiels, Niculescu, Stability, Control, and Computation for Time-Delay Systems,
+   2nd ed., SIAM, 2014.
 .. [Mindlin1951] Mindlin, Influence of rotatory inertia and shear on flexural motions of isotropic,
    elastic plates, J. Appl. Mech. 18, 1951, 31-38.
 .. [Modelica2022] Modelica Association, Functional Mock-up Interface for Model Exchange,

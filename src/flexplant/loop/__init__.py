@@ -5,6 +5,7 @@
   ``budget`` by source.
 - `sensitivity`, `complementary_sensitivity`, `control_sensitivity`, `loop_gain`, `bandwidth`.
 - `report_loops`: crossovers, gain, phase and modulus margins of each loop, broken at u or y.
+- `DelayedLoop`: loops with a continuous delay, and PD laws, without sampling them.
 - `compare_loops`: several designs, or one on model and machine, in one table.
 
 Every quantity also accepts a measured `fx.Frf` as plant; `in_axes` transforms it to decoupled axes.
@@ -32,6 +33,7 @@ from .budget import ErrorBudget as ErrorBudget
 from .budget import Spectrum as Spectrum
 from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop
+from .delayed_loops import DelayedLoop as DelayedLoop
 from .measured_loop import in_axes as in_axes
 from .on_measurement import OnMeasurement as OnMeasurement
 from .other_machines import ModeTolerances as ModeTolerances

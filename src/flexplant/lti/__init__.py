@@ -7,6 +7,7 @@ such systems.
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
 - `frequency_response`: an `Frf`, of systems, of structures between their ports, measured or not.
 - `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
+- `Delayed`: a continuous delay, and laws that differentiate, exact on the frequency axis.
 - `step`, `impulse`, `lsim`, `step_info`: time responses in numbers; `fx.plot.step` draws them.
 - `h2_norm`, `hinf_norm`, `peak_gain`: norms, with a proof for the last two.
 - `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,
@@ -40,6 +41,7 @@ such systems.
 | ``nyquist``, ``pzmap`` | `fx.plot.nyquist`, `fx.plot.pole_map` |
 | ``step``, ``impulse``, ``lsim``, ``stepinfo`` | `fx.lti.step`, `impulse`, `lsim`, `step_info` |
 | ``c2d`` | `fx.lti.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
+| ``InputDelay``, ``exp(-s)`` | `fx.lti.Delayed`, judged by `fx.loop.DelayedLoop` |
 | ``d2c``, ``d2d`` | `fx.lti.continuous`, `fx.lti.resampled(sys, rate)` |
 | ``dss``, ``stabsep`` | `fx.lti.descriptor`, `fx.lti.split_stable` |
 | ``gram``, ``hsvd`` | `fx.lti.controllability_gramian`, `fx.lti.hankel_values` |
@@ -61,6 +63,7 @@ from .balancing import norm_report as norm_report
 from .conversions import continuous as continuous
 from .conversions import descriptor as descriptor
 from .conversions import resampled as resampled
+from .delays import Delayed as Delayed
 from .discretisation import tustin as tustin
 from .filters import high_pass_filter as high_pass_filter
 from .filters import inverse_sensitivity as inverse_sensitivity

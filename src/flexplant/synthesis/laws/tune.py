@@ -113,8 +113,7 @@ def tune_loops(
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
     if _has_no_line(axes):
-        law = _pid_law(axes, float(peak))
-        return made(axes, {axes.names[0]: law}, 0, 0, None)
+        return made(axes, {axes.names[0]: _pid_law(axes, float(peak))}, 0, 0, None)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
     with Progress(len(axes.names), "axes", progress=progress) as bar:
