@@ -231,7 +231,7 @@ def test_power_spectral_densities(tmp_path, label, size):
     np.testing.assert_allclose(found[name].psd, size * psd, rtol=1e-5)
     np.testing.assert_allclose(found[name].freq, freq)
     np.testing.assert_allclose(read_spectra(path, scale=2.0)[name].psd, 2 * psd, rtol=1e-5)
-    with pytest.raises(FlexplantError, match=r"no time record.*\[9\]"):
+    with pytest.raises(FlexplantError, match=r"no time record.*\[9\].*io\.read_spectra"):
         read_records(path)
     unknown = record((4, 2), (4, 2), psd, **(changes | {"ordinate_axis_units_lab": "EU"}))
     with pytest.raises(ModelError, match="scale="):

@@ -16,6 +16,12 @@ from .uff_systems import is_permutation, turning, uff_nodes
 from .unit_labels import density_of
 
 _TIME, _DENSITY = 1, 9
+#: function types of records 58: what they hold, and what reads them
+_FUNCTIONS = {
+    _TIME: ("time record", "read_records"),
+    4: ("frequency response", "read_frf_uff"),
+    _DENSITY: ("power spectral density", "read_spectra"),
+}
 #: specific data type of a force
 _FORCE = 13
 UNIVERSAL = (".uff", ".unv", ".uf")
@@ -23,7 +29,7 @@ UNIVERSAL = (".uff", ".unv", ".uf")
 
 def read_uff_records(path: Path) -> RecordedChannels:
     """Return the time records of a universal file; those of one channel are runs, in order."""
-    parts = _of_type(path, _TIME, "time record", "Export these, or read_frf_uff what is there.")
+    parts = _of_type(path, _TIME)
     by_name: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for part in parts:
         name, sign = _named(part)
@@ -96,7 +102,7 @@ def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, S
     """
     path = file_path(path)
     scale = None if scale is None else positive(scale, "scale")
-    parts = _of_type(path, _DENSITY, "power spectral density", "Export these, or time records.")
+    parts = _of_type(path, _DENSITY)
     found: dict[str, Spectrum] = {}
     for part in parts:
         name, _ = _named(part)
@@ -119,12 +125,15 @@ def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, S
     return dict(sorted(found.items(), key=lambda item: channel_order(item[0])))
 
 
-def _of_type(path: Path, kind: int, what: str, do: str) -> list[dict[str, Any]]:
+def _of_type(path: Path, kind: int) -> list[dict[str, Any]]:
     records = datasets(path, (58,))
     found = [part for part in records if whole_entry(part, "func_type") == kind]
     if not found:
         kinds = sorted({whole_entry(part, "func_type") for part in records})
+        what = _FUNCTIONS[kind][0]
         told = f"holds no {what}: {len(records)} records 58 of function types {kinds}"
+        others = [f"flexplant.io.{_FUNCTIONS[one][1]}" for one in kinds if one in _FUNCTIONS]
+        do = f"Read what is there: {', '.join(others)}." if others else f"Export a {what}."
         raise refused(path, f"{told} (1 is time, 4 a frequency response, 9 a density)", do)
     return found
 
