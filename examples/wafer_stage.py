@@ -30,13 +30,13 @@ BAND = 150.0, 1250.0  # Hz, where poles are identified
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 COLORS = ("0.55", "#E69F00", "#0072B2")  # of the loops
-STORY = """At 0.1 % damping, predicted errors hold: of interpolated sensors (geometry alone), of
-filters of the model as drawn or measured. Modes left out are noise, or ignored (24).
+STORY = """At 0.1 % damping predicted errors hold: of sensors alone (geometry), of filters of the
+drawn or measured model, unless the modes left out are ignored (24 modes).
 | A design that trusts the updated model is unstable on the machine. A tolerant one holds.
 | The tolerant loop has the |S| on the machine that its model promised (cut at -50 dB).
 | It follows a move of 100 µm with a smaller error at the die than the best servo.
 | Its error settles sooner after the move (same runs, cut at 100 nm).
-| A fifth sensor helps most at the star. The color shows the error that remains."""
+| A fifth sensor helps most at the star. The colour shows the error that remains."""
 
 
 def ports(force: float = 1e-3) -> fx.Ports:
@@ -259,7 +259,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
 
     case, colors, shown = result["cases"][0.001], {}, {}  # at 0.1 % damping
     figure, axs = plt.subplots(2, 3, figsize=(17, 10.5), layout="constrained")
-    errors, force, size, move, rest, places = axs.flat
+    errors, force, S, move, rest, places = axs.flat
     given, forces = list(case["errors"].values()), [f"{1e3 * f:g} mN/√Hz" for f in FORCES]
     fx.plot.predictions(given, cases=forces, ax=errors)
     for (name, loop), color in zip(case["loops"].items(), COLORS, strict=True):
@@ -271,12 +271,12 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
             fx.plot.response(run, ["die:error"], span=(0.15, 0.4), ax=rest, **style)
             shown |= {f"{name}, {kind}": loop[kind] for kind in ("model", "machine")}
             colors |= {f"{name}, model": color, f"{name}, machine": "black"}
-    fx.plot.sensitivity(shown, colors=colors, dashed=list(shown)[1::2], ax=size)
+    fx.plot.sensitivity(shown, colors=colors, dashed=[*shown][1::2], ax=S).legend(loc="lower right")
     fx.plot.sensor_map(result["placement"], ports=ports(), ax=places)
     force.set_ylim(-8.0, 8.0), rest.set_ylim(-100.0, 100.0)
-    size.set(xlim=(5.0, 5e3), ylim=(-50.0, 12.0))
+    S.set(xlim=(5.0, 5e3), ylim=(-50.0, 12.0))
     for number, (ax, sentence) in enumerate(zip(axs.flat, STORY.split("\n|"), strict=True), 1):
-        ax.set_title(fill(f"{number}  {sentence}", 56), loc="left", pad=28 if ax is errors else 8)
+        ax.set_title(fill(f"{number}  {sentence}", 46), loc="left", pad=28 if ax is errors else 8)
     (path := folder / "wafer_stage.png").parent.mkdir(exist_ok=True)
     claimed = {"Comment": json.dumps(result["claims"])}  # says when the README's copy is old
     figure.savefig(path, dpi=90, metadata=claimed)

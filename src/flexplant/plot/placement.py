@@ -38,7 +38,7 @@ from ._axes import (
 )
 
 #: what a map of sensors shows
-_RATIO = "POI error with / without a further sensor [-], lower is better"
+_RATIO = "POI error with / without a further sensor [-],\nlower is better"
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:

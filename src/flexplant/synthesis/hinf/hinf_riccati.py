@@ -137,7 +137,9 @@ class Riccati(Value):
         if unit <= ROUNDING * _open_size(problem):  # w reaches nothing in z
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
         scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
-        with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
+        with Progress(
+            _BISECTION, "steps of the bisection", progress=self.progress, even=False
+        ) as bar:
             high, low = self._searched(scaled, bar)
             K, norm = self._accepted(scaled, high, back_off, norm_of)
         if K is None:  # nothing below it holds

@@ -118,7 +118,7 @@ def over_positions(
     # + (B + delta dB) u`, whose size and scale are searched
     moving = PlantRange.of(given)
     search, motion = _Search(moving, design), _MotionChannels(moving)
-    with Progress(_MOST, _DESIGNS, progress=progress):
+    with Progress(_MOST, _DESIGNS, progress=progress, even=False):
         first = search.tried_with("the mean plant", motion.mean)
         last = len(moving.plants) - 1
         for i in sorted({0, len(moving.plants) // 2, last}):

@@ -130,7 +130,7 @@ def design_stage(
     stated = known is not None and any(isinstance(kind, Frequencies) for kind in known.kinds)
     uncertain = given.uncertain(frequency=0.005) if known is None else known
     task = _StageTask(uncertain, stated, positive(margin, "margin"), poi, disturbance, effort)
-    with Progress(_MOST, "bandwidths", progress=progress) as bar:
+    with Progress(_MOST, "bandwidths", progress=progress, even=False) as bar:
         if bandwidth is not None:
             task.reaches(positive(bandwidth, "bandwidth"))
         else:

@@ -478,7 +478,9 @@ class Lmi(Value):
                 f"Lmi takes plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
                 "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
             )
-        with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:
+        with Progress(
+            _STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress, even=False
+        ) as bar:
             found, lower = self._smallest(problem, bar.advance)
         if found.value > lower * (1.0 + AWAY):
             raise SolverError(

@@ -160,7 +160,7 @@ def _best_step(
     """Return the step of the smallest mu, and mu of each; they end where mu falls no further."""
     best: _DkStep | None = None
     found: dict[str, float] = {}
-    with Progress(most, "steps of D-K", progress=progress) as bar:
+    with Progress(most, "steps of D-K", progress=progress, even=False) as bar:
         try:
             for step in steps:
                 bar.advance()
