@@ -81,8 +81,7 @@ def held_exactly(
 ) -> StateSpace:
     """Return the zero-order-hold equivalent of a continuous system; see `discretized`."""
     late = positive(delay, "delay", zero=True) / positive(rate, "rate")
-    some = range(len(g.inputs)) if delayed is None else g.input_index(delayed)
-    names = [g.inputs[i] for i in some]
+    names = g.inputs if delayed is None else [g.inputs[i] for i in g.input_index(delayed)]
     check_names(names, "inputs that are delayed")
     pairs = uncoupled_pairs(g.A) if not late and set(g.blocks or ()) == {2} else None
     if pairs is None:
@@ -401,30 +400,34 @@ def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
     return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
 
 
+#: terms of the Taylor series of an integral: 0.125^10 / 11! is rounding
+_TERMS = 10
+
+
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
-    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so `e^(A h) = e^(m h)
-    # (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating pair, linear in h
-    # for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled by `I(2 t) = I(t) +
-    # e^(A t) I(t)`: no division by small frequencies. Both states of a pair are scaled to equal
-    # size, so that s is small
-    given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
-    pairs[:, 0, 1] /= units
-    pairs[:, 1, 0] *= units
-    size = float(np.max(np.abs(pairs).sum(axis=2))) * h
-    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
+    # the integral is a Taylor series on t = h / 2^s, doubled by `I(2 t) = I(t) + e^(A t) I(t)`, where
+    # e^(A t), first `1 + A I(t)`, is squared: no division by small frequencies. There both states
+    # of a pair have units in which they are of one size, so that s is small
+    units = _even_units(pairs)
+    even = pairs.copy()
+    even[:, 0, 1] /= units
+    even[:, 1, 0] *= units
+    size = float(np.max(np.abs(even).sum(axis=2))) * h
+    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.125))))
     t = h / 2**doublings
-    identity = np.broadcast_to(np.eye(2), pairs.shape)
-    term = identity * t
-    integral = term.copy()
-    for k in range(2, 18):
-        term = pairs @ term * (t / k)
-        integral = integral + term
-    for k in range(doublings):
-        integral = integral + pair_expm(pairs, t * 2**k) @ integral
+    step, identity = even * t, np.broadcast_to(np.eye(2), pairs.shape)
+    integral = identity
+    for k in range(_TERMS, 1, -1):
+        integral = identity + step @ integral / k
+    integral = t * integral
+    flow = identity + even @ integral
+    for _ in range(doublings):
+        integral = integral + flow @ integral
+        flow = flow @ flow
     integral[:, 0, 1] *= units
     integral[:, 1, 0] /= units
-    return pair_expm(given, h), integral
+    return pair_expm(pairs, h), integral
 
 
 def _even_units(pairs: FloatArray) -> FloatArray:
@@ -437,9 +440,11 @@ def _even_units(pairs: FloatArray) -> FloatArray:
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
-    # an overdamped pair has poles m +- r, whose exponentials are formed separately: cosh(r h)
-    # overflows long before the product with the decay e^(m h). The smaller of the two poles is the
-    # determinant over the larger, which keeps the digits that m +- r would cancel
+    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
+    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
+    # pair, linear in h for a rigid-body pair. The exponentials of the poles m +- r of an overdamped
+    # pair are formed separately, because cosh(r h) overflows long before e^(m h) has decayed; the
+    # smaller pole is the determinant over the larger, because m +- r would cancel its digits
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs - mean[:, None, None] * np.eye(2)
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
