@@ -170,7 +170,7 @@ def test_search_and_certificate_break_the_same_loop():
         task = servo_task(one, None, None, None, None, (), observer)
         for bandwidth in (5.0, 20.0):
             law = task.law(bandwidth)
-            found = task.loop.gain(law)
+            found = task.loop.gain(law.driven.T, law.at(task.loop.freq))
             wanted = task.closed(law).broken.gain(task.loop.freq)
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
 

@@ -406,9 +406,9 @@ _TERMS = 10
 
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
-    # the integral is a Taylor series on t = h / 2^s, doubled by `I(2 t) = I(t) + e^(A t) I(t)`, where
-    # e^(A t), first `1 + A I(t)`, is squared: no division by small frequencies. There both states
-    # of a pair have units in which they are of one size, so that s is small
+    # the integral is a Taylor series on t = h / 2^s, doubled by `I(2 t) = I(t) + e^(A t) I(t)`,
+    # where e^(A t), first `1 + A I(t)`, is squared: no division by small frequencies. There both
+    # states of a pair have units in which they are of one size, so that s is small
     units = _even_units(pairs)
     even = pairs.copy()
     even[:, 0, 1] /= units

@@ -334,11 +334,19 @@ class ServoTask:
         notches = self.notches or ()
         return Axis(line, bandwidth, float(rolloff), float(slow), gain, self.rate, notches)
 
-    def notched(self, law: ServoLaw) -> ServoLaw:
-        """Return the law with notches where they serve, unless they were given."""
-        if self.notches is not None:
-            return law
-        return self.loop.notched(law, lambda one: self.closed(one).is_stable)
+    @cached_property
+    def notched(self) -> Callable[[ServoLaw], ServoLaw]:
+        """The function of a law that gives it with notches where they serve, or as given."""
+        kept: dict[tuple[Axis, ...], ServoLaw] = {}
+
+        def found(law: ServoLaw) -> ServoLaw:
+            if self.notches is not None:
+                return law
+            if law.axes not in kept:
+                kept[law.axes] = self.loop.notched(law, lambda one: self.closed(one).is_stable)
+            return kept[law.axes]
+
+        return found
 
     def phase_margins(self, law: ServoLaw) -> FloatArray:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""

@@ -19,7 +19,7 @@ from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
 from ...plant.axes import DrivenAxes, complex_gain, elastic, real_gain
 from .controller_elements import Integrator, LowPass, Notch, Pid
-from .law import Law
+from .law import Law, tustin_s
 
 #: a mass line whose lead is wide: where a mode lies just above the bandwidth, its notch takes phase
 WIDE = "mass, wide lead"
@@ -152,6 +152,8 @@ def widened(lines: Sequence[str]) -> tuple[str, ...]:
 TARGET = 2.0
 #: notches that are placed at most, modes that are tried for each, and the least gain of one
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
+#: points where |S| is at least this fraction of its peak are judged first for a further notch
+_HIGH = 0.5
 #: loops of this number of plants are kept: their designs at other bandwidths begin with them
 _KEPT = 8
 #: loop gain at a resonance below which a notch there serves nothing
@@ -175,6 +177,13 @@ class ServoLaw(NamedTuple):
             axes=tuple(replace(axis, notches=(*axis.notches, freq)) for axis in self.axes)
         )
 
+    def changed_by(self, centre: float, freq: FloatArray) -> ComplexArray:
+        """Return the factors (n_freq, r) by which a further notch changes the responses."""
+        bandwidths = np.array([axis.bandwidth for axis in self.axes])
+        section = Notch(centre, _DEPTH, _WIDTH).section
+        gain = section.gain(tustin_s(np.append(freq, bandwidths), self.axes[0].rate))
+        return np.asarray(gain[: freq.size, None] / np.abs(gain[freq.size :]))
+
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the responses (n_freq, r) of the laws."""
         return np.stack([axis.law.at(freq) for axis in self.axes], axis=-1)
@@ -195,31 +204,52 @@ class ServoLoop:
     modes: FloatArray
     plant: StandardPlant
 
-    def gain(self, law: ServoLaw) -> ComplexArray:
-        """Return the loop of a law (n_freq, nu, nu) on the grid, broken at u."""
-        act = -law.driven.T * law.at(self.freq)[:, None, :]
+    def gain(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> ComplexArray:
+        """Return the loop (k, nu, nu), broken at u, at some points, of laws by their responses."""
+        act = -T * at[some, None, :]
         if self.own is not None:
-            act = inverted(act @ self.own) @ act
-        return np.asarray(act @ self.moved)
+            act = inverted(act @ self.own[some]) @ act
+        return np.asarray(act @ self.moved[some])
+
+    @cached_property
+    def _mixed(self) -> bool:
+        return len({self.plant.units.get(name) for name in self.plant.u}) > 1
+
+    def _sizes(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> FloatArray:
+        """Return sigma_max(S_u) at some points; of an unstable loop too, so check that."""
+        return largest_sensitivity(self.gain(T, at, some), self._mixed)
 
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
-        # of an unstable loop too, so check that
-        mixed = len({self.plant.units.get(name) for name in self.plant.u}) > 1
-        size = largest_sensitivity(self.gain(law), mixed)
+        size = self._sizes(law.driven.T, law.at(self.freq))
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
-    def _near(self, T: FloatArray) -> FloatArray:
-        """Return the size of T E near each mode (n_freq, k), and 0 elsewhere."""
-        near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
-        through = self.moved if self.own is None else self.moved + self.own
-        return np.asarray(near * np.linalg.norm(T @ through, axis=(1, 2))[:, None])
+    def _best_notch(
+        self, law: ServoLaw, at: ComplexArray, size: FloatArray, centres: Sequence[float]
+    ) -> tuple[int, ComplexArray, FloatArray]:
+        """Return which further notch gives the lowest peak, its responses and its |S|."""
+        T, high = law.driven.T, np.flatnonzero(size >= _HIGH * size.max())
+        tried = [at * law.changed_by(freq, self.freq) for freq in centres]
+        least = np.array([self._sizes(T, one, high).max() for one in tried])
+        best, lower = 0, np.full(1, np.inf)
+        for i in np.argsort(least, kind="stable").tolist():
+            if least[i] < lower.max():  # else too high already where the loop is high without it
+                found = self._sizes(T, tried[i])
+                best, lower = (i, found) if found.max() < lower.max() else (best, lower)
+        return best, tried[best], lower
 
-    def resonant(self, law: ServoLaw) -> FloatArray:
+    @cached_property
+    def _near(self) -> list[slice]:
+        """The points of the grid near each mode."""
+        ends = np.searchsorted(self.freq, [0.98 * self.modes, 1.02 * self.modes])
+        return [slice(*pair) for pair in ends.T.tolist()]
+
+    def resonant(self, law: ServoLaw, at: ComplexArray) -> FloatArray:
         """Return the modes [Hz] above the bandwidth with loop gain, the largest first."""
-        gain = np.abs(law.at(self.freq)).max(axis=1)
-        peaks = np.max(gain[:, None] * self._near(law.driven.T), axis=0, initial=0.0)
+        through = self.moved if self.own is None else self.moved + self.own
+        size = np.abs(at).max(axis=1) * np.linalg.norm(law.driven.T @ through, axis=(1, 2))
+        peaks = np.array([size[near].max(initial=0.0) for near in self._near])
         # below the bandwidths a notch would take the gain that suppresses the error
         peaks[self.modes < law.driven.freq.min()] = 0.0
         order = np.argsort(-peaks, kind="stable")
@@ -228,19 +258,20 @@ class ServoLoop:
     def notched(self, law: ServoLaw, stable: Callable[[ServoLaw], bool]) -> ServoLaw:
         """Return the law with notches at the modes where they bring |S| at u down."""
         # while |S| is above 6 dB or the loop unstable: the one of the largest that lowers it most
-        peak = self.peak(law)[0]
+        at = law.at(self.freq)
+        size = self._sizes(law.driven.T, at)
         for _ in range(_NOTCHES):
+            peak = size.max()
             if peak <= TARGET and stable(law):
                 break
-            left = [f for f in self.resonant(law).tolist() if f not in law.notches][:_TRIED]
-            tried = [law.notched(freq) for freq in left]
-            if not tried:
+            left = [f for f in self.resonant(law, at).tolist() if f not in law.notches]
+            if not left:
                 break
-            peaks = [self.peak(one)[0] for one in tried]
-            best = 0 if peak <= TARGET else int(np.argmin(peaks))
-            if TARGET < peak < peaks[best] / _GAIN and stable(law):
+            tried = left[:_TRIED] if peak > TARGET else left[:1]
+            best, after, lower = self._best_notch(law, at, size, tried)
+            if TARGET < peak < lower.max() / _GAIN and stable(law):
                 break
-            law, peak = tried[best], peaks[best]
+            law, at, size = law.notched(tried[best]), after, lower
         return law
 
 
