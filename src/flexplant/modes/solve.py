@@ -26,6 +26,7 @@ from ..sparse.symmetric import (
     dense,
     diagonal,
     rounding_of,
+    width_of,
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
@@ -281,7 +282,7 @@ def _undamped(
     omega = omega[signed_square(omega) <= top]
     shapes = np.empty((n, r + omega.size))
     shapes[:, :r] = rigid
-    for at in column_groups(omega.size):
+    for at in column_groups(omega.size, width_of(n)):
         shapes[:, r + at.start : r + at.stop] = signed(phi[:, at])
     return np.concatenate([np.zeros(r), omega]), shapes, certificate
 
@@ -375,29 +376,35 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
     size_of_K, stiff = Absolute(K), diagonal(model.K)
     # scaled by stiffness, so that displacements compare with rotations and DOFs without inertia
     # weigh the same
-    weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
+    weight = 1 / np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0)
     rows = size_of_K @ np.ones((stiff.size, 1))
     gram = np.eye(omega.size)
     size, limit, left, rounding = np.zeros((4, omega.size))
     elastic = omega != 0
-    for at in column_groups(omega.size):
+    for at in column_groups(omega.size, width_of(stiff.size)):
         part = np.ascontiguousarray(phi[:, at])
         mass, force, moved = M @ part, K @ part, np.abs(part)
         gram[at.start :, at] = phi[:, at.start :].T @ mass
         whole = size_of_K @ moved
-        rounding[at] = _EPS * np.sum(moved * whole, axis=0)
+        rounding[at] = _EPS * np.einsum("ij,ij->j", moved, whole)
         # an entry of a shape has the rounding error of the largest entries, which stiff springs
         # multiply
         whole += rows * (_ENTRY * moved.max(axis=0))
-        inertia = np.linalg.norm(weight * mass, axis=0) * omega[at] ** 2
-        limit[at] = _RESIDUAL[0] * inertia + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
-        residual = force - mass * signed_square(omega[at])
-        size[at] = np.linalg.norm(weight * residual, axis=0)
-        scale = np.where(elastic[at], np.linalg.norm(force, axis=0), np.inf)
-        left[at] = np.linalg.norm(residual, axis=0) / scale
+        limit[at] = _RESIDUAL[0] * _lengths(mass, weight) * omega[at] ** 2
+        limit[at] += _RESIDUAL[1] * _lengths(whole, weight)
+        scale = np.where(elastic[at], _lengths(force), np.inf)
+        mass *= signed_square(omega[at])
+        force -= mass
+        size[at], left[at] = _lengths(force, weight), _lengths(force) / scale
     rounding[elastic] /= 2 * omega[elastic] ** 2
     rounding[~elastic] = 0.0
     return gram, size, limit, left, rounding
+
+
+def _lengths(columns: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+    """Return the lengths of columns whose squared entries have weights."""
+    one = np.ones(len(columns)) if weight is None else weight
+    return np.asarray(np.sqrt(np.einsum("i,ij,ij->j", one, columns, columns)))
 
 
 def rigid_residual(model: FEModel) -> float:

@@ -21,7 +21,7 @@ SPREAD = SPLIT
 _END = 1e-3
 #: number of rows processed together
 _ROWS = 65536
-#: number of shapes multiplied together, which limits the peak memory
+#: least number of shapes multiplied together: all shapes of a large model would fill the memory
 _COLUMNS = 16
 #: relative error of an entry in double precision
 PRECISION = float(np.finfo(np.float64).eps)
@@ -137,10 +137,15 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
     # this is the change of an eigenvalue when the entries of K are rounded to double precision; no
     # method can find it more accurately
     size_of_K, found = Absolute(K), np.zeros(phi.shape[1])
-    for at in column_groups(phi.shape[1]):
+    for at in column_groups(phi.shape[1], width_of(len(phi))):
         size = np.abs(phi[:, at])
         found[at] = PRECISION * np.einsum("ij,ij->j", size, size_of_K @ size)
     return found
+
+
+def width_of(rows: int) -> int:
+    """Return how many shapes of a number of rows are multiplied at a time."""
+    return max(_COLUMNS, _ROWS // max(rows, 1))
 
 
 def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
@@ -182,7 +187,7 @@ def mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
 
 def _eigh(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     stiffness, mass = np.zeros((2, X.shape[1], X.shape[1]))
-    for at in column_groups(X.shape[1]):
+    for at in column_groups(X.shape[1], width_of(len(X))):
         part, later = np.ascontiguousarray(X[:, at]), X[:, at.start :].T
         # lower triangles
         stiffness[at.start :, at] = later @ (K @ part)

@@ -286,26 +286,19 @@ def elastic_modes(
         ) from error
     if kept <= 0:
         return np.zeros(0), np.zeros((n, 0))
-    # q = reach^T y turns M into the identity
-    reach = la.solve_triangular(lower, np.diag(scale), lower=True)
-    stiffness = reach @ K @ reach.T
-    largest = float(np.abs(stiffness).max())
-    elastic: FloatArray = np.eye(n)
-    if r:
-        elastic = np.asarray(la.qr(lower.T @ (rigid / scale[:, None]))[0][:, r:], dtype=np.float64)
-        stiffness = elastic.T @ stiffness @ elastic
-    stiffness = 0.5 * (stiffness + stiffness.T)
+    basis = _Unit(lower, scale, rigid)
+    stiffness = basis.stiffness(K)
     # the lowest few alone are faster; divide and conquer gives all of them
     few = kept <= (n - r) // 4
     squares, vectors = la.eigh(
         stiffness, subset_by_index=(0, kept - 1) if few else None, driver="evr" if few else "evd"
     )
-    if squares.size > 1 and squares[0] < _DIRECT * largest:
+    if squares.size > 1 and squares[0] < _DIRECT * basis.largest:
         if few:  # all of them, so that the space of the soft ones is accurate
             squares, vectors = la.eigh(stiffness, driver="evd")
-        squares, phi = _improved(M, K, rigid, squares, reach.T @ (elastic @ vectors))
+        squares, phi = _improved(M, K, rigid, squares, basis.shapes(vectors))
     else:
-        phi = reach.T @ (elastic @ vectors)
+        phi = basis.shapes(vectors)
     squares, phi = squares[:kept], phi[:, :kept]
     unstable = squares < 0
     if np.any(unstable) and motions is not None:
@@ -315,6 +308,47 @@ def elastic_modes(
     expected = 0 if motions is None else motions().shape[1]
     check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs, unstable, expected)
     return signed_root(squares), signed(phi)
+
+
+class _Unit:
+    """Coordinates y in which M is the identity and rigid-body motions are the first entries.
+
+    ``q = S L^-T H y``: S M S = L L', and H is a product of one reflector for each motion.
+    """
+
+    def __init__(self, lower: FloatArray, scale: FloatArray, rigid: FloatArray) -> None:
+        self.lower, self.scale = lower, scale
+        self.reflectors, self.tau, *_ = la.lapack.dgeqrf(lower.T @ (rigid / scale[:, None]))
+        self.largest = 0.0
+
+    def _reflected(self, side: str, trans: str, matrix: FloatArray) -> FloatArray:
+        """Return H matrix, H' matrix ("L") or matrix H ("R")."""
+        if not self.tau.size:
+            return matrix
+        given, work = np.asfortranarray(matrix), 64 * max(matrix.shape)
+        la.lapack.dormqr(side, trans, self.reflectors, self.tau, given, work, overwrite_c=1)
+        return given
+
+    def stiffness(self, K: FloatArray) -> FloatArray:
+        """Return the stiffness of elastic motions, and remember the largest entry of all."""
+        scaled = np.asfortranarray(self.scale[:, None] * K)
+        scaled *= self.scale
+        whole = la.lapack.dsygst(scaled, self.lower, lower=1, overwrite_a=1)[0]
+        np.copyto(whole, whole.T, where=~np.tri(len(K), dtype=bool))
+        self.largest = float(max(whole.max(), -whole.min()))
+        r = self.tau.size
+        found = self._reflected("R", "N", self._reflected("L", "T", whole))
+        return np.asarray(found[r:, r:])
+
+    def shapes(self, vectors: FloatArray) -> FloatArray:
+        """Return the motions of all DOFs that elastic vectors stand for."""
+        y = np.zeros((len(self.scale), vectors.shape[1]), order="F")
+        y[self.tau.size :] = vectors
+        found = la.solve_triangular(
+            self.lower, self._reflected("L", "N", y), lower=True, trans="T", overwrite_b=True
+        )
+        found *= self.scale[:, None]
+        return np.asarray(found)
 
 
 def has_negative_springs(model: Any) -> bool:
