@@ -6,6 +6,7 @@ and linear algebra runs on one thread while items are computed (its rounding dep
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections import deque
@@ -310,6 +311,61 @@ _TELLS = 0.05
 _open = threading.local()
 
 
+class _Watcher:
+    """One thread that shows all work under way; it ends when there is no more work."""
+
+    # starting a thread for each work would take 150 us, more than a small problem itself
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as in a process that was forked: the thread is not in it."""
+        self._wake, self._thread = threading.Condition(), threading.Thread()
+        #: when the next step of showing a work is due, and the steps, each of which gives a pause
+        self._due: dict[Progress, tuple[float, Iterator[float]]] = {}
+        self._until = 0.0
+
+    def begin(self, work: Progress, steps: Iterator[float]) -> None:
+        """Show a work, step by step, from the first pause on."""
+        with self._wake:
+            due = monotonic() + next(steps)
+            self._due[work] = due, steps
+            if not self._thread.is_alive():
+                self._thread = threading.Thread(target=self._run, daemon=True)
+                self._thread.start()
+            elif due < self._until:
+                self._wake.notify()
+
+    def end(self, work: Progress) -> None:
+        """Show no more of a work; a step that is under way is finished."""
+        with self._wake:
+            self._due.pop(work, None)
+
+    def _run(self) -> None:
+        idle = False
+        with self._wake:
+            while self._due or not idle:
+                idle, now = not self._due, monotonic()
+                for work, (due, steps) in list(self._due.items()):
+                    pause = due - now if due > now else None
+                    if pause is None:
+                        with suppress(OSError, ValueError):  # a closed stream
+                            pause = next(steps, None)
+                    if pause is None:
+                        self._due.pop(work, None)
+                    else:
+                        self._due[work] = now + pause, steps
+                dues = [due for due, _ in self._due.values()]
+                self._until = min(dues, default=now + BAR_DELAY)
+                self._wake.wait(self._until - now)
+            self._thread = threading.Thread()
+
+
+_watcher = _Watcher()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_watcher.forget)
+
+
 class Progress:
     """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
 
@@ -339,7 +395,6 @@ class Progress:
         #: seconds in all that were last promised, 0 before; and whether advice was given
         self._promised, self._advised = 0.0, not advice
         self.description, self.advice = description, advice
-        self._over = threading.Event()
         if not (progress is None or isinstance(progress, bool | np.bool_)):
             raise ModelError(
                 f"progress must be True, False or None, got {progress!r:.60}. Leave it out: then "
@@ -350,7 +405,6 @@ class Progress:
         outermost = progress is None and not _open_bars()
         self._stream = watched() if outermost else None
         self._unseen = outermost and self._stream is None and sys.stderr is not None
-        self._thread: threading.Thread | None = None
         if progress or self._stream is not None:
             from tqdm import tqdm
 
@@ -367,10 +421,8 @@ class Progress:
         try:
             _open_bars().append(self)
             if (self.bar is not None and not self._forced) or self._unseen:
-                work = self._said if self._unseen else self._shown
-                self._thread = threading.Thread(target=work, daemon=True)
-                self._thread.start()
-        except BaseException:  # Ctrl-C while the thread starts: nothing would close it
+                _watcher.begin(self, self._said() if self._unseen else self._shown())
+        except BaseException:  # Ctrl-C while a thread starts: nothing would close it
             self._close()
             raise
         return self
@@ -384,13 +436,11 @@ class Progress:
 
     def _close(self) -> None:
         """End what shows the work; again where that was interrupted."""
-        self._over.set()
+        _watcher.end(self)
         if self in _open_bars():
             _open_bars().remove(self)
         if self.bar is not None:
             self.bar.close()
-        elif self._thread is not None and self._thread.ident is not None:
-            self._thread.join()
 
     def advance(self, items: int = 1, *, known: bool = False) -> None:
         """Count some items as done; `known` ones took no time, as those of a checkpoint."""
@@ -421,20 +471,21 @@ class Progress:
         else:
             self._write(f"{some} {_rounded(seconds)} s expected", seconds)
 
-    def _shown(self) -> None:
-        """Draw the bar while the first item, or any later one, takes its time."""
-        wait = BAR_DELAY
-        while not self._over.wait(wait):
+    def _shown(self) -> Iterator[float]:
+        """Draw the bar while the first item, or any later one, takes its time; yield pauses [s]."""
+        yield BAR_DELAY
+        while True:
             left = self._left()
             if not self._advised and left > LONG:
                 self._write(f"some {left:.0f} s more", left)
             self.bar.refresh()
-            wait = _AGAIN
+            yield _AGAIN
 
-    def _said(self) -> None:
-        """Say what runs, how long it will take, and again where that proves wrong."""
-        wait, said = BAR_DELAY, False
-        while not self._over.wait(wait):
+    def _said(self) -> Iterator[float]:
+        """Say what runs, how long it will take, and again where that proves wrong; yield pauses."""
+        yield BAR_DELAY
+        said = False
+        while True:
             left, spent = self._left(), self.elapsed
             total, known = spent + left, self._promised
             if known and left and not known / _OFF - BAR_DELAY < total < _OFF * known:
@@ -445,7 +496,8 @@ class Progress:
                 self._write(f"{spent:.0f} s{more}", np.inf)
             elif not known and (left or not said):
                 self._say(left)
-            wait, said = min(BAR_DELAY, _AGAIN), True
+            said = True
+            yield min(BAR_DELAY, _AGAIN)
 
     def _left(self) -> float:
         """Return the seconds that what is not done will take, by what is; 0 where unknown."""
