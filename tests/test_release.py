@@ -29,7 +29,6 @@ LICENCES = {
     "h5py": "BSD",
     "pyuff": "MIT",
     "ansys-mapdl-reader": "MIT",
-    "mkl": "Intel",
     "pdoc": "MIT-0|Public Domain",
     "latex2mathml": "MIT",
     "panel": "BSD",

@@ -178,13 +178,14 @@ faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_p
 | ``placement.KineticEnergy``, ``AutoMac``, indices | `placement.ModeInformation`, `PoiVariance` |
 | ``placement.Mirrored``, ``placement.Penalised`` | a `placement.Constraint` of yours |
 | ``plot.PolePicker``, ``plot.animate_mode`` | `plot.stabilisation`, `plot.mode_shape` |
+| ``sparse.Pardiso`` | gone: the library's own factor was faster on solids; `sparse.Cholmod` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy
 (MIT), matplotlib (its own, of BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e
 '.[ansys]'``: ``hdf5`` is h5py and ``workbench`` panel (BSD-3), ``uff`` pyuff and ``ansys``
-ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc (MIT-0) and latex2mathml (MIT). Their
+ansys-mapdl-reader (MIT), ``docs`` pdoc (MIT-0) and latex2mathml (MIT). Their
 own dependencies have similar licences. slycot (GPL-2) and other peers are used in tests only.
 Sources are cited by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its text
 says 0.1 % modal damping while its printed eigenvalues have 1 %; `examples/paper_plate.py` shows

@@ -1,7 +1,6 @@
 """One measurement in a process of its own: 24 modes of a mesh by one method, as one JSON line.
 
-python modes_peers.py plate 181 METHOD: ours, ours_on_pardiso, ours_on_cholmod, default, superlu,
-pardiso or cholmod.
+python modes_peers.py plate 181 METHOD: ours, ours_on_cholmod, default, superlu or cholmod.
 """
 
 import json
@@ -81,17 +80,12 @@ def superlu(A):
     ).solve
 
 
-def pardiso(A):
-    """MKL PARDISO, where MKL is installed (or MKLROOT tells where it is)."""
-    return fx.sparse.Pardiso().factored(A).solve
-
-
 def cholmod(A):
     """CHOLMOD, where scikit-sparse is installed."""
     return fx.sparse.Cholmod().factored(A).solve
 
 
-FACTORS = {"ours_on_pardiso": fx.sparse.Pardiso(), "ours_on_cholmod": fx.sparse.Cholmod()}
+FACTORS = {"ours_on_cholmod": fx.sparse.Cholmod()}
 
 
 def main(kind, n, method):

@@ -120,7 +120,6 @@ def made():
     solution = fx.lti.filter_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
     yield from (fe, modes, rom, fx.DesiredDofs(rom.dofs.labels), select_dofs(modes, 25))
     yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
-    yield fx.sparse.Pardiso()
     yield fx.sparse.Cholmod()
     law = fx.ModalDamping(0.01)
     yield fx.frequency_response(fe, ports(), [50.0, 80.0], damping=law, checks=1)

@@ -45,7 +45,7 @@ def proved_peak(model: Residues, tolerance: float) -> tuple[float, float] | None
     if model.through.shape[0] < model.through.shape[1]:
         model = model.transposed
     start = np.concatenate([[0.0], model.resonances])
-    size = np.linalg.norm(model.series(start, 0)[0], axis=(1, 2))
+    size = _frobenius(model.series(start, 0)[0])
     best = np.argsort(size)[: -PEAKS - 1 : -1]
     start = start[best[size[best] >= PART * size[best[0]]]]
     for _ in range(STEPS):
@@ -127,20 +127,20 @@ def _zone_radii(
     # with G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors of T_0: t - G*G is positive
     # definite when the Schur complement of the block of its largest eigenvalue is, for which bounds
     # of the others suffice
-    t0, t1, t2 = (np.linalg.norm(T, axis=(1, 2))[:, None] for T in one.T)
+    t0, t1, t2 = (_frobenius(T)[:, None] for T in one.T)
     r = near[:, None] * ZONES  # (n_omega, n_zones)
     beta = model.rest(np.repeat(omega, ZONES.size), r.reshape(-1), 2).reshape(r.shape)
     whole = t0 + t1 * r + t2 * r**2
     cubic = 2 * t1 * t2 + t2**2 * r + 2 * beta * whole + beta**2 * r**3
     top, first = one.values[:, :1], one.together
-    size1, size2 = (np.linalg.norm(A, axis=(1, 2))[:, None] for A in (one.A1, one.A2))
+    size1, size2 = (_frobenius(A)[:, None] for A in (one.A1, one.A2))
     spread = size1 * r + size2 * r**2 + cubic * r**3
     gaps = np.where(first[:, None], np.inf, (top - one.values)[:, None] - spread[:, :, None])
     along1, along2 = (np.linalg.norm(A * first[:, None], axis=2)[:, None] for A in (one.A1, one.A2))
     along = along1 + along2 * r[:, :, None] + (cubic * r**2)[:, :, None]
     pull = np.sum(along**2 / divisor(gaps), axis=2)
     block = first[:, :, None] & first[:, None]
-    slope = np.linalg.norm(one.A1 * block, axis=(1, 2))[:, None]
+    slope = _frobenius(one.A1 * block)[:, None]
     others = np.eye(first.shape[1]) * np.where(first, 0.0, -2.0 * size2)[:, None]
     bend = np.linalg.eigvalsh(one.A2 * block + others)[:, -1:]
     fall = -(bend + cubic * r + pull)
@@ -200,13 +200,29 @@ def _examined(
         return centre, np.zeros(0, dtype=bool)
     T0, T1, T2 = model.series(centre, 2)
     r = radius[:, None, None]
-    rest = radius**2 * np.linalg.norm(T2, axis=(1, 2)) + radius**3 * model.rest(centre, radius, 2)
+    rest = radius**2 * _frobenius(T2) + radius**3 * model.rest(centre, radius, 2)
     ends = np.stack([T0 + r * T1, T0 - r * T1])
-    bound = np.linalg.norm(ends, axis=(2, 3)).max(axis=0) + rest
+    bound = _frobenius(ends).max(axis=0) + rest
     unsure = np.flatnonzero((bound > level) & (rest < level))
-    bound[unsure] = _largest(ends[:, unsure]).max(axis=0) + rest[unsure]
-    unsure = unsure[bound[unsure] > level]
+    for size in (_largest_at_most, _largest):
+        bound[unsure] = size(ends[:, unsure]).max(axis=0) + rest[unsure]
+        unsure = unsure[bound[unsure] > level]
     return centre[unsure[_largest(T0[unsure]) > level]], bound <= level
+
+
+def _frobenius(X: ComplexArray) -> FloatArray:
+    """Return the Frobenius norm of each of a stack of matrices."""
+    *stack, p, m = X.shape
+    parts = np.ascontiguousarray(X).reshape(*stack, p * m).view(np.float64)
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", parts, parts)))
+
+
+def _largest_at_most(X: ComplexArray) -> FloatArray:
+    """Return an upper bound of `_largest`: the root of the sum of its powers of 8."""
+    unit = divisor(_frobenius(X))
+    scaled = X / unit[..., None, None]
+    square = scaled.conj().swapaxes(-1, -2) @ scaled
+    return np.asarray(unit * _frobenius(square @ square) ** 0.25)
 
 
 def _largest(X: ComplexArray) -> FloatArray:

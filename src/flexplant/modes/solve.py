@@ -17,7 +17,7 @@ from ..labels import Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.lowest import STEPS
-from ..sparse.other_factors import Cholmod, Pardiso
+from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import (
     Absolute,
     beyond,
@@ -61,7 +61,7 @@ def solve_modes(
     damping: Damping | None = None,
     compliance_at: Place | Iterable[Place] = (),
     compliance_damping: Damping | float | None = None,
-    factor: Pardiso | Cholmod | None = None,
+    factor: Cholmod | None = None,
     progress: bool | None = None,
 ) -> Modes:
     """Return the lowest modes of a structure, mass-normalised, rigid-body modes exactly at 0.
@@ -82,7 +82,7 @@ def solve_modes(
         modes is kept, by residual attachment vectors.
     compliance_damping : Damping or float, optional
         Damping of the attachment vectors; None: damped like the modes.
-    factor : Pardiso or Cholmod, optional
+    factor : Cholmod, optional
         Solver of a large sparse model in place of the library's own.
     progress : bool, optional
         Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
@@ -134,7 +134,7 @@ def solve_modes(
     if damping is not None:
         instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
     if factor is not None:
-        instance(factor, Pardiso | Cholmod, "factor", "Leave it out for the library's own factor.")
+        instance(factor, Cholmod, "factor", "Leave it out for the library's own factor.")
     kept, top = _mode_request(model, count, below)
     at = places(compliance_at)
     if at and model.n_unstable:
@@ -256,7 +256,7 @@ def _vector_zeta(
 
 
 def _undamped(
-    model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
+    model: FEModel, count: int, top: float, method: Cholmod | None
 ) -> tuple[FloatArray, FloatArray, Certificate]:
     rigid = model.rigid_body
     n, r = rigid.shape
@@ -307,7 +307,7 @@ def _coupled_modes(
     count: int,
     top: float,
     names: tuple[str, ...],
-    factor: Pardiso | Cholmod | None,
+    factor: Cholmod | None,
 ) -> Modes:
     if names:
         raise ModelError(
@@ -428,7 +428,7 @@ def wider(count: int, top: float, n: int) -> tuple[int, float]:
 
 
 def damped_modes(
-    model: FEModel, phi: FloatArray, count: int, top: float, method: Pardiso | Cholmod | None
+    model: FEModel, phi: FloatArray, count: int, top: float, method: Cholmod | None
 ) -> Modes:
     """Return the complex modes of a large model, from a basis that grows until they converge."""
     # Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of

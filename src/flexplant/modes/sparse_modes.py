@@ -15,7 +15,7 @@ from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
 from ..seeds import Rng
 from ..sparse.lowest import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
-from ..sparse.other_factors import Cholmod, Pardiso
+from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid, check_stiffness
 from ..structure.model import FEModel
@@ -55,7 +55,7 @@ _JUDGED = 8
 
 @one_thread()
 def counted_modes(
-    model: FEModel, count: int, top: float = np.inf, method: Pardiso | Cholmod | None = None
+    model: FEModel, count: int, top: float = np.inf, method: Cholmod | None = None
 ) -> tuple[FloatArray, FloatArray, Certificate]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
     # Lanczos finds them and a Sturm count in a gap above gives their number; missing modes are

@@ -16,7 +16,7 @@ from ..labels import DofSet, Place
 from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
 from ..sparse.lowest import multifrontal_inertia, signed_factor
 from ..sparse.ordering import Dissection, dissect
-from ..sparse.other_factors import Cholmod, CholmodCholesky, Pardiso, PardisoCholesky
+from ..sparse.other_factors import Cholmod, CholmodCholesky
 from ..sparse.symmetric import dense, diagonal, rounding_of, same_pattern
 from ..structure import FEModel
 from ..structure.definite import signed, unstable_stiffness
@@ -42,7 +42,7 @@ class StiffnessFactor:
     """
 
     def __init__(
-        self, model: FEModel, method: Pardiso | Cholmod | None = None, *, single: bool = False
+        self, model: FEModel, method: Cholmod | None = None, *, single: bool = False
     ) -> None:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
@@ -57,7 +57,7 @@ class StiffnessFactor:
         shifted = _shift_matrix(self.K, self.M, self.sigma)
         self.dissection = dissection_of(model)
         try:
-            self._cholesky: MultifrontalFactor | PardisoCholesky | CholmodCholesky = (
+            self._cholesky: MultifrontalFactor | CholmodCholesky = (
                 MultifrontalFactor(shifted, self.dissection, single=single)
                 if method is None
                 else method.factored(shifted)
@@ -150,7 +150,7 @@ def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
     return None if signed is None else CountingFactor(signed, square)
 
 
-def stiffness_factor(model: FEModel, method: Pardiso | Cholmod | None = None) -> StiffnessFactor:
+def stiffness_factor(model: FEModel, method: Cholmod | None = None) -> StiffnessFactor:
     """Return the factor of a sparse model, the same one as long as it is in use."""
     known = _held.get(model)
     factor = known() if known is not None else None
@@ -171,7 +171,7 @@ def held_factor(model: FEModel) -> StiffnessFactor | None:
     return stiffness_factor(model) if is_large(model) else None
 
 
-def search_factor(model: FEModel, method: Pardiso | Cholmod | None = None) -> StiffnessFactor:
+def search_factor(model: FEModel, method: Cholmod | None = None) -> StiffnessFactor:
     """Return a factor to search modes with: the one in use, or one in single precision."""
     known, order = _held.get(model), dissection_of(model)
     unused = known is None or known() is None

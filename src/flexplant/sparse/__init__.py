@@ -1,4 +1,4 @@
-"""Symmetric sparse factors: orderings, Cholesky, LDL', PARDISO, CHOLMOD.
+"""Symmetric sparse factors: orderings, Cholesky, LDL', CHOLMOD.
 
 Large models are solved by a multifrontal factor in NumPy, without a compiler: nested dissection
 orders the unknowns, and the work is done in dense blocks. It is used by `fx.solve_modes` and by
@@ -12,9 +12,8 @@ frequency responses of structures, and needs no separate call. Another solver ca
 >>> fx.solve_modes(plate, count=6).freq.round(1)
 array([  0. ,   0. ,   0. , 271.8, 293. , 628.6])
 
-``fx.solve_modes(model, count=24, factor=fx.sparse.Pardiso())`` takes that of Intel's library
-(extra ``mkl``), ``factor=fx.sparse.Cholmod()`` that of SuiteSparse (scikit-sparse). Names
-elsewhere: ``scipy.sparse.linalg.splu``, MUMPS.
+``fx.solve_modes(model, count=24, factor=fx.sparse.Cholmod())`` takes that of SuiteSparse
+(scikit-sparse). Names elsewhere: ``scipy.sparse.linalg.splu``, MUMPS.
 
 **Memory.** On a virtual machine, memory that a process gives back and takes again costs time. The
 C library keeps it with
@@ -26,6 +25,5 @@ with AVX-512, it took 66 s.
 
 from ..rooms import public_names as _public_names
 from .other_factors import Cholmod as Cholmod
-from .other_factors import Pardiso as Pardiso
 
 __dir__ = _public_names(__name__)
