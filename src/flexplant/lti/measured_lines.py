@@ -256,32 +256,44 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
     level = plant * (freq**slope)[:, None, None]
     first = np.clip(i - 2, 0, n - FEWEST)
     h = np.array([freq[first + j] - middle for j in range(FEWEST)])
+    is_single = level[0].size == 1
+    if is_single:  # a factor on the plant moves no pole
+        single = _three_fits(h, level[first + np.arange(FEWEST)[:, None], 0, 0])
     poles, moves, others = [], [], []
     for base in (0, 1):
         at = freq[i + base]
         weight = SK[i + base] / (at**slope)[:, None, None]
-        g = np.array([np.einsum("fuy,fyu->f", weight, level[first + j]) for j in range(FEWEST)])
         ends = [np.einsum("fuy,fyu->f", weight, level[i + end]) for end in (0, 1)]
-        fits = [pole_between(h[j : j + LINES], g[j : j + LINES]) for j in range(FEWEST - LINES + 1)]
-        for p, rho, _ in fits:
-            near = np.clip(p.real, -0.5 * wide, 0.5 * wide)
-            left, right = (ends[k] - rho / ((k - 0.5) * wide - p) for k in (0, 1))
-            moved = (at / (middle + near)) ** slope
-            beside = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
-            poles.append(p)
-            moves.append(moved * rho / beside)
-            # rho of another mode in the middle, if one fit shows more
-            others += [
-                np.abs(p - q) * tail / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside))
-                for q, _, tail in fits
-            ]
-    return _hidden_modes(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
+        if is_single:
+            p, rho, tail = single[0], weight[:, 0, 0] * single[1], abs(weight[:, 0, 0]) * single[2]
+        else:
+            g = [np.einsum("fuy,fyu->f", weight, level[first + j]) for j in range(FEWEST)]
+            p, rho, tail = _three_fits(h, np.array(g))
+        near = np.clip(p.real, -0.5 * wide, 0.5 * wide)
+        left, right = (ends[k] - rho / ((k - 0.5) * wide - p) for k in (0, 1))
+        moved = (at / (middle + near)) ** slope
+        beside = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
+        poles.append(p)
+        moves.append(moved * rho / beside)
+        # rho of another mode in the middle, if one fit shows more
+        more = np.max(np.abs(p[:, None] - p) * tail, axis=1)
+        others.append(more / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside)))
+    found = (np.concatenate(parts) for parts in (poles, moves, others))
+    return _hidden_modes(freq, F, *found)
+
+
+def _three_fits(h: FloatArray, g: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return `pole_between` of the first four, the middle and the last four of some lines."""
+    parts = [slice(j, j + LINES) for j in range(FEWEST - LINES + 1)]
+    p, rho, tail = zip(*(pole_between(h[some], g[some]) for some in parts), strict=True)
+    return np.array(p), np.array(rho), np.array(tail)
 
 
 def _hidden_modes(
-    freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, other: FloatArray
+    freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, others: FloatArray
 ) -> HiddenModes:
     """Return results of fits (k, n - 1): poles p from the middle of each interval, and shifts d."""
+    other = others.max(axis=0)
     wide, middle = np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
     step, least = np.angle(F[1:] / F[:-1]), _LEAST * middle
     acts = (np.abs(p.real) <= (0.5 + _ASIDE) * wide) & (np.abs(d) > least)
