@@ -320,16 +320,14 @@ class _Watcher:
 
     def forget(self) -> None:
         """Begin anew, as in a process that was forked: the thread is not in it."""
-        self._wake, self._thread = threading.Condition(), threading.Thread()
+        self._wake, self._thread, self._until = threading.Condition(), threading.Thread(), 0.0
         #: when the next step of showing a work is due, and the steps, each of which gives a pause
         self._due: dict[Progress, tuple[float, Iterator[float]]] = {}
-        self._until = 0.0
 
     def begin(self, work: Progress, steps: Iterator[float]) -> None:
         """Show a work, step by step, from the first pause on."""
         with self._wake:
-            due = monotonic() + next(steps)
-            self._due[work] = due, steps
+            self._due[work] = (due := monotonic() + next(steps)), steps
             if not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._run, daemon=True)
                 self._thread.start()
@@ -347,16 +345,12 @@ class _Watcher:
             while self._due or not idle:
                 idle, now = not self._due, monotonic()
                 for work, (due, steps) in list(self._due.items()):
-                    pause = due - now if due > now else None
-                    if pause is None:
+                    if due <= now:
+                        pause = np.inf
                         with suppress(OSError, ValueError):  # a closed stream
-                            pause = next(steps, None)
-                    if pause is None:
-                        self._due.pop(work, None)
-                    else:
+                            pause = next(steps, np.inf)
                         self._due[work] = now + pause, steps
-                dues = [due for due, _ in self._due.values()]
-                self._until = min(dues, default=now + BAR_DELAY)
+                self._until = min(now + _AGAIN, *(due for due, _ in self._due.values()), np.inf)
                 self._wake.wait(self._until - now)
             self._thread = threading.Thread()
 
@@ -400,8 +394,7 @@ class Progress:
                 f"progress must be True, False or None, got {progress!r:.60}. Leave it out: then "
                 "it is shown on a terminal."
             )
-        self._forced = bool(progress)
-        self._total = total
+        self._forced, self._total = bool(progress), total
         outermost = progress is None and not _open_bars()
         self._stream = watched() if outermost else None
         self._unseen = outermost and self._stream is None and sys.stderr is not None
