@@ -135,9 +135,9 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
     }
     servo = fx.design_servo(alone, bandwidth=10.0, observer=static)
     blocks = static, servo, *fx.simulation.reading_along(designs)
-    run = case["machine"].run(ports(force), *blocks, duration=2.5, rng=seed, runs=5)
+    run = case["machine"].run(ports(force), *blocks, duration=3.0, rng=seed, runs=5)
     axes = ("die:z", "die:rx", "die:ry")
-    return {axis: fx.simulation.compare_estimators(designs, run, axis, start=0.5) for axis in axes}
+    return {axis: fx.simulation.compare_estimators(designs, run, axis, start=1.0) for axis in axes}
 
 
 # %% Control: H-infinity without and with uncertainty, and the best servo that stays stable
