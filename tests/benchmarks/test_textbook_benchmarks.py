@@ -4,12 +4,15 @@ Run with ``-m benchmark -s``; TEXTBOOK_SEEDS="100 108" draws other problems of e
 """
 
 import os
+import time
 from collections import Counter
+from itertools import product
 
 import pytest
 
 from flexplant.errors import FlexplantError
-from test_synthesis.test_textbook_plants import KINDS, judged, shaped_loop
+from flexplant.synthesis import Lmi
+from test_synthesis.test_textbook_plants import KINDS, judged, least_h2, shaped_loop
 
 SEEDS = range(*map(int, os.environ.get("TEXTBOOK_SEEDS", "0 8").split()))
 
@@ -33,3 +36,28 @@ def test_textbook_plants(judge, capsys):
         print("\n" + "\n".join(rows))
         print("all: " + ", ".join(f"{count} {name}" for name, count in total.items()))
     assert total["right"] >= 0.99 * sum(total.values())
+
+
+@pytest.mark.benchmark
+def test_linear_matrix_inequalities_are_right_or_refused(capsys):
+    """The smallest gamma of LMIs: never wrong, and each answer or refusal within 10 s of CPU."""
+    found, slowest = Counter(), 0.0
+    for kind, seed in product(KINDS, SEEDS):
+        before = time.process_time()
+        found[word(lambda *which: judged(*which, Lmi()), kind, seed)] += 1
+        slowest = max(slowest, time.process_time() - before)
+    with capsys.disabled():
+        print(f"\nLmi(): {dict(found)}, the slowest in {slowest:.1f} s, its judgement included")
+    assert found.keys() <= {"right", "refused"}
+
+
+@pytest.mark.benchmark
+def test_the_least_h2_norms(capsys):
+    """SciPy's Riccati equations reach no less than `design_h2`, wherever the norm is finite."""
+    found = Counter()
+    for kind, seed in product([kind for kind in KINDS if kind != "sampled"], SEEDS):
+        gamma, norm, best = least_h2(kind, seed)
+        found[abs(norm / gamma - 1.0) < 1e-3 and gamma <= 1.002 * best] += 1
+    with capsys.disabled():
+        print(f"\ndesign_h2: {found[True]} of {sum(found.values())} right")
+    assert not found[False]
