@@ -308,20 +308,8 @@ LATE = {
 }
 
 
-#: the change that a latency of a fraction of a sample makes in the mapped A is left out
-NOT_TO_TWO_PERCENT = pytest.mark.xfail(
-    reason="a tolerance next to a latency is off by some 2 %", strict=False
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "sensors",
-    [
-        pytest.param(given, id=name, marks=[NOT_TO_TWO_PERCENT] * (name == "a latency"))
-        for name, given in LATE.items()
-    ],
-)
+@pytest.mark.parametrize("sensors", LATE.values(), ids=LATE)
 def test_sensors_behind_filters_and_latencies(sensors):
     """Machines that are unstable 1 % off, where 5 % was said to be safe for every mode."""
     model = fx.chain(
