@@ -62,7 +62,9 @@ def test_a_gain_of_zero_written_as_a_number():
 def test_channels_by_number():
     g = fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0], [3.0]], 0)
     assert g[0, 1].inputs == ("u2",) and g[0, 1].outputs == ("y1",)
-    with pytest.raises(LabelError, match=r"no input number 2: the system has 2 \(u1, u2\)"):
+    with pytest.raises(
+        LabelError, match=r"input number 2 does not exist: the system has 2 \(u1, u2\)"
+    ):
         g[0, 2]
     with pytest.raises(LabelError, match=r"by name, number or slice, got 0\.0"):
         g[0.0, 1]

@@ -82,7 +82,7 @@ def test_poles_without_partner_are_refused_or_left_out():
     found = numbered(stranger, modes(), partial=True)
     assert found.modes == (4, 6)
     assert np.allclose(np.diag(found.covariance), [0.5, 1.0, 0.5, 1.0])
-    with pytest.raises(ModelError, match="no mode"):
+    with pytest.raises(ModelError, match="no separate mode"):
         numbered(stranger.select([2]), modes(), partial=True)
 
 

@@ -102,5 +102,5 @@ def test_what_does_not_combine_is_refused():
         np.inf * G
     with pytest.raises(LabelError, match=r"2 inputs. Use frf.select"):
         G["y1", ["u1", "u2"]]
-    with pytest.raises(LabelError, match="no input number 2"):
+    with pytest.raises(LabelError, match="input number 2 does not exist"):
         G[0, 2]

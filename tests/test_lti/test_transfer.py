@@ -136,7 +136,9 @@ def test_channels_by_number_and_slice():
     assert g[0, -1].inputs == ("in2",)
     assert g[[1, "out0"], 1:].outputs == ("out1", "out0")
     assert g[:, "in1"].inputs == ("in1",)
-    with pytest.raises(LabelError, match=r"no output number 2: the system has 2 \(out0, out1\)"):
+    with pytest.raises(
+        LabelError, match=r"output number 2 does not exist: the system has 2 \(out0, out1\)"
+    ):
         _ = g[2, 0]
     with pytest.raises(LabelError, match=r"a channel is a pair"):
         _ = g["out1"]

@@ -462,5 +462,5 @@ def test_refusals():
     with pytest.raises(ModelError, match="residual must be of type ResidualForm"):
         assemble_plant(model(), channels(), residual="fast")
     late = [Sensor("a", at="4:x", quantity="acceleration", latency=1e-5, asd=1e-3)]
-    with pytest.raises(AssumptionError, match=r"'rub' reaches 'a' at once.*roll off"):
+    with pytest.raises(AssumptionError, match=r"'rub' reaches 'a' without delay.*roll off"):
         assemble_plant(model(), channels(y=late)).discretized(5e3)

@@ -245,7 +245,7 @@ def test_frf_shows_what_others_cover_and_differ_by():
     thick, thin, difference = ax.get_lines()
     assert thick.get_linewidth() > 2 * thin.get_linewidth()
     np.testing.assert_allclose(difference.get_ydata(), thick.get_ydata() + 20 * np.log10(0.5))
-    assert texts(ax) == {"one", "two", "two less one"}
+    assert texts(ax) == {"one", "two", "two minus one"}
     other = some_frf().replace(freq=np.geomspace(2.0, 1e3, 50))
     ax = fx.plot.frf({"one": one, "other": other}, "y1", "u1", unit="m/N", reference="one")
     assert len(ax.get_lines()) == 2

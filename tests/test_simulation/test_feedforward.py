@@ -231,7 +231,7 @@ def test_what_cannot_be_fed_forward(model):
     with pytest.raises(ModelError, match="follows from a SetPoint only"):
         fx.simulate(loop, reference=1e-6, duration=0.01)
     third = fx.setpoint(1e-6, velocity=5e-3, acceleration=0.5, jerk=100.0)
-    with pytest.raises(ModelError, match="its snap is impulses"):
+    with pytest.raises(ModelError, match="its snap consists of impulses"):
         fx.simulate(loop, reference=third, duration=0.1)
     with pytest.raises(ModelError, match=r"up_to\('jerk'\)"):
         own.forces(third, [0.0])

@@ -461,8 +461,16 @@ def test_refusals_of_the_c_export(tmp_path):
                        inputs=["s", "f"], outputs=["f"])  # fmt: skip
     path = tmp_path / "a.c"
     for error, cause, call in (
-        (LabelError, "C allows", lambda: write_c(designed()[1], tmp_path / "1st.c")),
-        (LabelError, "C allows", lambda: write_c(designed()[1], path, name="while")),
+        (
+            LabelError,
+            "is not allowed as a function name in C",
+            lambda: write_c(designed()[1], tmp_path / "1st.c"),
+        ),
+        (
+            LabelError,
+            "is not allowed as a function name in C",
+            lambda: write_c(designed()[1], path, name="while"),
+        ),
         (ModelError, r"\.c", lambda: write_c(designed()[1], tmp_path / "a.txt")),
         (ModelError, "sampled controller", lambda: write_c(designed(False)[1], path)),
         (AssumptionError, "recovery", lambda: write_c(slow, path, limits=1.0)),

@@ -435,11 +435,11 @@ def test_localisation_beside_a_wrong_stiffness(plate):
     assert found.chosen_values[0] == pytest.approx(0.5, rel=2e-3)
     assert found.nuisance == ("stiffness",)
     assert found.nuisance_values[0] == pytest.approx(0.02, rel=2e-3)
-    assert "beside stiffness = 0.0" in repr(found)
+    assert "with stiffness = 0.0" in repr(found)
     with pytest.warns(FlexplantWarning, match=r"leaves more than noise.*nuisance="):
         alone = localise(rom, masses, data, most=1)
     assert alone.chosen != (plate.z8,) or abs(alone.chosen_values[0] - 0.5) > 0.1
-    with pytest.raises(ModelError, match="at once"):
+    with pytest.raises(ModelError, match="both a candidate and a nuisance"):
         localise(rom, masses, data, nuisance=masses[:1])
     with pytest.raises(ModelError, match="data do not determine"):
         localise(rom, masses[:3], [data[0].select([4])], nuisance=masses[3:6])

@@ -221,7 +221,7 @@ class Lost(GaussNewton):
 def test_a_drawn_start_that_stops_a_mode_is_not_the_reason_why_none_leads_anywhere():
     """Of two starts the last ceases to oscillate: both are named."""
     model, data = overdamped(0)
-    said = r"none of 2 starts.*: nothing is found \(1 start\); modes \[3\] cease.*\(1 start\)"
+    said = r"none of 2 starts.*: nothing is found \(1 start\); modes \[3\] stop osc.*\(1 start\)"
     with pytest.raises(SolverError, match=said) as caught:
         update(model, [AddedDamping("3:z")], [data], starts=[[0.0], [900.0]], method=Lost())
     assert caught.value.__notes__[0] == "from damping at 3:z = 0 N s/m: nothing is found"

@@ -147,7 +147,7 @@ def _motion_variables(
     if doubled or not found:
         raise FlexplantError(
             f"{path!r} has nodal variables {names[:12]}, and it is not clear which are the "
-            f"shapes. Name them: variables={'x': 'DispX', ...}."
+            f"shapes. Name them: variables={{'x': 'DispX', ...}}."
         )
     return {d: found[d][0] for d in DIRECTIONS if d in found}
 
