@@ -367,7 +367,6 @@ class Progress:
     what runs, and how long it will take where this is known. An estimate follows from the work that
     is done (`expect`, `so_far`, or the items counted). It is corrected by a further line where it
     proves wrong by a factor of two. `advice` follows where more than 20 seconds are left.
-    `progress=False` is silent.
 
     Work inside other work shows no bar, neither here nor in the process of a pool.
     """
@@ -395,7 +394,7 @@ class Progress:
                 "it is shown on a terminal."
             )
         self._forced, self._total = bool(progress), total
-        outermost = progress is None and not _open_bars()
+        outermost = progress is None and not bars_of_thread()
         self._stream = watched() if outermost else None
         self._unseen = outermost and self._stream is None and sys.stderr is not None
         if progress or self._stream is not None:
@@ -412,7 +411,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         try:
-            _open_bars().append(self)
+            bars_of_thread().append(self)
             if (self.bar is not None and not self._forced) or self._unseen:
                 _watcher.begin(self, self._said() if self._unseen else self._shown())
         except BaseException:  # Ctrl-C while a thread starts: nothing would close it
@@ -430,8 +429,8 @@ class Progress:
     def _close(self) -> None:
         """End what shows the work; again where that was interrupted."""
         _watcher.end(self)
-        if self in _open_bars():
-            _open_bars().remove(self)
+        if self in bars_of_thread():
+            bars_of_thread().remove(self)
         if self.bar is not None:
             self.bar.close()
 
@@ -497,7 +496,9 @@ class Progress:
         own = self.done - self._known
         if not (self._total and self._counts) or own <= 0:
             return 0.0
-        if own < _TELLS * self._total and self.elapsed < LONG:  # the first ones may take longer
+        if (
+            own < _TELLS * (self._total - self._known) and self.elapsed < LONG
+        ):  # the first ones may take longer
             return 0.0
         since = self.elapsed - self._last  # of the item under way, which may take longer
         each = max(self._last / own, since)
@@ -548,7 +549,7 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0, more: bool = F
     `multiplications` are those of products of matrices that take as long. Where this is `more` that
     follows, or work inside other work, the outermost one takes at least as long.
     """
-    bars = _open_bars()
+    bars = bars_of_thread()
     if not bars:
         return
     if multiplications * _LEAST > BAR_DELAY * 1e-2:
@@ -561,7 +562,7 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0, more: bool = F
 
 def so_far(done: float, expected: float) -> None:
     """Say how long the work under way takes in all, by what is done of what is expected."""
-    bars = _open_bars()
+    bars = bars_of_thread()
     if len(bars) != 1:
         return
     bars[0]._counts = False
@@ -574,16 +575,11 @@ def so_far(done: float, expected: float) -> None:
 def tick(description: str, expected: float = 0.0) -> None:
     """Count an item of the innermost work, where that is its description, of those expected."""
     # for loops far below the function that shows the bar; without such a bar it does nothing
-    bars = _open_bars()
+    bars = bars_of_thread()
     if bars and bars[-1].description == description:
         bars[-1].advance()
         if expected:
             so_far(bars[-1].done, expected)
-
-
-def bars_of_thread() -> list[Progress]:
-    """Return the list of work under way in this thread, the innermost last: it goes on changing."""
-    return _open_bars()
 
 
 def watched() -> Any:
@@ -599,8 +595,7 @@ def in_notebook() -> bool:
     return type(shell).__name__ == "ZMQInteractiveShell"
 
 
-def _open_bars() -> list[Progress]:
-    if not hasattr(_open, "bars"):
-        _open.bars = []
-    bars: list[Progress] = _open.bars
+def bars_of_thread() -> list[Progress]:
+    """Return the list of work under way in this thread, the innermost last: it goes on changing."""
+    _open.bars = bars = getattr(_open, "bars", [])
     return bars

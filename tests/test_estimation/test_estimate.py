@@ -305,7 +305,7 @@ def test_a_gate_that_silences_a_sensor_warns():
     kalman = observer()
     y, u, _ = run(kalman.model, 1000, seed=8)
     y[500:, 0] += 1e-3  # no outlier: the sensor has jumped
-    with pytest.warns(FlexplantWarning, match="samples of y1: not outliers"):
+    with pytest.warns(FlexplantWarning, match="samples of y1: these are not outliers"):
         kalman.estimate(records(kalman.model, y, u), gate=6.0)
     with pytest.raises(ModelError, match="gate must be positive"):
         kalman.estimate(records(kalman.model, y, u), gate=0)

@@ -78,7 +78,7 @@ def test_two_halves_are_one_plate():
     np.testing.assert_array_equal(machine.dofs.location("right/1:z"), [0.3, 0, 0])
     with pytest.raises(LabelError, match=r"no DOF at nodes \[1\]"):
         machine.dofs.where(nodes=1, component="right")
-    with pytest.raises(LabelError, match="follows others"):
+    with pytest.raises(LabelError, match="follows other DOFs"):
         machine.dofs.index("right/1:z")
     assert machine.dofs.nearest((0.6, 0.6, 0), "z") == "right/15:z"
     assert machine.dofs.nearest((0.6, 0.6, 0), "z", component="left") == "left/15:z"

@@ -216,7 +216,7 @@ def test_a_loop_on_an_uncertain_plant_says_what_its_modes_hold_to():
     worst = int(np.argmin(fragile.least))
     assert found.tolerances.least[worst] == pytest.approx(fragile.least[worst], rel=1e-3)
     mode, holds = fragile.modes[worst], 100 * fragile.least[worst]
-    assert f"mode {mode} ({fragile.freq[worst]:.4g} Hz) holds to {holds:.2g} %" in said
+    assert f"mode {mode} ({fragile.freq[worst]:.4g} Hz) tolerates {holds:.2g} %" in said
     certificate = found.tolerances.certificate
     assert certificate[f"mode {mode} holds to"] == pytest.approx(fragile.least[worst], rel=1e-3)
     assert certificate[f"mode {mode} known to"] == 0.001
@@ -361,7 +361,7 @@ def two_masses(off=0.0):
 @pytest.mark.slow
 def test_laws_that_are_tuned_say_what_the_mode_below_their_notch_holds_to():
     """The notch turns the phase of a gain above 1: machines with another spring are the judge."""
-    with pytest.warns(FlexplantWarning, match=r"mode 2 \(209.5 Hz\) holds to .* known to 2 %"):
+    with pytest.warns(FlexplantWarning, match=r"mode 2 \(209.5 Hz\) tolerates .* known to 2 %"):
         found = fx.tune_loops(two_masses().uncertain(frequency=0.02), notches=1)
     (stable,), (within,) = found.tolerances.stable, found.tolerances.within
     assert 0.0 < within[1] < stable[1] < 0.05

@@ -73,7 +73,7 @@ def test_torsion_of_a_plate(kind):
     assert [ax.get_xlabel(), ax.get_zlabel()] == ["x [mm]", "z [mm]"]
     assert ax.figure.axes[1].get_ylabel() == "displacement, largest 1 [-]"
     for bad in (0, modes.omega.size + 1):
-        with pytest.raises(ModelError, match=f"no mode {bad}: modes are numbered 1 to"):
+        with pytest.raises(ModelError, match=f"mode {bad} does not exist: modes are numbered 1 to"):
             fx.plot.mode_shape(modes, bad)
 
 

@@ -142,7 +142,7 @@ def test_the_door(changes, error, says):
 
 def test_no_dofs_are_refused():
     empty = np.zeros((0, 0))
-    with pytest.raises(ModelError, match="no DOF"):
+    with pytest.raises(ModelError, match="DofSet is empty"):
         FEModel(empty, empty, dofs=DofSet([], [], np.zeros((0, 3))))
 
 

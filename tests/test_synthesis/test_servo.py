@@ -266,5 +266,5 @@ def test_refusals():
         design_servo(plant.with_ports(few), bandwidth=50.0)
     with pytest.raises(LabelError, match="no axis 'die:x'"):
         design_servo(plant, bandwidth=50.0, axes=["die:x"])
-    with pytest.raises(LabelError, match="no bandwidth of die:rx, die:ry"):
+    with pytest.raises(LabelError, match="no bandwidth is given for die:rx, die:ry"):
         design_servo(plant, bandwidth={"die:z": 50.0})

@@ -8,7 +8,7 @@ import pytest
 import flexplant as fx
 from flexplant import Frf
 from flexplant.synthesis import tune_loops
-from flexplant.synthesis.laws.tune import JointPlant
+from flexplant.synthesis.laws.joint_plants import JointPlant
 from oracles_tuning import best_bandwidth
 
 RATE, MASS = 1e4, 2.0

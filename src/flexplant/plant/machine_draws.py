@@ -257,7 +257,9 @@ class StatedFamily:
             raise ModelError("what is stated of the frequencies leaves no stiffness.")
         omega, V = mixed
         # the damping force of a mode stays where its stiffness changes
-        force = (space.zeta * space.omega * np.exp(damped[space.own]))[np.argmax(np.abs(V), axis=0)]
+        force = space.zeta * space.omega * np.exp(damped[space.own])
+        if force.size:
+            force = force[np.argmax(np.abs(V), axis=0)]
         zeta = np.divide(force, omega, out=np.zeros_like(omega), where=omega > 0.0)
         pairs = changed_pairs(
             space.whole,

@@ -50,7 +50,7 @@ def counts_of(elements: Any, count: int) -> tuple[int, ...]:
     if not isinstance(listed, Sequence | np.ndarray) or not several(listed) or len(listed) != count:
         raise ShapeError(
             f"elements must be {count} whole numbers (along {', '.join(axes)}), got "
-            f"{short(elements)}. Write for example ({', '.join(['8'] * count)})."
+            f"{short(elements)}. Pass for example ({', '.join(['8'] * count)})."
         )
     return tuple(
         whole(value, f"elements along {axis}", maximum=MOST)

@@ -19,7 +19,7 @@ from ..structure import FEModel
 from ..words import instance, with_deviation
 
 #: advice for the function that builds a model
-MAKES = "It returns an FEModel, for example lambda t: kirchhoff_plate(thickness=t, ...)."
+MAKES = "Pass a function that returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...)."
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = tuple[Matrix | None, Matrix | None, Matrix | None]
 
