@@ -165,7 +165,7 @@ for name, work in {**WORK, **MORE}.items():
         time.sleep(0.01)
     found[name] = {
         "threads": threads() == before,
-        "bars": len(progress._open_bars()),
+        "bars": len(progress.bars_of_thread()),
         "children": len(multiprocessing.active_children()),
         "alive": threading.active_count(),
     }
