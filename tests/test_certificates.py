@@ -235,7 +235,7 @@ WRONG = {
         ), "forces do not minimise",
     ),
     "normalised coprime factors": (
-        "synthesis.hinf.ncf._least_by_factors", larger(1.001),
+        "synthesis.hinf.ncf.hankel_norm", larger(1.001),
         lambda: fx.design_ncf(fx.lti.tf([1.0], [1.0, 1.0, 0.0])), "by the Hankel norm",
     ),
     "largest gain": (

@@ -49,14 +49,13 @@ def test_doctests_of_designs():
 
 
 #: public names without a doctest: what read_ansys reads cannot be written in a few lines, a Problem
-#: is what a search is given, machines of a plant are its property, a run of the others takes
+#: is what a search is given, an M-Delta structure is made by a function, a run of the others takes
 #: seconds; base classes for kinds of one's own have their examples in tests/test_new_kinds.py
 WITHOUT = {
     "BlockStructure",
     "DampingElement",
     "read_ansys",
     "Problem",
-    "PlantMachines",
     "design_mu",
     "Bound",
     "Judge",

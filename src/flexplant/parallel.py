@@ -573,8 +573,7 @@ def so_far(done: float, expected: float) -> None:
 
 
 def tick(description: str, expected: float = 0.0) -> None:
-    """Count an item of the innermost work, where that is its description, of those expected."""
-    # for loops far below the function that shows the bar; without such a bar it does nothing
+    """Count an item of the innermost work, where that is its description; else do nothing."""
     bars = bars_of_thread()
     if bars and bars[-1].description == description:
         bars[-1].advance()

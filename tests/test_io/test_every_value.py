@@ -77,20 +77,6 @@ def made():
         fit.trend(poles),
         fx.structure.ThickPlateShape((1.0, 1.0), 0.1, (2, 2), softness=3e-3),
     )
-    late = fx.lti.Delayed.tf([0.2, 0.6], [1.0])
-    yield from (late, fx.loop.DelayedLoop(fx.lti.Delayed(fx.lti.tf([1.0], [1.0, 0.0]), 1.0), -late))
-    masses = fx.testbeds.three_masses()
-    damped = fx.synthesis.damp_modes(masses, "velocity", y="y1", damping=0.1)
-    yield from (damped, damped.element, fx.plant.UnmodelledDynamics(0.1, at="u1"))
-    yield fx.synthesis.PositivePositionFeedback(100.0, 20.0)
-    yield fx.synthesis.IntegralResonantControl(100.0, 20.0)
-    observer = fx.design_kalman(masses)
-    loop = fx.close_loop(masses, observer, fx.design_servo(masses, bandwidth=20.0))
-    move = fx.setpoint(1e-3, velocity=0.05, acceleration=2.0, jerk=200.0)
-    yield fx.simulation.residual_vibration(loop, move)
-    M = fx.StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], 0, inputs=["d", "f"],
-                      outputs=["e", "x"])  # fmt: skip
-    yield fx.synthesis.uncertain_system(M, [fx.synthesis.RepeatedScalar()]).kinds[0]
     plant = fx.assemble_plant(rom, ports())
     sampled = plant.discretized(RATE, delay=1)
     yield fx.assemble_plant(rom, ports(), evaluation=fe).evaluation
@@ -212,6 +198,20 @@ def made():
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
     yield from of_structures()
+    late = fx.lti.Delayed.tf([0.2, 0.6], [1.0])
+    yield from (late, fx.loop.DelayedLoop(fx.lti.Delayed(fx.lti.tf([1.0], [1.0, 0.0]), 1.0), -late))
+    masses = fx.testbeds.three_masses()
+    damped = fx.synthesis.damp_modes(masses, "velocity", y="y1", damping=0.1)
+    yield from (damped, damped.element, fx.plant.UnmodelledDynamics(0.1, at="u1"))
+    yield fx.synthesis.PositivePositionFeedback(100.0, 20.0)
+    yield fx.synthesis.IntegralResonantControl(100.0, 20.0)
+    observer = fx.design_kalman(masses)
+    loop = fx.close_loop(masses, observer, fx.design_servo(masses, bandwidth=20.0))
+    move = fx.setpoint(1e-3, velocity=0.05, acceleration=2.0, jerk=200.0)
+    yield fx.simulation.residual_vibration(loop, move)
+    M = fx.StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], 0, inputs=["d", "f"],
+                      outputs=["e", "x"])  # fmt: skip
+    yield fx.synthesis.uncertain_system(M, [fx.synthesis.RepeatedScalar()]).kinds[0]
 
 
 def of_positions(modes):

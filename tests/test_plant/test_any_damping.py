@@ -287,7 +287,8 @@ def test_the_form_is_said(case, says):
 def test_a_proportional_pair_stays_a_block_however_damped():
     plant = plant_of("held proportional")
     assert tuple(plant.system.blocks) == (2, 2, 2, 2)
-    assert np.count_nonzero(plant.system.poles().imag) == 4
+    poles = plant.system.poles()  # those of the critical pair are apart by the root of rounding
+    assert np.count_nonzero(np.abs(poles.imag) > 1e-6 * np.abs(poles)) == 4
     assert plant.assembled.realisation.coupling is None
     found = [mode.zeta for mode in plant.check().modes]
     np.testing.assert_allclose(found, [2.0, 1.0, 0.7, 1e-3], rtol=1e-8)
