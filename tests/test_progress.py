@@ -65,6 +65,12 @@ def tried(work):
 """
 
 
+@pytest.fixture(autouse=True)
+def _own_watcher(monkeypatch):
+    """A thread that waits by the clock of another test would be late here."""
+    monkeypatch.setattr(progress, "_watcher", progress._Watcher())
+
+
 def child(code, stream):
     """Run code in a process of its own, its streams given."""
     paths = os.pathsep.join([str(HERE), *sys.path])

@@ -112,9 +112,9 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     assert len(drawn) >= 8 and all(one.find(".//path") is not None for one in drawn)
     captions = [words(one.find("figcaption")) for one in drawn]
     for part in (
-        "Where the error of die:error comes from",
-        "Where die:rx:error comes from",
-        "Where die:ry:error comes from",
+        "Contributions to the error of die:error",
+        "Contributions to die:rx:error",
+        "Contributions to die:ry:error",
         "sensitivity |S| of each axis, from its reference to its error",
         "Sensors, actuators and POIs",
         "The plant, from forces along each axis to the POI",

@@ -120,13 +120,15 @@ PROMISED = "least modulus margin of 20 machines drawn"
 
 @pytest.mark.long
 def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
-    """Shapes that mix by 10 %: each frequency alone may be off, and no loop holds on all."""
+    """Machines whose frequencies are off by 10 %: each alone may be off by 0.1 %, no loop holds."""
     small = sampled(some_modes(ZETA, 8, attached=False), CHANNELS)
     uncertain = small.uncertain(frequency=0.001)
     held = fx.design_stage(uncertain, bandwidth=60.0)
     assert held.certificate[PROMISED] >= 0.35
     assert PROMISED in repr(held)
-    monkeypatch.setattr("flexplant.synthesis.hinf.stage_design._SHAPES", 0.1)
+    far = small.uncertain(frequency=0.1).machines.drawn(20, rng=1)
+    task = "flexplant.synthesis.hinf.stage_design._StageTask.machines"
+    monkeypatch.setattr(task, getattr(far, "plants", far))
     with pytest.raises(InfeasibleError, match="on machines drawn"):
         fx.design_stage(uncertain, bandwidth=60.0)
 

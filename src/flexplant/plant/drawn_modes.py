@@ -20,7 +20,11 @@ class DrawnModes(ModalRealisation):
 
     def row(self, at: Place, direction: str) -> FloatArray:
         """Return the row (c,) over the columns for a place."""
-        return np.asarray(super().row(at, direction) @ self.over)
+        return self.load(super().row(at, direction))
+
+    def load(self, forces: FloatArray) -> FloatArray:
+        """Return forces on the model's DOFs over the columns."""
+        return np.asarray(forces @ self.over)
 
 
 class ModeSpace:

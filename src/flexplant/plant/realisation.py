@@ -110,6 +110,10 @@ class ModalRealisation(Value):
         """Return the row over the model's DOFs for a place."""
         return self.model.row(at, direction)
 
+    def load(self, forces: FloatArray) -> FloatArray:
+        """Return forces on the model's DOFs in the coordinates of `row`."""
+        return forces
+
     def force(self, row: FloatArray) -> FloatArray:
         """Return the column (2 b,) of B for a unit force along a row of DOFs."""
         return np.asarray(row @ self.inputs)
@@ -260,7 +264,7 @@ def modes_as_states(
     outputs[:, :, 0] = phi / scale
     names = _state_names(b, modes)
     return ModalRealisation(
-        model, pairs, inputs.reshape(n, -1), outputs.reshape(n, -1), names, rigid
+        model, pairs, inputs.reshape(n, 2 * b), outputs.reshape(n, 2 * b), names, rigid
     )
 
 

@@ -32,7 +32,9 @@ class RigidBody(Value):
 def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
     """Return the load (n,) ``-M r`` of a unit base acceleration."""
     key = ("inertia", direction, *np.asarray(about).tolist())
-    return realisation.once(key, lambda: _inertia_load(realisation, direction, about))
+    return realisation.once(
+        key, lambda: realisation.load(_inertia_load(realisation, direction, about))
+    )
 
 
 def _inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
