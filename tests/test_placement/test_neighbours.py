@@ -148,10 +148,10 @@ def test_over_machines(make):
         assert best.chosen == proven.chosen
         assert 0 < best.bound <= proven.value
     # what is best for one machine is not best at worst
-    alone = place_sensors(machines[1], sensors, 4, PoiVariance("die"))
+    alone = place_sensors(machines[0], sensors, 4, PoiVariance("die"))
     worst = OverMachines(PoiVariance("die"), machines)
     robust = place_sensors(plant, sensors, 4, worst)
-    assert robust.value < worst(alone.on(plant))
+    assert robust.value < 0.999 * worst(alone.on(plant))
 
 
 @pytest.mark.slow
