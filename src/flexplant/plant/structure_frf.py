@@ -286,6 +286,7 @@ def _all_motions(model: Structure) -> Any:
     return SimpleNamespace(
         model=model,
         row=model.row,
+        load=lambda forces: forces,
         inputs=nothing,
         outputs=nothing,
         motion=motion,
