@@ -74,7 +74,9 @@ and the names of the same functions in other tools.
 - shape loops by hand in a browser, on measured responses: `examples/workbench.py`
 - from the files of a project to C code: `examples/gantry.py`; follow set-points:
   `examples/feedforward.py`
-- design by mixed sensitivity, on textbook plants: `examples/textbook.py`
+- design by mixed sensitivity, on textbook plants: `examples/textbook.py`; margins, LQG, PID, mu and
+  delays as textbooks have them: `examples/classical.py`
+- damp modes actively, then move, with input shapers: `examples/active_damping.py`
 - guarantee robustness: `examples/robust_control.py`
 - join components: `examples/joined_machine.py`
 - place sensors and actuators: `examples/placement.py`
@@ -208,13 +210,5 @@ def __getattr__(name: str) -> _Any:
     """Import the room of a name at its first use; say of a wrong name where it is."""
     if name in __all__:
         return _imported(name)
-    where = ""
-    if not name.startswith("_"):
-        rooms = [room for room in __all__ if hasattr(_imported(room), "__path__")]
-        where = "".join(
-            f" Use flexplant.{room}.{name}." for room in rooms if name in dir(_imported(room))
-        )
-        ours = _import_module(".rooms", __name__).OURS.get(name)
-        if ours and not where:
-            where = f" What MATLAB or python-control call so is flexplant.{ours}."
+    where = _import_module(".rooms", __name__).hint(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}.{where}")

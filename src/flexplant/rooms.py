@@ -9,12 +9,21 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from .errors import counted
 
 
 def public_names(room: str) -> Callable[[], list[str]]:
-    """Return the `__dir__` of a package: the names that it re-exports, not its modules."""
+    """Return the `__dir__` of a package: the names that it re-exports, not its modules.
+
+    A name that the package lacks gets an error that says where it is.
+    """
+
+    def missing(name: str) -> Any:
+        raise AttributeError(f"module {room!r} has no attribute {name!r}.{hint(name)}")
+
+    sys.modules[room].__dict__["__getattr__"] = missing
 
     def names() -> list[str]:
         shown = vars(sys.modules[room]).items()
@@ -27,15 +36,29 @@ def public_names(room: str) -> Callable[[], list[str]]:
     return names
 
 
+def hint(name: str) -> str:
+    """Return where a name is that a module lacks, in words; empty where nothing is known."""
+    if name.startswith("_"):
+        return ""
+    package = sys.modules["flexplant"]
+    rooms = [one for one in package.__all__ if isinstance(getattr(package, one), ModuleType)]
+    homes = [f"flexplant.{room}" for room in rooms if name in dir(getattr(package, room))]
+    homes += ["flexplant"] if name in package.__all__ else []
+    where = "".join(f" Use {home}.{name}." for home in homes)
+    ours = OURS.get(name)
+    return where or (f" What MATLAB or python-control call so is flexplant.{ours}." if ours else "")
+
+
 #: what is called otherwise in MATLAB and python-control: its name here, and theirs
 _THEIRS = {
-    "StateSpace": "ss", "Frf": "frd", "StateSpace.poles": "pole", "StateSpace.zeros": "tzero zero",
+    "StateSpace": "ss", "Frf": "frd", "StateSpace.poles": "pole damp",
+    "StateSpace.zeros": "tzero zero",
     "StateSpace.dcgain": "dcgain", "frequency_response": "freqresp evalfr",
     "plot.bode": "bode bode_plot bodeplot", "plot.singular_values": "sigma",
     "plot.nyquist": "nyquist nyquist_plot", "plot.pole_map": "pzmap",
     "lti.step (or plot.step)": "step step_response",
     "lti.impulse": "impulse impulse_response",
-    "lti.lsim (or simulate)": "lsim forced_response",
+    "lti.lsim (or simulate)": "lsim forced_response initial initial_response",
     "lti.step_info": "stepinfo", "loop.report_loops": "margin",
     "synthesis.margins": "allmargin diskmargin disk_margins stability_margins",
     "loop.sensitivity": "loopsens", "lti.discretized": "c2d sample_system",
@@ -44,14 +67,14 @@ _THEIRS = {
     "lti.solve_stein": "dlyap", "lti.control_care": "care icare", "lti.control_dare": "dare idare",
     "plant.mixed_sensitivity": "augw", "plant.mixed_sensitivity, then design_hinf": "mixsyn",
     "design_hinf": "hinfsyn", "design_h2": "h2syn",
-    "synthesis.lqr": "lqr dlqr", "synthesis.lqi": "lqi", "synthesis.lqg": "lqg",
+    "synthesis.lqr": "lqr dlqr", "synthesis.lqi": "lqi", "synthesis.lqg": "lqg lqgreg",
     "synthesis.place": "place acker",
     "design_kalman (or synthesis.lqe)": "kalman lqe dlqe",
     "lti.continuous": "d2c", "lti.resampled": "d2d", "lti.descriptor": "dss",
     "lti.controllability_gramian": "gram", "lti.hankel_values": "hsvd hankelsv",
     "lti.split_stable": "stabsep", "lti.linf_norm": "linfnorm",
     "plot.root_locus": "rlocus root_locus root_locus_plot",
-    "balanced (or reduce)": "model_reduction",
+    "balanced (or reduce)": "model_reduction modred",
     "design_ncf": "ncfsyn", "synthesis.ncf_margin": "ncfmargin",
     "synthesis.design_structured": "hinfstruct", "tune_loops": "systune",
     "synthesis.tune_pid (or design_servo)": "pidtune pid_tune",

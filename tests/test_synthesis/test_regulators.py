@@ -119,3 +119,19 @@ def test_an_integral_that_no_constant_input_holds_is_refused_for_that(unit, rate
             lqi(g, Q=Q, R=R, outputs=["v"])
         with pytest.raises(AssumptionError, match="2 outputs are integrated"):
             lqi(g, Q=np.eye(2 * n + 2), R=R)
+
+
+@pytest.mark.parametrize("room", [fx, fx.lti, fx.synthesis, fx.plot, fx.loop])
+def test_names_of_other_tools_lead_here_from_every_room(room):
+    """``fx.lti.dlqr`` and ``fx.synthesis.d2c`` are answered as ``fx.dlqr`` is."""
+    ours = {
+        "dlqr": "synthesis.lqr", "kalman": "lqe", "acker": "synthesis.place", "d2c": "continuous",
+        "d2d": "resampled", "gram": "controllability_gramian", "hsvd": "hankel_values",
+        "stabsep": "split_stable", "dss": "descriptor", "rlocus": "root_locus", "lqg": "lqg",
+        "ultidyn": "UnmodelledDynamics", "musyn": "design_mu", "stepinfo": "step_info",
+    }  # fmt: skip
+    for theirs, here in ours.items():
+        if theirs in dir(room):
+            continue
+        with pytest.raises(AttributeError, match=rf"flexplant\..*{here}"):
+            getattr(room, theirs)

@@ -239,7 +239,7 @@ class DelayedLoop(Value):
         turning = [f for f in _zeros(lambda f: one(f).imag, L.imag, lines) if one(f).real < 0]
         phases = [(float(np.degrees(np.angle(-one(f)))), f) for f in crossing]
         # a lag turns the phase clockwise
-        delays = [(np.radians(p % 360.0) / (2 * np.pi * f), f) for p, f in phases]
+        delays = [((p % 360.0) / (360.0 * f), f) for p, f in phases]
         gains = [(1.0 / abs(one(f)), f) for f in turning]
         none = (np.inf, np.nan)
         return {
