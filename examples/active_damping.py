@@ -99,7 +99,9 @@ if __name__ == "__main__":
     tuned = dampers(mast)
     print(*tuned.values(), sep="\n")
     print(table(mast, tuned, by_hinf(mast)))
-    both, radius = moved(mast, tuned["ppf"])
-    print(f"drive alone: spectral radius {radius:.5f}; with PPF {both.spectral_radius:.5f}")
+    both, radius = moved(mast, tuned["velocity"])
+    print(
+        f"drive alone: spectral radius {radius:.5f}; with velocity feedback {both.spectral_radius:.5f}"
+    )
     for label, left in residuals(both).items():
         print(label, left)
