@@ -101,7 +101,8 @@ if __name__ == "__main__":
     print(table(mast, tuned, by_hinf(mast)))
     both, radius = moved(mast, tuned["velocity"])
     print(
-        f"drive alone: spectral radius {radius:.5f}; with velocity feedback {both.spectral_radius:.5f}"
+        f"drive alone: spectral radius {radius:.5f}; "
+        f"with velocity feedback {both.spectral_radius:.5f}"
     )
     for label, left in residuals(both).items():
         print(label, left)
