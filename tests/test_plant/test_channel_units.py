@@ -16,7 +16,9 @@ def every_kind():
             fx.Disturbance("twist", at=(0, 0, 0), direction="rx"),
             fx.BaseAcceleration("floor"),
             fx.plant.OutputDisturbance("drift", sensor="tilt"),
-            fx.Disturbance("mixed", at={"1:z": 1.0, "1:rx": 2.0}),
+            fx.Disturbance("mixed", at={"1:z": 3.0, "1:rx": 2.0}),
+            fx.Disturbance("levered", at={"1:z": 1.0, "1:rx": 0.4, "9:z": -1.0}),
+            fx.Disturbance("leg", at={"1:x": 0.6, "1:z": 0.8, "1:ry": 0.3}),
         ],
         u=[fx.Actuator("u1", at=(0, 0, 0)), fx.Actuator("m1", at="1:ry")],
         z=[
@@ -28,6 +30,8 @@ def every_kind():
             fx.Sensor("tilt", at=(0, 0, 0), direction="rx"),
             fx.Sensor("speed", at="1:z", quantity="velocity"),
             fx.Sensor("acc", at="1:rx", quantity="acceleration"),
+            fx.Sensor("geared", at={"1:rx": 1.0, "9:z": 200.0}),
+            fx.Sensor("unclear", at={"1:rx": 1.0, "9:z": 1.0}),
         ],
         references=[fx.Reference("die")],
     )
@@ -40,9 +44,11 @@ def test_ports_tell_the_unit_of_every_channel():
         "u1:effort": "N", "m1:effort": "N m", "die:z": "m", "die:rx": "rad", "die:ref": "m",
         "die:error": "m", "die:hat": "m", "die:rx:hat": "rad", "turn:z": "rad", "pos": "m",
         "pos:noise": "m", "tilt": "rad", "speed": "m/s", "acc": "rad/s^2",
+        "levered": "N", "leg": "N", "geared": "rad",
     }  # fmt: skip
     assert {name: found.get(name) for name in wanted} == wanted
     assert "mixed" not in found
+    assert "unclear" not in found
 
 
 @pytest.mark.slow

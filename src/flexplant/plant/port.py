@@ -13,6 +13,7 @@ from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, single_channel
 from ..store import Value
+from ..tolerances import TYPED
 from ..words import check_names, flag
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
@@ -226,9 +227,21 @@ def force_unit(at: Place, direction: str) -> str | None:
 
 
 def turning(at: Place, direction: str) -> bool | None:
-    """Return whether a place moves by rotation; None for a sum of both kinds."""
+    """Return whether a place moves by rotation; None where a sum of both kinds does not tell.
+
+    A sum of both kinds has the unit of the part with weights of length 1: the weights of the other
+    part are then levers, as in the motion ``{"2:y": 1, "2:rz": -0.7}`` [m] of a rail 0.7 m away.
+    """
     kinds = {one.startswith("r") for one in place_directions(at, direction)}
-    return kinds.pop() if len(kinds) == 1 else None
+    if len(kinds) == 1:
+        return kinds.pop()
+    squares: dict[tuple[Any, bool], float] = {}
+    for one, weight in at.items() if isinstance(at, Mapping) else ():
+        node, _, along = one.rpartition(":") if isinstance(one, str) else (one, "", direction)
+        part = node, along.startswith("r")
+        squares[part] = squares.get(part, 0.0) + float(weight) ** 2
+    whole = {turns for (_, turns), square in squares.items() if abs(square - 1.0) < TYPED}
+    return whole.pop() if len(whole) == 1 else None
 
 
 def place_directions(at: Place, direction: str) -> tuple[str, ...]:

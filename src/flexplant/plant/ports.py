@@ -366,7 +366,9 @@ class Ports(Value):
 
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
         sensors, references, errors and estimates like their POI, efforts like their actuator. A sum
-        of displacements and rotations has no unit. Filters of ports do not change units.
+        of displacements and rotations has the unit of the part whose weights have length 1, as a
+        displacement has with levers [m] of rotations; no unit if both parts do, or none. Filters of
+        ports do not change units.
         """
         found = {port.name: port.unit for port in self.physical}
         for port in self.w:
