@@ -158,7 +158,7 @@ def test_from_nastran(example, tmp_path, monkeypatch):
     np.testing.assert_array_equal(other["modes"].freq, result["modes"].freq)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_from_skfem(example):
     """Mass by geometry, frequencies by ARPACK and of a finer mesh."""
     pytest.importorskip("skfem")

@@ -166,6 +166,8 @@ def rebuild(cls: type[Value], state: Mapping[str, Any]) -> Value:
 
 def frozen(value: Any) -> Any:
     """Return a read-only copy of an array, sparse matrix or mapping; anything else as it is."""
+    if value is None or isinstance(value, str | float | int):
+        return value
     if isinstance(value, np.ndarray):
         if not value.flags.writeable and value.base is None:
             return value

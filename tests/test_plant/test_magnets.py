@@ -163,7 +163,7 @@ def test_check_and_repr_name_the_pairs():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_loop_is_closed_on_observer_servo_and_h_infinity():
     plant = assemble_plant(suspend(reduced(0.001), magnets()), ports()).discretized(RATE, delay=1)
     free = assemble_plant(reduced(0.001), ports()).discretized(RATE, delay=1)

@@ -94,7 +94,7 @@ def test_without_an_observer_the_loop_is_on_the_poi_itself():
     assert nz and servo.certificate["spectral radius"] == pytest.approx(radius, abs=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_notches_are_placed_where_they_serve():
     """The Kalman estimate brings the bowl mode back: unstable without a notch, 5 dB with."""
     plant, static, kalman = updated()
@@ -123,7 +123,7 @@ def test_a_servo_that_cannot_run_is_refused_with_the_bandwidth_that_can():
             design_servo(plant, bandwidth=bandwidth, observer=observer, notches=())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_flipped_sign_is_unstable():
     plant, _, kalman = updated()
     servo = design_servo(plant, bandwidth=50.0, observer=kalman)
@@ -189,7 +189,7 @@ def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found(asd):
     assert servo.certificate["modulus margin"] >= 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_left_out_count():
     """The truth as the evaluation model; a higher rate's roll-off reaches its modes less."""
     plant, static, _ = updated()

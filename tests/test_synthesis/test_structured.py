@@ -357,7 +357,7 @@ DIS3 = {  # COMPleib, distillation-like academic model; static feedback of 1.081
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_clock_decides_and_the_starts_are_listed(monkeypatch):
     """A clock that runs a million times as fast changes nothing; COMPleib's DIS3 within 2 %."""
     B, C = np.array(DIS3["B"]), np.eye(6)[[1, 2, 4, 5]]

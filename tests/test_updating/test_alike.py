@@ -67,7 +67,7 @@ def test_all_images_of_the_true_places_are_alike(seed, count):
         assert "AMBIGUOUS" in repr(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_place_too_many_is_as_rare_as_the_page_says():
     """One change: of c - 1 other places one explains its price by chance."""
     rng, trials, extra = np.random.default_rng(5), 60, 0
