@@ -203,23 +203,39 @@ def test_a_nonlinear_element():
 
 
 @dataclass(frozen=True, eq=False)
-class Warmth(fx.plant.Delta):
-    """Sensors and actuators that gain alike with temperature."""
+class Slip(fx.plant.Delta):
+    """How far along the machine a sensor sits, from its own mass towards the second one."""
+
+    power: int = 1
 
     def changed(self, machine, amount):
-        return machine.replace(gains={"u": 1.0 + amount, "y": 1.0 + amount})
+        a = amount**self.power
+        port = machine.ports.sensor("y").replace(at={"3:x": 1.0 - a, "2:x": a})
+        return machine.with_port(port)
 
 
 @dataclass(frozen=True, eq=False)
-class Warm(fx.plant.Uncertainty):
+class Slips(fx.plant.Uncertainty):
+    power: int = 1
+
     def deltas(self, plant):
-        return [Warmth("warmth", 0.02)]
+        return [Slip("y:place", 0.2, power=self.power)]
 
 
-def test_an_uncertainty_is_drawn_as_machines():
+def test_an_uncertain_place_opens_as_a_delta_and_is_drawn_as_machines():
     made = plant().discretized(5e3, delay=1)
-    drawn = made.uncertain(Warm()).machines.drawn(3, rng=0)
-    first = fx.frequency_response(made.Gyu, [20.0]).data[0, 0, 0]
-    ratios = [fx.frequency_response(one.Gyu, [20.0]).data[0, 0, 0] / first for one in drawn]
-    assert all(abs(ratio.imag) < 1e-9 and 0.9 < ratio.real < 1.1 for ratio in ratios)
-    assert len({round(ratio.real, 9) for ratio in ratios}) == 3
+    known = made.uncertain(Slips(), fx.plant.Frequencies(0.01))
+    modes = fx.solve_modes(MODEL, count=3, damping=fx.ModalDamping(0.01))
+    omega = 2.0 * np.pi * 90.0
+    near, far = (
+        np.sum(modes.phi[i] * modes.phi[0] / (modes.omega**2 - omega**2
+                                              + 2j * modes.zeta * modes.omega * omega))
+        for i in (1, 2)
+    )  # fmt: skip
+    opened = fx.frequency_response(known.opened.closed({"y:place": 0.5}), [90.0])["y", "u"][0]
+    assert opened == pytest.approx(0.1 * near + 0.9 * far, rel=1e-9)
+    places = [one.ports.sensor("y").at["2:x"] for one in known.machines.drawn(3, rng=0)]
+    assert len(set(places)) == 3
+    assert np.abs(places).max() < 0.6
+    with pytest.raises(ModelError, match=r"'y:place'.*'y' is no affine.*Slip an `opened`"):
+        made.uncertain(Slips(2), fx.plant.Frequencies(0.01))

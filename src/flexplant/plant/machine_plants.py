@@ -15,6 +15,7 @@ from ..updating.machines import COUNT, Machines
 from ..words import in_unit
 from .drawn_modes import DrawnModes
 from .machine_draws import MachineFamily, StatedFamily
+from .ports import Ports
 from .uncertainty.delta import MachineParts, with_changes
 from .uncertainty.mode_delta import ModeDelta
 from .uncertainty.parameter_amounts import ParameterDelta
@@ -136,7 +137,11 @@ class PlantMachines:
             return self._base
         of_modes = [one for one in drawn if isinstance(one[0], ModeDelta)]
         others = [one for one in drawn if not isinstance(one[0], ModeDelta | ParameterDelta)]
-        machine = MachineParts.of(self._base).replace(loudness=self._loudness(apart))
+        machine = MachineParts.of(self._base)
+        for port in _noisy(machine.ports):
+            if off := self._unsure.get(port.name):  # log-normal
+                louder = float(np.exp(off * apart.standard_normal()))
+                machine = machine.with_port(port.replace(asd=louder * port.asd))
         for delta, x in sorted(others, key=lambda one: one[0].stage):
             machine = delta.changed(machine, delta.amount(x))
         if self.fit is not None:
@@ -159,20 +164,13 @@ class PlantMachines:
     @property
     def _unsure(self) -> dict[str, float]:
         """Deviations of the densities of ports, where these are stated."""
-        ports = self.plant.ports
-        every = (*ports.w, *ports.u, *ports.y)
+        every = _noisy(self.plant.ports)
         return {port.name: port.asd_deviation for port in every if port.asd_deviation > 0.0}
 
     @property
     def densities(self) -> str:
         """What an interval of noise says where no density has a deviation; else empty."""
         return "" if self._unsure else ", densities as given"
-
-    def _loudness(self, rng: np.random.Generator) -> dict[str, float]:
-        """Return drawn densities beside those given, log-normal."""
-        return {
-            name: float(np.exp(off * rng.standard_normal())) for name, off in self._unsure.items()
-        }
 
     def _of_fit(self, rng: np.random.Generator) -> DrawnModes:
         """Return the modes of one machine of the fit, shared by plants of one evaluation model."""
@@ -183,6 +181,11 @@ class PlantMachines:
         key = (fit, str(seed.entropy), seed.spawn_key)
         found: DrawnModes = realisation.once(key, lambda: family.machine(rng))
         return found
+
+
+def _noisy(ports: Ports) -> tuple[Any, ...]:
+    """Return the ports that have noise of a density."""
+    return (*ports.w, *ports.u, *ports.y)
 
 
 def interval_of(values: FloatArray, level: float = LEVEL) -> tuple[float, float]:

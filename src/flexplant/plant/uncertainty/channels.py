@@ -9,7 +9,6 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray
-from ...errors import ModelError
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
@@ -193,18 +192,12 @@ class EvenUnits(NamedTuple):
         return DeltaPart(name, width * left, width * right, feed)
 
 
-def require_exact(
+def missed(
     opened: Opened, base: StateSpace, wanted: StateSpace, values: Mapping[str, float]
-) -> None:
-    """Raise ModelError unless the channels give the plant with all Deltas changed at once."""
+) -> str:
+    """Return a state or output that the channels miss on a machine at some values, or nothing."""
     made, own, new = (system_matrix(g) for g in (opened.closed(values), base, wanted))
     # of the change six digits, where rounding of the whole leaves them
     allowed = TYPED * np.abs(new - own).max(axis=1) + ROUNDING * np.abs(new).max(axis=1)
     bad = np.flatnonzero(np.abs(made - new).max(axis=1) > allowed)
-    if bad.size:
-        name = (*base.states, *base.outputs)[int(bad[0])]
-        raise ModelError(
-            f"{name!r} does not depend on the Deltas ({', '.join(list(values)[:3])}, ...) as "
-            "displacements, velocities and accelerations do, so that no channels express them. "
-            "Give the sensor a `row` and a quantity, or leave that uncertainty out."
-        )
+    return (*base.states, *base.outputs)[int(bad[0])] if bad.size else ""

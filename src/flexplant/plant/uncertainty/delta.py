@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -14,16 +14,20 @@ from ...errors import FlexplantWarning
 from ...lti.statespace import as_statespace
 from ...store import Value
 from ..building import P, sampled
+from ..forces import Actuator
 from ..partitioned import Partition
-from ..port import ForcePort
+from ..port import ForcePort, SensorPort
+from ..ports import Poi, Ports
 from ..realisation import ModalRealisation, plant_modes
 from ..remade import rebuilt
 from .channels import EvenUnits, Opened, with_parts
 
+Port: TypeAlias = ForcePort | SensorPort | Poi
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachineParts(Value):
-    """What a machine is assembled from, which Deltas change: modes, gains of ports, and delay.
+    """What a machine is assembled from, which Deltas change: modes, ports, and delay.
 
     Parameters
     ----------
@@ -32,20 +36,18 @@ class MachineParts(Value):
     realisation : ModalRealisation
         Modes; their blocks (b, 2, 2) are those of `pairs`.
     pairs : (b, 2, 2) array [rad/s]
+    ports : Ports
+        Its ports; `with_port` and `with_gain` change one.
     model : FEModel or ReducedModel, optional
-        A model with other matrices, whose modes are then solved again in place of all the above.
-    gains : mapping {str: float}
-        Changes of the gains of actuators and sensors, relative.
+        A model with other matrices, whose modes are then solved again in place of `realisation`.
     late : float [samples]
         Change of the delay.
-    loudness : mapping {str: float}
-        Of the noises of ports, relative densities.
 
     Examples
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> machine = fx.plant.MachineParts.of(plant).replace(gains={"u1": 1.1})
+    >>> machine = fx.plant.MachineParts.of(plant).with_gain("u1", 1.1)
     >>> machine.assembled().Gyu.D.shape == plant.Gyu.D.shape
     True
     """
@@ -53,16 +55,29 @@ class MachineParts(Value):
     plant: Partition
     realisation: ModalRealisation
     pairs: FloatArray
+    ports: Ports
     model: Any = None
-    gains: Mapping[str, float] = field(default_factory=dict)
     late: float = 0.0
-    loudness: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, plant: Partition) -> MachineParts:
         """Return the nominal machine of a plant."""
-        realisation = plant.assembled.realisation
-        return cls(plant, realisation, realisation.pairs)
+        own = plant.assembled
+        return cls(plant, own.realisation, own.realisation.pairs, own.ports)
+
+    def with_port(self, port: Port) -> MachineParts:
+        """Return the machine with a port in place of the one of its name: at another place, say."""
+        side = [port if one.name == port.name else one for one in getattr(self.ports, port.home)]
+        return self.replace(ports=self.ports.replace(**{port.home: side}))
+
+    def with_gain(self, name: str, gain: float) -> MachineParts:
+        """Return the machine with the gain of an actuator or sensor times a number."""
+        every: tuple[Actuator | SensorPort, ...] = (*self.ports.u, *self.ports.y)
+        port = next(one for one in every if one.name == name)
+        part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
+        # states as before: a command is scaled before the filter, a reading behind it
+        driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
+        return self.with_port(port.replace(dynamics=part.replace(D=gain * part.D, **driven)))
 
     def assembled(self) -> Any:
         """Return the plant of the machine, with the nominal one's ports and sampled like it."""
@@ -73,40 +88,21 @@ class MachineParts(Value):
                 realisation = plant_modes(self.model)
         elif not np.array_equal(self.pairs, realisation.pairs):
             realisation = realisation.replace(pairs=self.pairs)
-        ports = None
-        if self.gains or self.loudness:
-            own = plant.assembled.ports
-            sides = {side: [self._port(port) for port in getattr(own, side)] for side in "wuy"}
-            ports = own.replace(**sides)
+        ports = None if self.ports is plant.assembled.ports else self.ports
         if not self.late:
             return rebuilt(plant, ports=ports, realisation=realisation)
         fresh = rebuilt(plant.continuous, ports=ports, realisation=realisation)
         return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
-
-    def _port(self, port: Any) -> Any:
-        """Return a port of the machine."""
-        louder = self.loudness.get(port.name, 1.0)
-        found = port if louder == 1.0 else port.replace(asd=louder * port.asd)
-        return _times(found, self.gains.get(port.name, 1.0))
-
-
-def _times(port: Any, gain: float) -> Any:
-    """Return an actuator or sensor with another gain."""
-    if gain == 1.0:
-        return port
-    part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
-    # states as before: a command is scaled before the filter, a reading behind it
-    driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
-    return port.replace(dynamics=part.replace(D=gain * part.D, **driven))
 
 
 @dataclass(frozen=True, eq=False)
 class Delta(Value):
     """One real uncertainty, ``w = delta z`` with ``|delta| <= 1``.
 
-    A new kind says by `changed` what a machine is at an amount. Its channels are then read off the
-    plants at both ends, which is exact where [A B; C D] is affine in it, or a fraction; a kind
-    with other channels has its own `opened`.
+    A new kind says by `changed` what a machine is at an amount, for example by `with_port`. Its
+    channels are then read off the plants at both ends, so that [A B; C D] must be affine in the
+    amount, or a fraction of it: the row of a sensor that moves is taken as linear between the ends,
+    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind with other channels has its own `opened`.
 
     Parameters
     ----------

@@ -29,8 +29,7 @@ class GainDelta(Delta):
 
     def changed(self, machine: MachineParts, amount: float) -> MachineParts:
         """Return a machine with another gain."""
-        before = machine.gains.get(self.port, 1.0)
-        return machine.replace(gains={**machine.gains, self.port: before * (1.0 + amount)})
+        return machine.with_gain(self.port, 1.0 + amount)
 
     def require_in_range(self, deviations: float) -> None:
         """Refuse a gain of unknown sign."""

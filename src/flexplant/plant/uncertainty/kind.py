@@ -63,7 +63,7 @@ class Uncertainty(Value):
     >>> @dataclass(frozen=True, eq=False)
     ... class Warmth(fx.plant.Delta):
     ...     def changed(self, machine, amount):
-    ...         return machine.replace(gains={"u1": 1.0 + amount, "y1": 1.0 + amount})
+    ...         return machine.with_gain("u1", 1.0 + amount).with_gain("y1", 1.0 + amount)
     >>> @dataclass(frozen=True, eq=False)
     ... class Warm(fx.plant.Uncertainty):
     ...     def deltas(self, plant):

@@ -20,7 +20,7 @@ from ...updating import Machines, ModalUncertainty, UpdateResult
 from ...words import mapping
 from ..building import P
 from ..partitioned import Partition
-from .channels import Opened, require_exact
+from .channels import Opened, missed
 from .delta import Delta, with_changes
 from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
@@ -139,10 +139,7 @@ class UncertainPlant(Value, Generic[P]):
         # parameters solve other modes, whose states are not the plant's: gains are compared alone
         own = [one for one in deltas if one.stage and one.kind != "delay"]
         if own:
-            compared = found if not self.of_matrices else _opened(base, own)
-            values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(own)}
-            changes = [(delta, values[delta.name] * delta.scale) for delta in own]
-            require_exact(compared, base.system, with_changes(base, changes).system, values)
+            _require_exact(base, found if not self.of_matrices else _opened(base, own), own)
         return found
 
     @cached_property
@@ -349,6 +346,37 @@ def _opened(base: Partition, deltas: Sequence[Delta]) -> Opened:
     for own in groups.values():
         found = type(own[0]).opened(base, found, own)
     return found
+
+
+def _require_exact(base: Partition, opened: Opened, deltas: Sequence[Delta]) -> None:
+    """Raise ModelError unless the channels give the machine with all Deltas changed at once."""
+    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
+
+    def lost(chosen: Sequence[Delta]) -> str:
+        changes = [(one, values[one.name] * one.scale) for one in chosen]
+        own = {one.name: values[one.name] for one in chosen}
+        return missed(opened, base.system, with_changes(base, changes).system, own)
+
+    where = lost(deltas)
+    if not where:
+        return
+    cause = next((one for one in deltas if lost([one])), None)
+    if cause is None:
+        raise ModelError(
+            f"{where!r} depends on products of Deltas that the channels of "
+            f"{some_names(list(values))} lack. Leave one of these uncertainties out."
+        )
+    read_off = type(cause).opened.__func__ is Delta.opened.__func__  # type: ignore[attr-defined]
+    raise ModelError(
+        f"no channels express {cause.name!r}: {lost([cause])!r} is no affine function of its amount"
+        + (
+            ", nor a fraction. Let `changed` follow a straight line between its ends, or give "
+            f"{type(cause).__name__} an `opened` of its own."
+            if read_off
+            else " as displacements, velocities and accelerations are. Give the sensor a `row` and "
+            "a quantity, or leave that uncertainty out."
+        )
+    )
 
 
 def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
