@@ -168,6 +168,39 @@ def test_an_objective_counts_in_seconds_at_any_speed(speed, rate):
     assert found.certificate["norm"] == found.gamma
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Told(fx.synthesis.MeasuredObjective):
+    """What a list says in turn, then its last entry."""
+
+    said: Any = ()
+
+    def measured(self, closed):
+        return self.said.pop(0) if len(self.said) > 1 else self.said[0]
+
+
+@pytest.mark.parametrize(
+    ("said", "error", "match"),
+    [
+        ([np.nan], ModelError, "one positive number of a stable loop, got nan"),
+        ([-1.0], ModelError, "one positive number of a stable loop, got -1.0"),
+        ([None], ModelError, "one positive number of a stable loop, got None"),
+        ([np.inf], fx.errors.InfeasibleError, "infinite for the stable loops"),
+        (1.0 + 0.01 * np.arange(999), CertificateError, "one loop two numbers.*earlier calls"),
+        ([1.0], None, ""),
+    ],
+)
+def test_an_objective_that_fails_is_told_why(said, error, match):
+    made = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lti.low_pass_filter(0.1),
+                                      KS=0.1)  # fmt: skip
+    given = {"objective": Told(said=list(said)), "starts": 1, "evaluations": 20}
+    if error is None:  # nothing depends on the controller
+        found = fx.synthesis.design_structured(made, fx.synthesis.FixedOrder(0), **given)
+        assert found.gamma == 1.0
+        return
+    with pytest.raises(error, match=match):
+        fx.synthesis.design_structured(made, fx.synthesis.FixedOrder(0), **given)
+
+
 def test_a_judge_in_the_wrong_unit_of_time_is_told_so():
     class Wrong:
         below = None

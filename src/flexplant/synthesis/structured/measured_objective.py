@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 
 from ...arrays import FloatArray, positive
-from ...errors import require_known
+from ...errors import ModelError, require_known, short
 from ...lti.discretisation import tustin
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
@@ -25,7 +26,9 @@ class MeasuredObjective(Value):
     """The base class of objectives of your own: a positive number of the closed loop.
 
     A new objective gives `measured`, a smooth function of the loop from w to z in seconds and the
-    user's units. Its derivatives by the controller's parameters are found by differences.
+    user's units; infinite for a stable loop that is out of the question. It follows from the loop
+    alone, whatever its states. Its derivatives by the controller's n parameters are found by
+    differences: each gradient closes 2 n loops more, which `evaluations` does not count.
 
     Parameters
     ----------
@@ -86,7 +89,13 @@ class MeasuredJudge(SmoothJudge):
             return np.inf, None
         law = StateSpace(*K, inputs=self.sides[0], outputs=self.sides[1])
         closed = lft(self.system, tustin(law, 1.0 / self.dt) if self.dt else law)
-        return float(self.objective.measured(closed)), None
+        found: object = self.objective.measured(closed)
+        if not (isinstance(found, Real) and found > 0):
+            raise ModelError(
+                f"`measured` of {self.objective!r} must return one positive number of a stable "
+                f"loop, got {short(found)}. Return a number that falls as loops get better."
+            )
+        return float(found), None
 
     def _logarithm(self, K: Matrices, by: FloatArray) -> tuple[float, FloatArray]:
         value = self.value(K)[0]

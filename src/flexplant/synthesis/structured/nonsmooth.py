@@ -147,6 +147,8 @@ def minimax(
     while len(values) <= steps and refused <= _REFUSED and not spent():
         if mu is None:
             slope = float(np.linalg.norm(pieces.gradient[np.argmax(pieces.value)]))
+            if not slope:  # the number does not depend on the parameters here
+                break
             mu = slope / (_FIRST * max(1.0, float(np.linalg.norm(x))))
         model = _Model(pieces, value, weights)
         step, weights, decrease = model.step(mu)
@@ -202,7 +204,7 @@ def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, Flo
     # [LawsonHanson1995]_
     from scipy.optimize import nnls
 
-    size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny)
+    size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny ** 0.5)
     G, c = gradients / size, np.maximum(beside / size**2, -1.0 / _LIFT)
     lifted = np.vstack([-_LIFT * G.T, np.ones((1, c.size)), _LIFT * c[None] + 1.0 / _LIFT])
     right = np.zeros(lifted.shape[0])

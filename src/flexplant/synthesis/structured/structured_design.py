@@ -29,6 +29,7 @@ from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf, PeakGain
 from ..preparation import Prepared, posed, prepared, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
+from .measured_objective import MeasuredObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -91,9 +92,9 @@ def design_structured(
         StateSpace is accepted.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
         Structure of the controller, and start of the search.
-    objective : Hinf, H2, PeakGain, or sequence of these
+    objective : Hinf, H2, PeakGain, MeasuredObjective, or sequence of these
         Objective to be minimised; of several objectives, each with `below`, the largest ratio to
-        it. Any object with the methods of `LoopObjective` is accepted. H2 of a continuous plant is
+        it. One of your own is a kind of `synthesis.MeasuredObjective`. H2 of a continuous plant is
         finite for controllers without feedthrough where D12 and D21 are:
         ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
@@ -226,6 +227,11 @@ def design_structured(
 def _blame(objectives: Sequence[LoopObjective]) -> str:
     """Return why the search and the loop give two numbers."""
     foreign = [one for one in objectives if not isinstance(one, Hinf | H2 | PeakGain)]
+    if foreign and isinstance(foreign[0], MeasuredObjective):
+        return (
+            f"`measured` of {foreign[0]!r} gives one loop two numbers. It must follow from the "
+            "loop from w to z alone: not from its states, earlier calls or random numbers"
+        )
     if foreign:
         return (
             f"`measured` of {foreign[0]!r} and what its `judges` minimise are not one number. "
@@ -266,7 +272,8 @@ def _objectives(given: Any) -> list[LoopObjective]:
         if isinstance(one, type) or not hasattr(one, "judges"):
             raise ModelError(
                 "objective must be synthesis.Hinf(...), synthesis.H2(...), "
-                f"synthesis.PeakGain(...) or several of them, got {short(one)}."
+                "synthesis.PeakGain(...), a synthesis.MeasuredObjective of yours or several of "
+                f"them, got {short(one)}."
             )
         if len(every) > 1 and one.below is None:
             raise ModelError(
@@ -486,6 +493,11 @@ class _StructureSearch:
 
     def _infeasible(self, theta: FloatArray, starts: int) -> InfeasibleError:
         K = self.family.matrices(theta)
+        if all(loop.stable(K) is not None for loop in self.loops):
+            return InfeasibleError(
+                f"the objective is infinite for the stable loops at the end of all {starts} starts."
+                " Give it a number for every stable loop, or a structure that starts elsewhere."
+            )
         worst = max(range(len(self.loops)), key=lambda i: self.loops[i].stability(K)[0])
         value, _, pole = self.loops[worst].stability(K)
         freq = self.problems[worst].frequency(abs(pole.imag))
