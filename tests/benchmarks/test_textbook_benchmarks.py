@@ -40,7 +40,7 @@ def test_textbook_plants(judge, capsys):
 
 @pytest.mark.benchmark
 def test_linear_matrix_inequalities_are_right_or_refused(capsys):
-    """The smallest gamma of LMIs: none is false; those far above the optimum are counted."""
+    """The smallest gamma of LMIs: none is false or loose, one in ten may be refused."""
     found, slowest = Counter(), 0.0
     for kind, seed in product(KINDS, SEEDS):
         before = time.process_time()
@@ -48,7 +48,8 @@ def test_linear_matrix_inequalities_are_right_or_refused(capsys):
         slowest = max(slowest, time.process_time() - before)
     with capsys.disabled():
         print(f"\nLmi(): {dict(found)}, the slowest in {slowest:.1f} s, its judgement included")
-    assert found.keys() <= {"right", "loose", "refused"}
+    assert found.keys() <= {"right", "refused"}
+    assert found["right"] >= 0.9 * sum(found.values())
 
 
 @pytest.mark.benchmark

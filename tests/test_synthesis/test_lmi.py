@@ -13,7 +13,7 @@ from flexplant.lti import StateSpace, lft
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
 from flexplant.synthesis.lmi import lmi_programs as lmi_programs
-from flexplant.synthesis.lmi.lmi_programs import Plant, smallest_gamma, symmetric_blocks
+from flexplant.synthesis.lmi.lmi_programs import Plant, projected, symmetric_blocks
 from flexplant.synthesis.preparation import prepared
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
 from shared_data import data_file
@@ -189,27 +189,6 @@ def test_a_solver_that_stops_early_is_not_the_end(n, seed, full):
 
 
 @pytest.mark.slow
-def test_where_every_setting_stops_early_the_error_is_ours(monkeypatch):
-    """Gahinet's program, 10 states, rng 2: gamma is 2e6 times the plant's size."""
-    monkeypatch.setattr(lmi_programs, "ATTEMPTS", ({},))
-    P, u, y = system(random_system(10, 2, True))
-    with pytest.raises(SolverError, match=r"Loosen weights|loosen weights"):
-        design_hinf(P, Lmi(back_off=1e-3), u=u, y=y)
-
-
-@pytest.mark.slow
-def test_an_answer_that_cannot_be_read_is_named(monkeypatch):
-    import cvxpy as cp
-
-    def unread(*_):
-        raise cp.error.SolverError("Solver 'CLARABEL' failed.")
-
-    monkeypatch.setattr(cp.Problem, "unpack_results", unread)
-    with pytest.raises(SolverError, match=r"could not be read .*Solved after .*Loosen weights"):
-        Lmi().solve(problem(scalar(1.0, 1.0)))
-
-
-@pytest.mark.slow
 def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
     h = 1e-3
     # 2 kg on no spring in SI units, sampled; y in m, z the position error in um and the effort
@@ -287,27 +266,15 @@ def test_blocks_are_mirrored():
     np.testing.assert_allclose(M, np.block([[(a + a.T) / 2, b], [b.T, (c + c.T) / 2]]))
 
 
-def test_every_lmi_is_symmetric_for_any_values(monkeypatch):
-    seen = []
-
-    def look(program, settings):
-        rng = np.random.default_rng(0)
-        for variable in program.variables():
-            value = rng.standard_normal(variable.shape)
-            variable.value = value + value.T if variable.attributes["symmetric"] else value
-        for constraint in program.constraints:
-            M = constraint.args[0].value
-            assert np.max(np.abs(M - M.T)) <= 1e-12 * np.max(np.abs(M))
-            seen.append(M.shape)
-        raise SolverError("seen")
-
-    monkeypatch.setattr(lmi_programs, "solve_program", look)
-    p = Plant.of(problem(random_parts(5, n=4)))
-    with pytest.raises(SolverError, match="seen"):
-        smallest_gamma(p, 1.0, SETTINGS)
-    with pytest.raises(SolverError, match="seen"):
-        lmi_programs.moderate_controller(p, 1.05, SETTINGS)
-    assert seen[2] == (8, 8) and seen[3:] == [(11, 11), (11, 11), (8, 8)]
+def test_every_lmi_is_symmetric_for_any_values():
+    X, Y, constraints = projected(Plant(*random_parts(5, n=4), np.ones(2), np.ones(2)), 1.0)
+    rng = np.random.default_rng(0)
+    for variable in (X, Y):
+        value = rng.standard_normal(variable.shape)
+        variable.value = value + value.T
+    matrices = [constraint.args[0].value for constraint in constraints]
+    assert all(np.max(np.abs(M - M.T)) <= 1e-12 * np.max(np.abs(M)) for M in matrices)
+    assert matrices[2].shape == (8, 8)
 
 
 # --- what is refused
@@ -346,10 +313,9 @@ def test_too_many_states_or_none():
 
 
 def test_an_unreachable_unstable_mode_has_no_controller():
-    # only weakly infeasible (Y towards 0 satisfies all), so that the solver has no proof
     parts = list(scalar(1.0, 1.0))
     parts[2] = [[0.0]]
-    with pytest.raises(SolverError, match=r"after \d+ iterations.*Does u reach"):
+    with pytest.raises(SolverError, match="Does u reach"):
         Lmi().solve(problem(parts))
 
 

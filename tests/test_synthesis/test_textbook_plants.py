@@ -243,4 +243,4 @@ def test_a_structured_design_of_full_order(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["two lags", "double integrator", "distillation", "RHP zero"])
 def test_linear_matrix_inequalities(kind):
-    assert judged(kind, 0, Lmi()).gamma <= SINGULAR
+    assert judged(kind, 0, Lmi()).word == "right"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -28,7 +28,7 @@ from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks,
 #: gains stay finite where D12 and D21 have full rank, so that 1 % is kept with the tolerance, and
 #: with what is added for undamped modes or to tiny efforts; they grow without bound where the ranks
 #: are missing
-_REGULAR, _ADDED, _SINGULAR = 0.008, 0.003, 0.05
+_REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
 #: most steps of the bisection
@@ -42,6 +42,14 @@ _SLACK = 1e-6
 #: by how much a norm may exceed its gamma, relative to the distance from the smallest one. Of a lag
 #: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
 _MISSED = 0.1
+#: least distance that counts as one
+_LEAST = 1e-3
+
+#: a search in a regular problem, scaled by the norm of its loop of least quadratic cost, and by
+#: which: the smallest gamma that is reached, and the largest that is refuted
+Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
+#: the norm of the loop of a problem with a controller
+NormOf: TypeAlias = Callable[[Prepared, StateSpace], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +72,7 @@ class Riccati(Value):
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. Unless given 0.8 % where D12 and D21 have
+        Relative distance from the smallest gamma found. Unless given 0.5 % where D12 and D21 have
         full rank (0.3 % with what is added for a missed mode or to a tiny effort or noise), and
         5 % where they have not.
     tolerance : float
@@ -106,89 +114,94 @@ class Riccati(Value):
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
-        lack = lacking(problem)
         if self.regularised is False:
+            lack = lacking(problem)
             require_ranks(() if lack.is_full else lack.ranks)
             require_shown(problem)
-            return self._regular(problem, _REGULAR)
-        if self.regularised is None and not lack.words:
-            return self._regular(problem, _REGULAR)
-        back_off = _ADDED if lack.is_full else _SINGULAR
-        return made_regular(problem, lambda regular: self._regular(regular, back_off), lack)
-
-    def _regular(
-        self,
-        problem: Prepared,
-        back_off: float,
-        norm_of: Callable[[Prepared, StateSpace], float] | None = None,
-    ) -> SolvedController:
-        """Return the controller of a regular problem, accepted by some norm of its loop."""
-        # the least quadratic cost stabilises: its norm is where the search for less begins
-        try:
-            least = h2_controller(problem)
-            unit = _resonance_gain(problem, least)
-        except (la.LinAlgError, OnAxisError, SolverError):
-            unit = np.inf
-        if not np.isfinite(unit):
-            raise SolverError(
-                "no controller of least quadratic cost stabilises in rounding: "
-                + beyond_rounding(problem)
-            )
-        if unit <= ROUNDING * _open_size(problem):  # w reaches nothing in z
-            return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
-        scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
-        with Progress(
-            _BISECTION, "steps of the bisection", progress=self.progress, even=False
-        ) as bar:
-            high, low = self._searched(scaled, bar)
-            K, norm = self._accepted(scaled, high, back_off, norm_of)
-        if K is None:  # nothing below it holds
-            K = least.replace(C=least.C / unit)
-            norm = norm_of(scaled, K)
-        _require_finite_gain(scaled, K, unit * norm)
-        return SolvedController(
-            K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm)
+            return regular_controller(problem, self._searched, self.back_off)
+        return back_off_controller(
+            problem, self._searched, self.back_off, always=bool(self.regularised)
         )
 
-    def _searched(self, problem: Prepared, bar: Progress) -> tuple[float, float]:
+    def _searched(self, problem: Prepared, _: float) -> tuple[float, float]:
         """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
         # reached: what the equations promise of a step is seen at the resonances of its loop
         high = 1.0
         low = tried = min(high, max(one.direct for one in both_sides(problem)))
-        for _ in range(_BISECTION):
-            if high <= tried * (1.0 + self.tolerance) or high < SETTLED:
-                break
-            middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
-            K, refuted = _attempt(problem, middle)
-            bar.advance()
-            gain = np.inf if K is None else _resonance_gain(problem, K)
-            if gain <= middle * (1.0 + _SLACK):
-                high = middle
-                continue
-            high, tried = min(high, gain), middle  # rounding costs some of what is promised
-            if refuted:
-                low = middle
+        with Progress(
+            _BISECTION, "steps of the bisection", progress=self.progress, even=False
+        ) as bar:
+            for _ in range(_BISECTION):
+                if high <= tried * (1.0 + self.tolerance) or high < SETTLED:
+                    break
+                middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
+                K, refuted = _attempt(problem, middle)
+                bar.advance()
+                gain = np.inf if K is None else resonance_gain(problem, K)
+                if gain <= middle * (1.0 + _SLACK):
+                    high = middle
+                    continue
+                high, tried = min(high, gain), middle  # rounding costs some of what is promised
+                if refuted:
+                    low = middle
         return high, low
 
-    def _accepted(
-        self,
-        problem: Prepared,
-        high: float,
-        back_off: float,
-        norm_of: Callable[[Prepared, StateSpace], float],
-    ) -> tuple[StateSpace | None, float]:
-        """Return the backed-off controller with the norm of its loop."""
-        # next to the optimum rounding puts norms above their gammas, and a controller that misses
-        # by much of its distance hangs on rounding: the distance grows until the norm holds
-        step = back_off if self.back_off is None else self.back_off
-        while step < 1.0:
-            controller = _attempt(problem, high * (1.0 + step)).controller
-            if controller is not None:
-                norm = norm_of(problem, controller)
-                if norm <= high * (1.0 + step + _MISSED * max(step, self.tolerance)):
-                    return controller, norm
-            step = max(2.0 * step, self.tolerance)
-        return None, 1.0
+
+def back_off_controller(
+    problem: Prepared, search: Search, back_off: float | None, *, always: bool = False
+) -> SolvedController:
+    """Return the controller at a distance from the smallest gamma of a search.
+
+    A little noise and effort is added where the problem needs it, or always.
+    """
+    lack = lacking(problem)
+    if not (always or lack.words):
+        return regular_controller(problem, search, back_off)
+    step = (_ADDED if lack.is_full else _SINGULAR) if back_off is None else back_off
+    return made_regular(problem, lambda regular: regular_controller(regular, search, step), lack)
+
+
+def regular_controller(
+    problem: Prepared, search: Search, back_off: float | None, norm_of: NormOf | None = None
+) -> SolvedController:
+    """Return the controller of a regular problem, accepted by some norm of its loop."""
+    # the least quadratic cost stabilises: its norm is the unit in which a search looks for less
+    try:
+        least = h2_controller(problem)
+        unit = resonance_gain(problem, least)
+    except (la.LinAlgError, OnAxisError, SolverError):
+        unit = np.inf
+    if not np.isfinite(unit):
+        raise SolverError(
+            "no controller of least quadratic cost stabilises in rounding: "
+            + beyond_rounding(problem)
+        )
+    if unit <= ROUNDING * _open_size(problem):  # w reaches nothing in z
+        return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
+    scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
+    high, low = search(scaled, unit)
+    K, norm = _accepted(scaled, high, _REGULAR if back_off is None else back_off, norm_of)
+    if K is None:  # nothing below it holds
+        K = least.replace(C=least.C / unit)
+        norm = norm_of(scaled, K)
+    _require_finite_gain(scaled, K, unit * norm)
+    return SolvedController(K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm))
+
+
+def _accepted(
+    problem: Prepared, high: float, step: float, norm_of: NormOf
+) -> tuple[StateSpace | None, float]:
+    """Return the backed-off controller with the norm of its loop."""
+    # next to the optimum rounding puts norms above their gammas, and a controller that misses by
+    # much of its distance hangs on rounding: the distance grows until the norm holds
+    while step < 1.0:
+        controller = _attempt(problem, high * (1.0 + step)).controller
+        if controller is not None:
+            norm = norm_of(problem, controller)
+            if norm <= high * (1.0 + step + _MISSED * max(step, _LEAST)):
+                return controller, norm
+        step = max(2.0 * step, _LEAST)
+    return None, 1.0
 
 
 def quick_answer(problem: Prepared) -> SolvedController:
@@ -198,9 +211,9 @@ def quick_answer(problem: Prepared) -> SolvedController:
     quick = Riccati(tolerance=_QUICK, progress=False)
     lack = lacking(problem)
     if not lack.words:
-        return quick._regular(problem, _REGULAR, _resonance_gain)
+        return regular_controller(problem, quick._searched, None, resonance_gain)
     regular = Regularised(problem, LEVELS[0], bool(lack.modes))
-    found = quick._regular(regular.problem, _SINGULAR, _resonance_gain)
+    found = regular_controller(regular.problem, quick._searched, _SINGULAR, resonance_gain)
     return SolvedController(*regular.restored(found), found.gamma, 0.0)
 
 
@@ -237,7 +250,7 @@ def _loop_norm(problem: Prepared, controller: StateSpace) -> float:
     return peak_gain(lft(problem.system, controller))[0]
 
 
-def _resonance_gain(problem: Prepared, controller: StateSpace) -> float:
+def resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     """Return the largest gain of the loop at its resonances: quick, at most its norm."""
     try:
         loop = lft(problem.system, controller)
