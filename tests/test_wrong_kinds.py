@@ -174,7 +174,7 @@ CALLS = [
     ("design_hinf", lambda x: fx.design_hinf(x), ()),
     ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),
     ("design_hinf u", lambda x: fx.design_hinf(plant().system, u=x, y=plant().y), ()),
-    ("Lmi back_off", lambda x: fx.Lmi(back_off=x), ("fraction",)),
+    ("Lmi back_off", lambda x: fx.Lmi(back_off=x), ("none", "fraction")),
     ("Lmi max_states", lambda x: fx.Lmi(max_states=x), ()),
     ("Lmi tolerance", lambda x: fx.Lmi(tolerance=x), ("fraction",)),
     ("Riccati tolerance", lambda x: fx.Riccati(tolerance=x), ("fraction",)),

@@ -145,7 +145,7 @@ def test_what_fails_raises(monkeypatch):
     def failing(self, *problem):
         raise SolverError("these equations were not solved.")
 
-    monkeypatch.setattr(Riccati, "_regular", failing)
+    monkeypatch.setattr(Riccati, "_searched", failing)
     monkeypatch.setattr(Riccati, "solve", plain)
     with pytest.raises(SolverError, match=r"^these equations were not solved\.$"):
         solved(*plant)

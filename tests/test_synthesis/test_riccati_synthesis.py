@@ -538,18 +538,11 @@ def test_a_missing_channel_is_named(missing):
         design_hinf(P, u=u, y=y)
 
 
-@pytest.mark.parametrize(
-    ("method", "bar"),
-    [
-        (None, "steps of the bisection"),
-        (Riccati(), "steps of the bisection"),
-        (Lmi(), "programs of the LMIs"),
-    ],
-)
-def test_progress_shows_the_steps_of_each_method(method, bar, capsys):
+@pytest.mark.parametrize("method", [None, Riccati()])
+def test_progress_shows_the_steps_of_the_bisection(method, capsys):
     P, u, y = scalar(1.0)
     found = design_hinf(P, method, u=u, y=y, progress=True)
-    assert bar in capsys.readouterr().err
+    assert "steps of the bisection" in capsys.readouterr().err
     design_hinf(P, method, u=u, y=y, progress=False)
     assert not capsys.readouterr().err
     hinf_norm(found.system, progress=True)

@@ -87,8 +87,8 @@ def design_hinf(
         and y are given.
     method : Riccati or Lmi, optional
         By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
-        singular, and a little disturbance where w or z misses an undamped mode. `Lmi()`
-        needs neither and suits up to 30 states.
+        singular, and a little disturbance where w or z misses an undamped mode. `Lmi()` finds
+        gamma by a semidefinite program and suits up to 30 states.
     bandwidth : float [Hz], optional
         For a stage without weights: those of `stage_weights` are used, for the POI's only
         reference. `design_stage` finds the largest possible one.

@@ -146,8 +146,7 @@ def require_ranks(ranks: Sequence[str]) -> None:
     """Raise AssumptionError when D12 or D21 has not full rank, with the cure of each."""
     if ranks:
         raise AssumptionError(
-            f"{'; '.join(ranks)}, and nothing may be added (regularised=False). "
-            f"{_remedy(ranks)} Or use Lmi(), which needs no rank."
+            f"{'; '.join(ranks)}, and nothing may be added (regularised=False). {_remedy(ranks)}"
         )
 
 

@@ -232,8 +232,8 @@ def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
 #: largest relative distance of a program's gamma from its lower bound; and how far above the bound
 #: the controller's own distance begins at most: with that, 0.5 %, it makes 1 %
 _GAP, _NEAR = 2e-2, 5e-3
-#: gamma, relative to the plant's own, that is taken for zero
-_NOTHING = 1e-7
+#: gamma, relative to the norm of the loop of least quadratic cost, that is taken for zero
+_NOTHING = 1e-4
 #: regularisation of Clarabel's equations: X and Y of smallest gammas are nearly singular, and its
 #: own 1e-8 leaves these gammas up to 4 % too large; 1e-11 fails on one plant in a hundred
 _REGULARISATION = 1e-10
@@ -320,8 +320,8 @@ class Lmi(Value):
                 f"unstable mode? {beyond_rounding(given).capitalize()}"
             ) from error
         problem = given.measured_in(unit)
-        parts = (getattr(problem, name) for name in Plant._fields[:8])
-        plant = Plant(*parts, np.ones(len(given.u)), np.ones(len(given.y)))
+        p, units = problem, (np.ones(len(given.u)), np.ones(len(given.y)))
+        plant = Plant(p.A, p.B1, p.B2, p.C1, p.C2, p.D11, p.D12, p.D21, *units)
         cp, gamma = modelling(), modelling().Variable()
         states = plant.balanced(X / unit**2, Y).with_unit_channels()
         X, Y, constraints = projected(states, gamma)
@@ -330,7 +330,7 @@ class Lmi(Value):
         settings["static_regularization_constant"] = _REGULARISATION
         solve_program(cp.Problem(goal, constraints), settings)
         high = float(gamma.value)
-        if high * unit < _NOTHING * given.own_gain:
+        if high < _NOTHING:
             raise InfeasibleError(
                 "gamma has no minimum: the infimum is 0. u cancels w in z, at no cost. Weight the "
                 "efforts in z, or give the sensors noise in w."
