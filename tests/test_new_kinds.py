@@ -37,9 +37,9 @@ class Strain(StretchGauge):
         return super().row(realisation) / self.length
 
 
-def plant(*sensors):
+def plant(*sensors, noises=()):
     ports = fx.Ports(
-        w=[fx.Disturbance("f", at="1:x", asd=1e-3)],
+        w=[fx.Disturbance("f", at="1:x", asd=1e-3), *noises],
         u=[fx.Actuator("u", at="1:x")],
         z=[fx.Poi("die", at="3:x", axes=("x",))],
         y=sensors or [fx.Sensor("y", at="3:x", direction="x", asd=1e-9)],
@@ -49,14 +49,21 @@ def plant(*sensors):
 
 
 def test_a_sensor_keeps_its_unit(tmp_path):
+    leaking = fx.StateSpace([[-0.1]], [[1.0]], [[1.0]], [[0.0]])
+    walks = [
+        fx.plant.OutputDisturbance("rate", "gap", asd=1e-9, shape=leaking, unit="m/s"),
+        fx.plant.OutputDisturbance("hum", "gap"),
+    ]
     made = plant(
-        StretchGauge("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8)
-    )
+        StretchGauge("gap", "2:x", "1:x", asd=1e-9), Strain("strain", "2:x", "1:x", asd=1e-8),
+        noises=walks,
+    )  # fmt: skip
     made = made.discretized(5e3, delay=1)
     made.save(tmp_path / "plant.npz")
     for one in (made, fx.load(tmp_path / "plant.npz")):
         assert (one.units["gap"], one.units["strain"]) == ("m", "m/m")
         assert one.units["strain:noise"] == "m/m"
+        assert (one.units["rate"], one.units["hum"]) == ("m/s", "m")
     gains = fx.frequency_response(made.Gyu, [20.0]).data[:, 0, 0]
     assert gains[1] == pytest.approx(10.0 * gains[0], rel=1e-9)
     assert fx.design_kalman(made).rms("die") > 0

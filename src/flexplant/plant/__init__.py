@@ -10,6 +10,7 @@ for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u =
   for analysis and as machines drawn at random; your own kind of uncertainty derives from
   `Uncertainty`. Dynamics that the model lacks: `Neglected` modes,
   `UnmodelledDynamics(weight, at="u1")`.
+- Your own kind of sensor derives from `SensorPort`, a force from `ForcePort`.
 - `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body, with its
   mass); `frequency_response` of structures between their ports.
 

@@ -155,18 +155,21 @@ class OutputDisturbance(ForcePort):
     ----------
     name, sensor : str
         Names of the channel and of the sensor.
-    asd : float [unit of the sensor/sqrt(Hz)]
+    asd : float [unit of the channel/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     asd_deviation : float
         Relative deviation of the density, by which machines that are drawn differ.
     shape : StateSpace, optional
         A stable filter between the channel and the sensor: drift, mains hum.
+    unit : str, optional
+        Unit of the channel where the shape changes it, rad/s of the rate whose integral a gyro
+        shows, say; by default the sensor's.
 
     Examples
     --------
     >>> import flexplant as fx
     >>> fx.plant.OutputDisturbance("cable", sensor="y1", asd=1e-12)
-    OutputDisturbance(name='cable', sensor='y1', asd=1e-12, shape=None)
+    OutputDisturbance(name='cable', sensor='y1', asd=1e-12, shape=None, unit=None)
     """
 
     name: str
@@ -174,6 +177,7 @@ class OutputDisturbance(ForcePort):
     asd: float = 0.0
     shape: StateSpace | None = None
     asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
+    unit: str | None = field(default=None, kw_only=True)
 
     @property
     def added_to(self) -> str:

@@ -125,7 +125,7 @@ class SensorPort(Value):
 
     `row` gives a displacement, for example of one point relative to another; with a `quantity` also
     its velocity or acceleration. `see` gives anything that is linear in states and forces; `row` is
-    then what the sensor shows at rest.
+    then what the sensor shows at rest. Coloured noise of a sensor is an `OutputDisturbance` in w.
 
     Parameters
     ----------

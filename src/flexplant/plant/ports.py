@@ -365,14 +365,14 @@ class Ports(Value):
         """The SI units of all channels that have one, and of derived channels.
 
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
-        sensors, references, errors and estimates like their POI, efforts like their actuator. A sum
-        of displacements and rotations has the unit of the part whose weights have length 1, as a
-        displacement has with levers [m] of rotations; no unit if both parts do, or none. Filters of
-        ports do not change units.
+        sensors, where a coloured one has no `unit` of its own, references, errors and estimates
+        like their POI, efforts like their actuator. A sum of displacements and rotations has the
+        unit of the part whose weights have length 1, as a displacement has with levers [m] of
+        rotations; no unit if both parts do, or none. Filters of ports do not change units.
         """
         found = {port.name: port.unit for port in self.physical}
         for port in self.w:
-            if port.added_to is not None:
+            if port.added_to is not None and port.unit is None:
                 found[port.name] = found[port.added_to]
         found |= {f"{sensor.name}:noise": sensor.unit for sensor in self.y}
         for kind in ("effort", "disturbance"):

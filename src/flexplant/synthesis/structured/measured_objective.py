@@ -90,7 +90,7 @@ class MeasuredJudge(SmoothJudge):
         law = StateSpace(*K, inputs=self.sides[0], outputs=self.sides[1])
         closed = lft(self.system, tustin(law, 1.0 / self.dt) if self.dt else law)
         found: object = self.objective.measured(closed)
-        if not (isinstance(found, Real) and found > 0):
+        if not (isinstance(found, Real) and float(found) > 0.0):
             raise ModelError(
                 f"`measured` of {self.objective!r} must return one positive number of a stable "
                 f"loop, got {short(found)}. Return a number that falls as loops get better."
