@@ -101,6 +101,14 @@ class AxisLaw:
         """Return the response of `law`, whose elements are not made, at any s of Tustin's rule."""
         return self._scale(numbers) * product(self.sections(numbers), s)
 
+    def is_stable(self, numbers: FloatArray) -> bool:
+        """Return whether the loop is stable, by the Nyquist count of what the lines resolve."""
+        axis = self.axis
+        if axis.resolved:
+            loop = self.response(numbers, self.s) * axis.points[1]
+            return bool(_turns_stably(loop, axis.integrators))
+        return are_stable([self.law(numbers)], axis.freq, axis.G[None, None], rigid=int(axis.free))
+
     def _scale(self, numbers: FloatArray) -> float:
         """Return the gain with which the loop of the rigid body crosses 1 at the bandwidth."""
         w = float(np.exp(numbers[0]))
@@ -193,7 +201,7 @@ class AxisLaw:
         """Return what steps from some numbers lead to; None when that does not hold the peak."""
         # linear programs within a radius, with an exact penalty [Fletcher1987]_, chapter 14
         x, radius, best = numbers, _RADIUS, None
-        if not self.axis.is_stable(self.law(x)):
+        if not self.is_stable(x):
             return None
         room = self._spare(x)
         for _ in range(steps):
@@ -202,7 +210,7 @@ class AxisLaw:
                 break
             trial = self._spare(x + step)
             gained = step[0] + _PENALTY * (min(trial.min(), 0.0) - min(room.min(), 0.0))
-            if gained > 0.1 * expected and self.axis.is_stable(self.law(x + step)):
+            if gained > 0.1 * expected and self.is_stable(x + step):
                 x, room = x + step, trial
                 radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
                 if room.min() >= -_SPARE and (best is None or x[0] > best[0]):
@@ -313,6 +321,8 @@ class MeasuredAxis:
     #: of 1 / s on the line where its bandwidth is sought: 2 of a mass, 1 of its velocity, 0 of a
     #: spring
     power: int = _MASS
+    #: whether the lines resolve all resonances, as those of a model do
+    resolved: bool = False
 
     @property
     def ceiling(self) -> float:
@@ -328,6 +338,8 @@ class MeasuredAxis:
     @cached_property
     def deviation(self) -> FloatArray:
         """The standard deviation of each line."""
+        if self.resolved:
+            return np.zeros(self.freq.size)
         if self.variance is not None:
             return np.asarray(np.sqrt(self.variance))
         return _scatter(self.freq, self.G)
@@ -337,7 +349,7 @@ class MeasuredAxis:
         """Frequencies [Hz], responses and bounds on their errors: the lines, and between them."""
         # where a response changes much, it follows the circles through its neighbours
         f, G, bound = self.freq, self.G, _DEVIATIONS * self.deviation
-        if f.size < 4:
+        if f.size < 4 or self.resolved:
             return f, G, bound
         step = np.abs(np.diff(G))
         size = np.minimum(np.abs(G[1:]), np.abs(G[:-1]))
@@ -392,9 +404,10 @@ class MeasuredAxis:
         above = self.suspension if self.power == _MASS else 0.0
         return self._peaks[self._peaks > above]
 
-    def is_stable(self, law: Law) -> bool:
-        """Return whether the loop of a law is stable, by the Nyquist count."""
-        return are_stable([law], self.freq, self.G[None, None], rigid=int(self.free))
+    @property
+    def integrators(self) -> int:
+        """The number of poles of the axis with its law at zero frequency."""
+        return 2 * self.free + (self.power != 1)
 
 
 def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid: int) -> bool:
@@ -501,7 +514,7 @@ def starts(of: AxisLaw) -> list[FloatArray]:
             # far enough from the last of the same notches to end elsewhere
             apart = not own or score < own[-1][0] - _APART
             if np.isfinite(score) and len(own) < _EACH and apart:
-                own += [(score, numbers)] if of.axis.is_stable(of.law(numbers)) else []
+                own += [(score, numbers)] if of.is_stable(numbers) else []
     best = sorted((one for own in found for one in own), key=lambda one: -one[0])
     return [numbers for _, numbers in best[:_STARTS]]
 
@@ -531,8 +544,8 @@ def _best_starts(
     gain = gain[..., :-1] * level / np.abs(gain[..., -1:])
     room = np.min(of.room_of(gain, rows), axis=-1)
     room[room < -_LACK] = -np.inf
-    at_zero = 2 * of.axis.free + (of.axis.power != 1)
-    room[~_turns_stably(gain * of.axis.points[1][rows], at_zero)] = -np.inf
+    stable = _turns_stably(gain * of.axis.points[1][rows], of.axis.integrators)
+    room[~stable] = -np.inf
     best, each = np.argmax(room, axis=1), np.arange(len(sets))
     scores = np.log(w) + _LATER * np.minimum(room[each, best], 0.0)
     return [

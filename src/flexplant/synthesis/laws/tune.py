@@ -114,6 +114,7 @@ def tune_loops(
         return made(axes, {axes.names[0]: _pid_law(axes, float(peak))}, 0, 0, None)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
+    resolved = not isinstance(axes.plant, Frf)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         for i, (name, (free, powers)) in enumerate(
             zip(axes.names, _lines(axes, rigid), strict=True)
@@ -121,7 +122,8 @@ def tune_loops(
             variance = None if frf.variance is None else frf.variance[i, i]
             lines = (frf.freq, frf.data[i, i], axes.rate, free, variance)
             laws = [
-                AxisLaw(MeasuredAxis(name, *lines, power), float(peak), most) for power in powers
+                AxisLaw(MeasuredAxis(name, *lines, power, resolved), float(peak), most)
+                for power in powers
             ]
             law, numbers = _fastest(laws)
             of.append(law)
@@ -235,7 +237,7 @@ def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
     grid = resonance_grid(plant.plant.poles(), dt, points=1000)
     freq = grid[grid < 0.4999 / dt] if dt else grid
     data = np.moveaxis(plant.coupling(freq).inner, 0, -1)
-    return Frf(freq, data, axes.before.inputs, axes.names, variance=np.zeros(data.shape))
+    return Frf(freq, data, axes.before.inputs, axes.names)
 
 
 #: slower starts, as a factor, until the loops are stable with |S| below so much
