@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 from ..arrays import FloatArray
@@ -360,7 +361,7 @@ class Ports(Value):
         pois = [poi.channel(axis) for poi in self.z for axis in poi.axes]
         return [*pois, *(sensor.name for sensor in self.y)]
 
-    @property
+    @cached_property
     def units(self) -> dict[str, str]:
         """The SI units of all channels that have one, and of derived channels.
 

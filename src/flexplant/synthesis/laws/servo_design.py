@@ -312,16 +312,23 @@ class ServoTask:
             return ServoLaw(driven, tuple(self.axis(n, float(f), float(g)) for n, f, g in each))
 
         tried = [of(lines) for lines in combinations(lines_of(self.plant, driven))]
-        best = tried[0] if len(tried) == 1 else min(tried, key=self._badness)
+        able = [one for one in tried if self.phase_margins(one).min() > 0.0]
+        if not able:
+            return tried[0]
+        best = self._best(able)
         wide = of(widened([axis.line for axis in best.axes]))
         modes, lowest = elastic(self.plant), float(driven.freq.min())
         if wide == best or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
             return best
-        return min((best, wide), key=lambda one: self._badness(self.notched(one)))
+        ends = [self.notched(best), self.notched(wide)]
+        return best if self._best(ends) is ends[0] else wide
 
-    def _badness(self, law: ServoLaw) -> tuple[bool, float]:
-        """Return whether the loop of a law is unstable, and the peak of |S| at u."""
-        return not self.closed(law).is_stable, self.loop.peak(law)[0]
+    def _best(self, laws: Sequence[ServoLaw]) -> ServoLaw:
+        """Return the law with the lowest peak of |S| at u among those whose loop is stable."""
+        if len(laws) == 1:
+            return laws[0]
+        rising = sorted(laws, key=lambda law: self.loop.peak(law)[0])
+        return next((law for law in rising if self.closed(law).is_stable), rising[0])
 
     def axis(self, line: str, bandwidth: float, gain: float) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""

@@ -389,11 +389,14 @@ class JointSearch:
         """Return the problem linearised at some numbers."""
         slopes, places = [np.empty((0, x.size))], []
         for number, (one, C, room) in enumerate(zip(couplings, gains, rooms, strict=True)):
-            for place, own in enumerate(room):
-                rows = np.unique(near_lowest(own, _LOWEST, _REACH))
+            near = [np.unique(near_lowest(own, _LOWEST, _REACH)) for own in room]
+            some = np.unique(np.concatenate(near))
+            changes = self._changes(x, one.freq[some])
+            for place, rows in enumerate(near):
                 if rows.size:
-                    some = one.rows(rows)
-                    slopes.append(self._by_numbers(x, some, some.slopes(C[rows], place)))
+                    by_laws = one.rows(rows).slopes(C[rows], place)
+                    by_numbers = by_laws[:, self._owners] * changes[np.searchsorted(some, rows)]
+                    slopes.append(by_numbers.real)
                     places.append((number, place, rows))
         limits = [law.limits(own) for law, own in zip(self.of, self._split(x), strict=True)]
         low, high, sides, most = zip(*limits, strict=True)
@@ -402,18 +405,20 @@ class JointSearch:
         bounds = (np.concatenate(low) - x, np.concatenate(high) - x, bound, slack)
         return _Program(np.vstack(slopes), places, bounds, self._places)
 
-    def _by_numbers(self, x: FloatArray, some: Coupling, slopes: ComplexArray) -> FloatArray:
-        """Return the derivatives by the numbers from those by the laws, by differences."""
-        s = tustin_s(some.freq, self.of[0].axis.rate)
+    def _changes(self, x: FloatArray, freq: FloatArray) -> ComplexArray:
+        """Return the derivatives (n, numbers) of the laws by their numbers, by differences."""
+        s = tustin_s(freq, self.of[0].axis.rate)
         found = []
-        for i, (law, own) in enumerate(zip(self.of, self._split(x), strict=True)):
+        for law, own in zip(self.of, self._split(x), strict=True):
             here = law.response(own, s)
-            for k in range(own.size):
-                moved = own.copy()
-                moved[k] += _DIFFERENCE
-                change = (law.response(moved, s) - here) / _DIFFERENCE
-                found.append((slopes[:, i] * change).real)
+            for step in _DIFFERENCE * np.eye(own.size):
+                found.append((law.response(own + step, s) - here) / _DIFFERENCE)
         return np.array(found).T
+
+    @property
+    def _owners(self) -> IntArray:
+        """The axis of each number."""
+        return np.repeat(np.arange(len(self.given)), [one.size for one in self.given])
 
     @property
     def _places(self) -> IntArray:
