@@ -411,8 +411,8 @@ class JointSearch:
         found = []
         for law, own in zip(self.of, self._split(x), strict=True):
             here = law.response(own, s)
-            for step in _DIFFERENCE * np.eye(own.size):
-                found.append((law.response(own + step, s) - here) / _DIFFERENCE)
+            moved = own + _DIFFERENCE * np.eye(own.size)
+            found += [(law.response(one, s) - here) / _DIFFERENCE for one in moved]
         return np.array(found).T
 
     @property
