@@ -99,12 +99,11 @@ def test_start_gaps_and_lags_are_the_normal_equations(lag, gaps):
 @pytest.mark.parametrize("lag", LAGS)
 def test_noises_of_process_and_sensors_may_be_correlated(lag):
     model = observer().model
-    S = np.zeros_like(model.C2.T)
-    S[:, 0] = 0.7 * observer().plant.noise_factor[:, 0] * np.sqrt(model.R[0, 0])
-    with pytest.raises(ModelError, match="root is not a factor"):
-        model.replace(S=S)
-    model = model.replace(S=S, root=None)
-    solved = filter_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)
+    H = np.array(model.H)  # of the first sensor's noise 0.7 is that of the first disturbance
+    H[0] *= np.sqrt(1.0 - 0.7**2)
+    H[0, 0] = 0.7 * np.sqrt(model.R[0, 0])
+    model = model.replace(H=H)
+    solved = filter_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     y, u, _ = run(model, 40, seed=10)
     y[12:15, 0] = np.nan
     method, later = LAGS[lag]

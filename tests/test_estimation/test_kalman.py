@@ -19,7 +19,6 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.estimation import Filter, Smoother, check_gain, design_kalman, kalman
-from flexplant.estimation.filter_models import noise_root
 from flexplant.lti import StateSpace
 from flexplant.lti.lyapunov import difference_of
 from flexplant.lti.riccati import riccati_root
@@ -420,7 +419,7 @@ def test_covariances_that_lack_digits_give_no_deviations():
 def test_square_roots_give_the_filter_that_covariances_give():
     plant = plate_plant(1e-2)
     found = design_kalman(plant)
-    root = riccati_root(found.model.A, found.model.C2, *noise_root(found.model))
+    root = riccati_root(found.model.A, found.model.C2, found.model.G, found.model.H)
     scale = np.abs(found.predictor_gain).max(axis=1, keepdims=True) + 1e-300
     np.testing.assert_allclose(root.K / scale, found.predictor_gain / scale, atol=1e-7)
     assert root.change < 1e-9 and root.steps < 10

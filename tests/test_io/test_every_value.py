@@ -98,7 +98,7 @@ def made():
     yield fx.loop.OnMeasurement(0.5, 100.0)
     yield fx.plant.MeasuredResponse(fx.frequency_response(plant.continuous.Gyu, [10.0, 20.0]))
     yield fx.loop.SpillOver(0.99, True, 0.5, 0.6, 100.0, 490)
-    yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
+    yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant, plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
     response = fx.simulate(loop, reference=point, duration=0.1, rng=1)
     yield exposure_errors(response, window=0.01)

@@ -332,7 +332,6 @@ def _model_at(plant: AnyPlant, found: LeftOut | None, poi: Any, points: FloatArr
     moved = plant.around(plant.machine.with_ports(wider))
     if found is None:
         return filter_model(moved)
-    assert found.whole is not None  # noqa: S101 - left_out sets it
     whole = found.whole.machine.with_ports(wider)
     return filter_model(moved, left_out(moved, whole))
 

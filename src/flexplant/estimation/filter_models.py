@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, real_array
 from ..certificates import Verified
-from ..errors import CertificateError, ModelError, ShapeError, SolverError
+from ..errors import CertificateError, SolverError
 from ..lti.lyapunov import difference_of, solve_stein, square_root
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, StandardPlant
 from ..plant.partitioned import require_noise
 from ..store import Value
-from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out_modes import LeftOut
 
@@ -37,30 +36,27 @@ class FilterModel(Value):
 
     ::
 
-        x[k+1] = A x[k] + B u[k] + w[k]         [w]   [Q  0  S]
-        z[k]   = C1 x[k] + D1 u[k] + n[k]   cov [n] = [0  V  N]
-        y[k]   = C2 x[k] + D2 u[k] + v[k]       [v]   [S' N' R]
+        x[k+1] = A x[k] + B u[k] + G xi[k]            [G xi]   [Q  0  S]
+        z[k]   = C1 x[k] + D1 u[k] + n[k]         cov [  n ] = [0  V  N]
+        y[k]   = C2 x[k] + D2 u[k] + H xi[k]          [H xi]   [S' N' R]
 
     Parameters
     ----------
     A, B, C1, D1, C2, D2 : arrays
         Model from the commands u to the motions z at the POIs and to the sensors y.
-    Q : (n, n) array
-        Covariance of the effect of disturbances on x in one sample.
-    R : (ny, ny) array
-        Covariance at the sensors: their noise and that of truncated modes.
+    G : (n, r) array
+        Effect of noises xi of unit variance on x in one sample: of disturbances.
+    H : (ny, r) array
+        Their effect on the sensors: their own noise, that of truncated modes, and of disturbances
+        that are held over each sample.
     V : (nz, nz) array
         Covariance of the motions of truncated modes at the POIs.
     N : (nz, ny) array
         Covariance between these and the noise of the sensors.
-    S : (n, ny) array
-        Covariance between the noises of process and sensors.
     dt : float [s]
         Sampling time.
     channels, sensors, commands : tuples of str
         Names of z, y and u.
-    root : (n + ny, r) array, optional
-        A factor of ``[Q S; S' R]``, where one is known.
 
     Examples
     --------
@@ -76,28 +72,29 @@ class FilterModel(Value):
     D1: FloatArray
     C2: FloatArray
     D2: FloatArray
-    Q: FloatArray
-    R: FloatArray
+    G: FloatArray
+    H: FloatArray
     V: FloatArray
     N: FloatArray
-    S: FloatArray
     dt: float
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
     commands: tuple[str, ...]
-    root: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        if self.root is None:
-            return
-        joint = np.block([[self.Q, self.S], [self.S.T, self.R]])
-        size = np.sqrt(np.abs(joint.diagonal()))
-        # a replaced product with its old factor would be two problems in one model
-        if np.any(np.abs(self.root @ self.root.T - joint) > SAME * np.outer(size, size)):
-            raise ModelError(
-                "root is not a factor of [Q S; S' R]: the noises of the model were changed, but "
-                "root was not. Replace it with them, or pass root=None."
-            )
+    @cached_property
+    def Q(self) -> FloatArray:
+        """Covariance (n, n) of the effect of disturbances on x in one sample."""
+        return self.G @ self.G.T
+
+    @cached_property
+    def R(self) -> FloatArray:
+        """Covariance (ny, ny) at the sensors."""
+        return self.H @ self.H.T
+
+    @cached_property
+    def S(self) -> FloatArray:
+        """Covariance (n, ny) between the noises of process and sensors."""
+        return self.G @ self.H.T
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
         """Return the model with states x / d and measurements y / s."""
@@ -107,11 +104,9 @@ class FilterModel(Value):
             C1=self.C1 * d,
             C2=self.C2 * d / s[:, None],
             D2=self.D2 / s[:, None],
-            Q=self.Q / d / d[:, None],
-            R=self.R / s / s[:, None],
+            G=self.G / d[:, None],
+            H=self.H / s[:, None],
             N=self.N / s,
-            S=self.S / d[:, None] / s,
-            root=None if self.root is None else self.root / np.concatenate([d, s])[:, None],
         )
 
     def innovation(self, P: FloatArray) -> FloatArray:
@@ -125,10 +120,9 @@ class FilterModel(Value):
         return np.asarray(0.5 * (updated + updated.T))
 
     def driven(self, gain: FloatArray) -> FloatArray:
-        """Return ``Q + K R K' - K S' - S K'``, what one sample adds with a predictor gain K."""
-        mixed = gain @ self.S.T
-        added = self.Q + gain @ self.R @ gain.T - mixed - mixed.T
-        return np.asarray(0.5 * (added + added.T))
+        """Return ``(G - K H)(G - K H)'``, what one sample adds with a predictor gain K."""
+        entering = self.G - gain @ self.H
+        return entering @ entering.T
 
 
 def weigh(part: FloatArray, spread: FloatArray) -> FloatArray:
@@ -141,26 +135,17 @@ def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:
     """Return the model of a sampled plant, with known truncated modes as noise."""
     own = plant if found is None else found.plant
     g = own.system
-    n = g.n_states
-    if own.process_noise.shape != (n, n):
-        raise ShapeError(f"process_noise must be ({n}, {n}), got {own.process_noise.shape}.")
     y, z = sensors(own), poi_channels(own)
     toward, at = g.select(y, own.u), g.select(z, own.u)
     rows = [own.y.index(name) for name in y]
-    direct = own.noise_direct[rows]
-    R = own.sensor_noise[np.ix_(rows, rows)] + direct @ direct.T
-    ny, nz = len(y), len(z)
-    V, N = np.zeros((nz, nz)), np.zeros((nz, ny))
-    noises = [own.sensor_noise_factor[rows]]
+    H = [own.noise_direct[rows], own.sensor_noise_factor[rows]]
+    V, N = np.zeros((len(z), len(z))), np.zeros((len(z), len(y)))
     if found is not None:
-        R, V, N = R + found.sensors, found.pois, found.cross
-        noises.append(square_root(found.sensors))
-    noise = np.hstack(noises)
-    silent = np.zeros((n, noise.shape[1]))
-    root = np.block([[own.noise_factor, silent], [direct, noise]])
+        H, V, N = [*H, square_root(found.sensors)], found.pois, found.cross
+    silent = [np.zeros((g.n_states, part.shape[1])) for part in H[1:]]
     return FilterModel(
-        g.A, toward.B, at.C, at.D, toward.C, toward.D, own.process_noise, R, V, N,
-        own.noise_factor @ direct.T, own.dt, z, y, tuple(own.u), root,
+        g.A, toward.B, at.C, at.D, toward.C, toward.D, np.hstack([own.noise_factor, *silent]),
+        np.hstack(H), V, N, own.dt, z, y, tuple(own.u),
     )  # fmt: skip
 
 
@@ -202,17 +187,11 @@ class Sight(NamedTuple):
 
 
 def filter_system(
-    plant: AnyPlant,
-    model: FilterModel,
-    K: FloatArray,
-    L_z: FloatArray,
-    name: str,
-    inputs: Sequence[str] = (),
+    plant: AnyPlant, model: FilterModel, K: FloatArray, L_z: FloatArray
 ) -> StateSpace:
-    """Return the filter, from sensors and u to the estimates of POIs and of unknown inputs."""
+    """Return the filter, from sensors and u to the estimates of POIs."""
     # `x+ = A x + B u + K e`, `hat = C1 x + D1 u + L_z e` with the innovation `e = y - C2 x - D2 u`
-    m, more = model, len(model.A) - plant.system.n_states
-    units = {f"{one}:hat": plant.units[one] for one in inputs if one in plant.units}
+    m = model
     return StateSpace(
         m.A - K @ m.C2,
         np.hstack([K, m.B - K @ m.D2]),
@@ -220,19 +199,11 @@ def filter_system(
         np.hstack([L_z, m.D1 - L_z @ m.D2]),
         plant.dt,
         inputs=[*m.sensors, *m.commands],
-        outputs=[*estimates(m.channels), *(f"{one}:hat" for one in inputs)],
-        states=[*plant.system.states, *(f"{one}:state" for one in inputs[:more])],
-        name=name,
-        units={**plant.units, **units},
+        outputs=estimates(m.channels),
+        states=plant.system.states,
+        name="kalman",
+        units=plant.units,
     )
-
-
-def noise_root(model: FilterModel) -> tuple[FloatArray, FloatArray]:
-    """Return G (n, r) and H (ny, r): the noises of process and sensors, of xi of unit variance."""
-    n, root = model.A.shape[0], model.root
-    if root is None:
-        root = square_root(np.block([[model.Q, model.S], [model.S.T, model.R]]))
-    return root[:n], root[n:]
 
 
 def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:

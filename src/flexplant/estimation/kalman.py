@@ -31,7 +31,6 @@ from .filter_models import (
     error_of,
     filter_model,
     filter_system,
-    noise_root,
     stable_radius,
     weigh,
 )
@@ -102,12 +101,13 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
-    observer = _judged(plant, whole, found)
-    if machines is None or found is None or whole is None:
-        return observer
-    noises = unsure_noise(found, plant, whole, machines)
-    others = [_judged(plant, whole, noise) for noise in noises]
-    return min([observer, *others], key=_upper_ends)
+    if found is None:
+        observer, none = _observer(plant, None), {} if whole is None else {LEFT_OUT: 0.0}
+        return observer.replace(certificate=observer.certificate | none)
+    if machines is None:
+        return _judged(plant, found)
+    noises = [found, *unsure_noise(found, plant, machines)]
+    return min((_judged(plant, noise) for noise in noises), key=_upper_ends)
 
 
 def _upper_ends(observer: KalmanEstimator) -> float:
@@ -116,16 +116,11 @@ def _upper_ends(observer: KalmanEstimator) -> float:
     return float(np.mean([np.inf if end is None else np.log(end) for end in ends]))
 
 
-def _judged(plant: AnyPlant, whole: AnyPlant | None, found: LeftOut | None) -> KalmanEstimator:
+def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
     """Return the filter of a plant and of modes left out, with its errors on the larger plant."""
     observer = _observer(plant, found)
-    if whole is None:
-        return observer
-    if found is None:
-        return observer.replace(certificate=observer.certificate | {LEFT_OUT: 0.0})
-    complete = error_variances(read_alike(plant, whole), observer.system)
-    counted = {LEFT_OUT: float(found.modes.size)}
-    certificate = observer.certificate | counted
+    complete = error_variances(read_alike(plant, found.whole), observer.system)
+    certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}
     if complete.difference > certificate["difference"]:
         certificate |= Certificate((difference_check(complete.difference, ROUNDED),))
     return observer.replace(certificate=certificate, variances=complete.values)
@@ -147,7 +142,7 @@ def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     model = filter_model(plant, found)
     design = filter_design(model)
     own = plant if found is None else found.plant
-    system = filter_system(own, model, design.K, design.L_z, "kalman")
+    system = filter_system(own, model, design.K, design.L_z)
     return KalmanEstimator(
         system, plant, design.gain, design.covariance, design.certificate, design.variances, found
     )
@@ -178,10 +173,9 @@ class FilterDesign(NamedTuple):
 
 def filter_design(model: FilterModel) -> FilterDesign:
     """Return the gains of a model whose sensors may include the noise of truncated modes."""
-    G, H = noise_root(model)
-    own = np.sum(H[:, ~np.any(G, axis=0)] ** 2, axis=1)
+    own = np.sum(model.H[:, ~np.any(model.G, axis=0)] ** 2, axis=1)
     # R is nearly all noise that moves the states too, the sensors' own part lost in it
-    if np.any(own < _OWN * np.sum(H**2, axis=1)):
+    if np.any(own < _OWN * np.sum(model.H**2, axis=1)):
         return _design_in_roots(model, None)
     try:
         return _design_by_covariance(model)
@@ -205,7 +199,7 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
 
 def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
     """Return the gains where P has too few digits; raise `why` if they do not exist."""
-    G, H = noise_root(model)
+    G, H = model.G, model.H
     try:
         found = riccati_root(model.A, model.C2, G, H)
     except SolverError as error:

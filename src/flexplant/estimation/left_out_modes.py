@@ -58,7 +58,7 @@ class LeftOut(Value):
     plant : StandardPlant
         Plant with the static compliance of the truncated modes as response to u. Attachment vectors
         that represent them are excited by u only.
-    whole : StandardPlant, optional
+    whole : StandardPlant
         Plant with the modes, from which the same follows for another POI.
 
     Examples
@@ -77,7 +77,7 @@ class LeftOut(Value):
     pois: FloatArray
     cross: FloatArray
     plant: AnyPlant
-    whole: AnyPlant | None = None
+    whole: AnyPlant
 
     def __repr__(self) -> str:
         return f"<LeftOut: {counted(self.modes.size, 'mode')} as noise and static compliance>"

@@ -17,7 +17,7 @@ from .left_out_modes import LeftOut
 PARTS = (1.0, 0.5, 0.25)
 
 
-def unsure_noise(found: LeftOut, plant: AnyPlant, whole: AnyPlant, machines: Any) -> list[LeftOut]:
+def unsure_noise(found: LeftOut, plant: AnyPlant, machines: Any) -> list[LeftOut]:
     """Return noises for a filter that weighs modes by their uncertainty, one for each of `PARTS`.
 
     The stationary covariance of what the sensors and POIs of a machine show beyond the model of
@@ -27,7 +27,7 @@ def unsure_noise(found: LeftOut, plant: AnyPlant, whole: AnyPlant, machines: Any
     if machines.missing:
         raise AssumptionError(f"no filter weighs modes by their uncertainty: {machines.missing}.")
     model = _driven_modes(found.plant)
-    alone = _difference(_driven_modes(whole), model)
+    alone = _difference(_driven_modes(found.whole), model)
     mean = np.mean([_difference(_driven_modes(one), model) for one in machines.plants], axis=0)
     nz = len(poi_channels(plant))
     noises = []
