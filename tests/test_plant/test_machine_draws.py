@@ -369,6 +369,47 @@ def test_budgets_and_comparisons_have_intervals(plant):
     assert "servo on 95 % of such machines:" in text and "modulus margin" in text
 
 
+def test_placements_compare_places_machine_by_machine(plant):
+    """The sentence of scores and of a placement is that of two filters on the same machines."""
+    near = plant.assembled.ports.y[1].replace(name="near", at=(0.2, 0.0, 0.0))
+    scores = fx.score_sensors(plant, [["y1", "near"], ["y1", "y2"]], candidates=[near])
+    best, next_one = (fx.design_kalman(scores.on(plant, rank=i)) for i in (0, 1))
+    low, high, _ = best.compared(next_one, "die")
+    assert f"{low:.3g} to {high:.3g} on 95 % of such machines" in repr(scores)
+    found = fx.place_sensors(plant, [plant.assembled.ports.y[0], near], 2)
+    own = fx.design_kalman(plant)
+    low, high, _ = fx.design_kalman(found.on(plant)).compared(own, "die")
+    assert f"over the own sensors {low:.3g} to {high:.3g} on 95 %" in repr(found)
+    alone = fx.score_sensors(plant.replace(evaluation=None), [["y1", "y2"], ["y1", "near"]],
+                             candidates=[near])  # fmt: skip
+    assert not alone.interval
+
+
+def test_any_figure_of_a_loop_has_an_interval(plant):
+    """The MA of the error after a move, against runs on the machines one by one."""
+    observer = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    move = fx.setpoint(1e-4, velocity=0.01, acceleration=1.0, jerk=200.0)
+
+    def ma(one):
+        run = fx.simulate(one, reference={"die:ref": move}, duration=0.06, noise=False)
+        return run.exposure("die:error", start=0.04)[0]
+
+    low, high, sentence = loop.interval(ma, unit="m")
+    each = [ma(loop.around(loop.plant.around(one))) for one in plant.machines.plants]
+    assert (low, high) == pytest.approx(interval_of(np.array(each)))
+    assert sentence.endswith("m on 95 % of such machines")
+
+
+def test_the_report_says_where_figures_lie(plant, tmp_path):
+    observer = fx.design_static(plant)
+    loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=20.0, observer=observer))
+    text = fx.plot.report(tmp_path / "design.html", loop).read_text()
+    for figure in ("modulus margin", "bandwidth"):
+        assert loop.interval(figure).sentence in text
+
+
 def test_a_sentence_stands_where_something_is_missing():
     few = Case(count=3)
     plant = few.plant()

@@ -387,7 +387,7 @@ class PoiEstimator(Value):
         unit = self.plant.units.get(poi_channels(self.plant)[row], "")
         known = self.plant.machine.machines
         given = "" if known is None else known.densities
-        return interval(known, lambda: self._on_machines[:, row], level, unit, given)
+        return interval(known, lambda: self.on_machines[:, row], level, unit, given)
 
     def compared(self, other: PoiEstimator, channel: str, level: float = LEVEL) -> FigureInterval:
         """Return where this error over that of another estimator lies, machine by machine.
@@ -419,12 +419,12 @@ class PoiEstimator(Value):
         own, others = (row_of(poi_channels(one.plant), channel) for one in (self, other))
 
         def ratios() -> FloatArray:
-            if self._on_machines.shape[0] != other._on_machines.shape[0]:
+            if self.on_machines.shape[0] != other.on_machines.shape[0]:
                 raise ModelError(
                     "the estimators are compared on the same machines: make both plants from one, "
                     "plant.with_ports(...) or plant.at(...)."
                 )
-            return np.asarray(self._on_machines[:, own] / other._on_machines[:, others])
+            return np.asarray(self.on_machines[:, own] / other.on_machines[:, others])
 
         known = self.plant.machine.machines
         found = interval(known, ratios, level, "")
@@ -435,8 +435,8 @@ class PoiEstimator(Value):
         return found._replace(sentence=said)
 
     @cached_property
-    def _on_machines(self) -> FloatArray:
-        """RMS errors (n, n_poi) on each machine that agrees with the measurement."""
+    def on_machines(self) -> FloatArray:
+        """RMS errors (n, n_poi) [m or rad] on each machine that agrees with the measurement."""
         known = self.plant.machine.machines
         plants = [] if known is None else known.plants
         return np.sqrt([

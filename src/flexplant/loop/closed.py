@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -324,16 +324,23 @@ class ClosedLoop(Value):
             )
         return MachineLoops(self, known)
 
-    def interval(self, figure: str, level: float = LEVEL) -> FigureInterval:
+    def interval(
+        self, figure: str | Callable[[ClosedLoop], float], level: float = LEVEL, *, unit: str = ""
+    ) -> FigureInterval:
         """Return the interval of a figure of the loop over machines with the same measurement.
 
         Parameters
         ----------
-        figure : str
+        figure : str or callable
             "modulus margin", "bandwidth" (the smallest of |S| < 1 of all axes with a reference,
-            Hz), "spectral radius", or a signal for its `rms`.
+            Hz), "spectral radius", or a signal for its `rms`. A function of a loop that returns a
+            positive number is evaluated on each machine, such as the MA of the error after a move:
+            ``lambda one: simulate(one, reference=move, duration=0.1, noise=False)
+            .exposure("die:error", start=0.05)[0]``.
         level : float
             Fraction of the machines, between 0 and 1.
+        unit : str
+            SI unit of what a function returns.
 
         Returns
         -------
@@ -346,7 +353,7 @@ class ClosedLoop(Value):
         ModelError
             When the figure is unknown, or the level is out of range.
         """
-        return loop_interval(self, figure, level)
+        return loop_interval(self, figure, level, unit)
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:

@@ -24,15 +24,15 @@ class MachineLoops:
     def __init__(self, loop: Any, machines: PlantMachines) -> None:
         self.machines = machines
         self.loops = [loop.around(loop.plant.around(plant)) for plant in machines.plants]
-        self._found: dict[str, FloatArray] = {}
+        self._found: dict[Any, FloatArray] = {}
 
     @property
     def unstable(self) -> int:
         """Number of machines on which the loop is not stable."""
         return sum(not loop.is_stable for loop in self.loops)
 
-    def values(self, figure: str) -> FloatArray:
-        """Return a figure, or the rms of a channel, on each machine."""
+    def values(self, figure: str | Callable[[Any], float]) -> FloatArray:
+        """Return a figure, the rms of a channel, or a function of the loop on each machine."""
         if figure not in self._found:
             self._found[figure] = np.array([_figure(loop, figure) for loop in self.loops])
         return self._found[figure]
@@ -68,7 +68,9 @@ def axis_bandwidths(loop: Any) -> dict[str, float]:
     }
 
 
-def _figure(loop: Any, figure: str) -> float:
+def _figure(loop: Any, figure: str | Callable[[Any], float]) -> float:
+    if not isinstance(figure, str):
+        return float(figure(loop))
     if figure == BANDWIDTH:
         return min(axis_bandwidths(loop).values())
     if figure == RADIUS:  # the distance to the circle is log-normal, not the radius
@@ -76,10 +78,12 @@ def _figure(loop: Any, figure: str) -> float:
     return float(loop.modulus_margin if figure == MARGIN else loop.rms(figure))
 
 
-def loop_interval(loop: Any, figure: str, level: float) -> FigureInterval:
+def loop_interval(
+    loop: Any, figure: str | Callable[[Any], float], level: float, unit: str = ""
+) -> FigureInterval:
     """Return the interval of a figure or a channel's rms; see `ClosedLoop.interval`."""
     known = loop.plant.machine.machines
-    if figure not in loop.monitored.outputs:
+    if not callable(figure) and figure not in loop.monitored.outputs:
         one_of(figure, "figure", (*FIGURES, *loop.monitored.outputs))
     if known is None or known.missing:
         return interval(known, lambda: np.zeros(0), level, "")
@@ -90,8 +94,9 @@ def loop_interval(loop: Any, figure: str, level: float) -> FigureInterval:
         )
     if figure == BANDWIDTH and not axis_sensitivities(loop):
         return FigureInterval(None, None, "no interval: the loop has no reference")
-    unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
-    given = "" if figure in FIGURES else known.densities
+    if isinstance(figure, str):
+        unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
+    given = "" if callable(figure) or figure in FIGURES else known.densities
     found = interval(known, partial(loops.values, figure), level, unit, given)
     if figure != RADIUS or found.low is None or found.high is None:
         return found

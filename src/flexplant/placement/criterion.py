@@ -151,6 +151,13 @@ class Criterion(Value):
         """Return the unit of its square root where it is a mean square of a motion; else ""."""
         return ""
 
+    def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
+        """Return the interval of its root over that of another plant, machine by machine.
+
+        It is empty where the plant's machines are not known, or the criterion has no such root.
+        """
+        return ""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class _Function(Criterion):

@@ -11,11 +11,12 @@ import numpy as np
 from ..arrays import FloatArray, positive
 from ..errors import LabelError, ModelError, only_one, require_known, short
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
-from ..estimation.estimator_channels import sensors
+from ..estimation.estimator_channels import poi_channels, sensors
 from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant
 from ..plant.building import direct_effect
+from ..plant.machine_plants import LEVEL, interval
 from ..plant.partitioned import require_noise
 from ..store import checked
 from ..words import flag, instance, one_of
@@ -232,6 +233,23 @@ class PoiVariance(Criterion):
         require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
         if plant.model is not None:
             _check_direct(plant, candidates)
+
+    def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
+        """Return the interval of the rms error over that of other sensors, machine by machine."""
+        machines = plant.machine.machines
+        if machines is None or self._own:
+            return ""
+
+        def variances(one: StandardPlant) -> FloatArray:
+            factors = self._factors(one)
+            rows = [poi_channels(one).index(name) for name in factors]
+            errors = design_kalman(one).on_machines[:, rows]
+            terms = (errors * np.array(list(factors.values()))) ** 2
+            return np.asarray(np.sum(terms, axis=1) if self.measure == "sum" else terms.max(axis=1))
+
+        return interval(
+            machines, lambda: np.sqrt(variances(plant) / variances(other)), LEVEL, ""
+        ).sentence
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.

@@ -198,6 +198,9 @@ class Placement(Value):
     left_out : tuple of str
         Sensors or actuators of the plant that were not among the candidates: none of them is part
         of the choice, and the value is that without them.
+    interval : str
+        Error over that with the plant's own sensors on 95 % of the plant's machines, or what is
+        missing for this interval; empty where no machines are known.
 
     Examples
     --------
@@ -219,6 +222,7 @@ class Placement(Value):
     unit: str = ""
     unjudged: str = ""
     left_out: tuple[str, ...] = ()
+    interval: str = ""
 
     def __repr__(self) -> str:
         ends = [steps[-1] for steps in self.history]
@@ -236,7 +240,8 @@ class Placement(Value):
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
             f"{counted(self.evaluations, 'evaluation')}"
             f"{', ' if self.stopped else ''}{self.stopped}"
-            f"{', ' if self.unjudged else ''}{self.unjudged}{self._without}>"
+            f"{', ' if self.unjudged else ''}{self.unjudged}{self._without}"
+            f"{', over the own sensors ' if self.interval else ''}{self.interval}>"
         )
 
     @property

@@ -48,6 +48,9 @@ class Scores(Value):
         Unit of the square roots of the values, where they are mean squares of a motion.
     unjudged : str
         What is said of such motions where the plant has no evaluation model.
+    interval : str
+        Error of the best layout over that of the next one on 95 % of the plant's machines, or what
+        is missing for this interval; empty where no machines are known.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -59,6 +62,7 @@ class Scores(Value):
     side: Side
     unit: str = ""
     unjudged: str = ""
+    interval: str = ""
 
     def __len__(self) -> int:
         return len(self.layouts)
@@ -67,7 +71,9 @@ class Scores(Value):
         feasible = int(np.count_nonzero(np.isfinite(self.values)))
         listed = counted(len(self), "layout")
         head = f"<Scores of {listed} by {self.criterion}, {feasible} feasible>"
-        return "\n".join([head, self.table(5), *([f"  {self.unjudged}"] if self.unjudged else [])])
+        lines = [head, self.table(5), *([f"  {self.unjudged}"] if self.unjudged else [])]
+        lines += [f"  the best over the next: {self.interval}"] if self.interval else []
+        return "\n".join(lines)
 
     @property
     def best(self) -> tuple[str, ...]:
@@ -234,6 +240,8 @@ def _score_layouts(
     reasons |= dict(zip(lost, work.mapped(judged.reason, [chosen[i] for i in lost]), strict=True))
     order = np.argsort(values, kind="stable")
     judged.confirm(chosen[order[0]], float(values[order[0]]))
+    first = [with_side(plant, side, [ports[j] for j in chosen[i]]) for i in order[:2]]
+    several = np.count_nonzero(np.isfinite(values)) > 1
     return Scores(
         tuple(names[i] for i in order),
         values[order],
@@ -244,6 +252,7 @@ def _score_layouts(
         side,
         unit := judged.criterion.unit(plant),
         plant.unjudged if unit else "",
+        judged.criterion.compared(first[0], first[1]) if several else "",
     )
 
 

@@ -27,7 +27,15 @@ from ..store import Value, checked
 from ..words import instance, name_list
 from ..work import Work
 from .branch_and_bound import Exchange
-from .candidates import Places, Port, candidate_places, known_candidates, sampled_plant, side_of
+from .candidates import (
+    Places,
+    Port,
+    candidate_places,
+    known_candidates,
+    sampled_plant,
+    side_of,
+    with_side,
+)
 from .closed_loop_h2 import Separation
 from .constraints import Budget, Constraint, LinearRows, constraint_rows, constraints_in_words
 from .criterion import Criterion, in_words
@@ -251,6 +259,8 @@ def _solution(
     chosen = tuple(ports[i] for i in found.chosen)
     known = {port.name for port in ports}
     own = [port.name for side in layouts.side for port in getattr(plant.ports, side)]
+    other = with_side(plant, layouts.side, chosen)
+    moved = layouts.side == "y" and {port.name for port in chosen} != set(own)
     return Placement(
         chosen=tuple(port.name for port in chosen),
         left_out=tuple(name for name in own if name not in known),
@@ -259,6 +269,7 @@ def _solution(
         side=layouts.side,
         unit=(unit := layouts.criterion.unit(plant)),
         unjudged=plant.unjudged if unit else "",
+        interval=layouts.criterion.compared(other, plant) if moved else "",
         **{name: value for name, value in vars(found).items() if name != "chosen"},
     )
 

@@ -18,6 +18,7 @@ from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
 from ..loop.blocks import references
 from ..loop.broken import axis_sensitivities, error_sensitivity
+from ..loop.machine_figures import BANDWIDTH, MARGIN
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
@@ -271,7 +272,8 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         found = loop.budget(main)
     except FlexplantError as error:
         why = f"No error budget: {error}"
-    parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
+    margins = _margins(loop, compared.rows[name])
+    parts = [tiles([_error_tile(main, found), *_stability(loop), *margins])]
     for verdict in design.of(Verdict).values():
         said = "The specification is met."
         if not verdict.passed:
@@ -362,6 +364,8 @@ def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
         beside, kind = "unstable with the modes left out", "bad"
     elif np.isfinite(found.left_out):
         beside = f"with the modes left out {with_unit(found.left_out, found.unit)}"
+    if found.interval:
+        beside += f"; {found.interval}"
     return (f"{channel}, rms", with_unit(found.rms, found.unit), beside, kind)
 
 
@@ -380,16 +384,20 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     return [*found, (what, word, beside, kind)]
 
 
-def _margins(row: LoopFigures) -> list[Tile]:
+def _margins(loop: ClosedLoop, row: LoopFigures) -> list[Tile]:
     if not row.stable:
         return []
+    known = bool(loop.plant.dt) and loop.plant.machine.machines is not None
+    margin, reached = (
+        f"; {loop.interval(name).sentence}" if known else "" for name in (MARGIN, BANDWIDTH)
+    )
     peak = 20.0 * np.log10(1.0 / row.margin)
     tiles: list[Tile] = [
-        ("|S| at u, largest", f"{peak:.1f} dB", f"modulus margin {row.margin:.3g}", "")
+        ("|S| at u, largest", f"{peak:.1f} dB", f"modulus margin {row.margin:.3g}{margin}", "")
     ]
     if np.isfinite(row.bandwidth):
         most = f"|S| at most {20.0 * np.log10(row.peak):.1f} dB, at {row.peak_freq:.4g} Hz"
-        tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most, ""))
+        tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most + reached, ""))
     return tiles
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
+from ..loop.machine_figures import BANDWIDTH, MARGIN
 from ..lti.discretisation import Recursion
 from ..lti.interconnection import feedback, series
 from ..lti.sampling import discretized
@@ -47,6 +48,7 @@ class Consequences:
     rms: float = float("nan")
     unit: str = ""
     sources: Sequence[tuple[str, float]] = ()
+    on_machines: Sequence[tuple[str, str]] = ()
     time: FloatArray = field(default_factory=lambda: np.zeros(0))
     error: FloatArray = field(default_factory=lambda: np.zeros(0))
     time_label: str = ""
@@ -113,6 +115,9 @@ class Question:
         found.rms = float(budget.rms)
         each = zip(budget.names, np.sqrt(np.maximum(budget.variances, 0.0)), strict=True)
         found.sources = sorted(((n, float(v)) for n, v in each), key=lambda one: -one[1])[:12]
+        if plant.dt and plant.machine.machines is not None:
+            names = (found.channel, MARGIN, BANDWIDTH)
+            found.on_machines = [(name, closed.interval(name).sentence) for name in names]
 
     def _in_time(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
         if loop.is_stable is False:

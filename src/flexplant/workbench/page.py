@@ -430,6 +430,7 @@ class Page:
         if np.isfinite(answer.rms):
             factor, unit = in_unit(answer.rms, answer.unit)
             rows.append((f"rms of {answer.channel}", f"{answer.rms / factor:.4g} {unit}", None))
+        rows += [(f"{name} of machines", text, None) for name, text in answer.on_machines]
         return [*rows, *(("not computed", text, None) for text in answer.missing)]
 
     # -- what takes longer ----------------------------------------------------------------------
