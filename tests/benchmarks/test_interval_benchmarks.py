@@ -25,7 +25,7 @@ pytestmark = pytest.mark.benchmark
 
 RATE, DELAY = 10e3, 1.3
 FORCE, NOISE = 1e-3, 1.4e-12
-FIGURES = ("die:z", "die:rx", "die:ry", "modulus margin", "bandwidth")
+FIGURES = ("die:z", "die:rx", "die:ry", "modulus margin", "bandwidth", "MA")
 COUNT = 10
 
 KINDS = {
@@ -147,15 +147,31 @@ def judged(kind, seed, make=fx.plate):
     servo = fx.design_servo(plant, bandwidth=kind["bandwidth"], observer=observer)
     loop = fx.close_loop(plant, observer, servo)
     stated = [observer.interval(name) for name in FIGURES[:3]]
-    stated += [loop.interval(name) for name in FIGURES[3:]]
+    stated += [loop.interval(name) for name in FIGURES[3:5]]
+    stated.append(loop.interval(ma, unit="m"))
     g = observer.system.select(inputs=[f"y{i}" for i in range(1, 5)])
     errors = unlike_machines.true_errors(machine, (g.A, g.B, g.C, g.D), FORCE, NOISE, RATE, 4)
     true = [*errors, *loop_figures(machine, (observer, servo))]
     return stated, true
 
 
+#: a move of 1 mm along z in 60 ms, after which the error settles for 20 ms
+MOVE = {"distance": 1e-3, "velocity": 0.05, "acceleration": 2.0, "jerk": 200.0}
+SETTLING = 0.02
+
+
+def ma(loop):
+    """Largest |MA| [m] of the error after the move, without noise."""
+    move = fx.setpoint(**MOVE)
+    late = move.duration + SETTLING
+    run = fx.simulate(
+        loop, reference={"die:ref": move}, duration=late + 0.03, noise=False, progress=False
+    )
+    return run.exposure("die:error", start=late)[0]
+
+
 def loop_figures(machine, blocks):
-    """Margin and bandwidth of the loop on the machine."""
+    """Margin, bandwidth and MA after a move of the loop on the machine."""
     A, B, C = machine.continuous()
     four = range(1, 5)
     w = [*(f"amp{i}" for i in four), *(f"y{i}:noise" for i in four), "die:ref"]
@@ -169,7 +185,8 @@ def loop_figures(machine, blocks):
     system = fx.StateSpace(A, forces, rows, D, inputs=[*w, *u], outputs=[*z, *sensors, "die:ref"])
     plant = fx.StandardPlant.from_statespace(system, w=w, u=u, z=z, y=[*sensors, "die:ref"])
     loop = fx.close_loop(plant.discretized(RATE, delay=DELAY), *blocks)
-    return loop.modulus_margin, fx.compare_loops({"servo": loop}).rows["servo"].bandwidth
+    bandwidth = fx.compare_loops({"servo": loop}).rows["servo"].bandwidth
+    return loop.modulus_margin, bandwidth, ma(loop)
 
 
 def table(name, kind, make=fx.plate, count=COUNT, first=3000):
