@@ -9,12 +9,15 @@ from flexplant.lti import StateSpace, tf
 from flexplant.plant import StandardPlant, mixed_sensitivity
 from flexplant.synthesis import (
     FixedOrder,
+    FullBlock,
     Lmi,
     design_h2,
     design_hinf,
+    design_mu,
     design_ncf,
     design_structured,
     ncf_margin,
+    uncertain_system,
 )
 from flexplant.synthesis.hinf.lower_bound import relaxed_bound
 from flexplant.synthesis.preparation import prepared
@@ -238,6 +241,37 @@ def test_a_structured_design_of_full_order(kind):
     P = posed(problem(kind, 0))
     found = design_structured(P, FixedOrder(P.system.n_states), rng=0, progress=False)
     assert found.gamma <= 1.02 * oracle.smallest_norm(problem(kind, 0))
+
+
+def channels_of_mu(p, d):
+    """The problem of [S; KS] with an additive Delta: KS times 1 / d, w of Delta times d."""
+    A, B, C, D = p.parts
+    B, D = (np.hstack([d * one[:, :1], one]) for one in (B, D))
+    rows = np.array([[0, 1 / d, 0], [1, 0, 0], [0, 0, 1]])
+    return A, B, rows @ C, rows @ D
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["two lags", "three lags", "double integrator", "Pade delay"])
+def test_robust_performance_of_what_is_typed_first(kind):
+    """mu of these two blocks is the largest |S| + |KS|; the best D that is constant is no better.
+
+    D of some decades made the plant of a double integrator too badly conditioned to go on.
+    """
+    p = problem(kind, 0)
+    M = StateSpace(*channels_of_mu(p, 1.0), inputs=["wd", "w", "u"], outputs=["zd", "z", "y"])
+    uncertain = uncertain_system(M, [FullBlock()], u=["u"], y=["y"])
+    found = design_mu(uncertain, w=["w"], z=["z"], progress=False)
+    K = found.system
+    loop = closed_loop(split(*p.parts, 1, 1), K.A, K.B, K.C, K.D)
+    loop = oracle.scaled(loop, oracle.loop_speed(p.parts, p))
+    poles = np.linalg.eigvals(loop[0])
+    omega = np.concatenate([np.geomspace(1e-8, 1e5, 4000), np.abs(poles), np.abs(poles.imag)])
+    mu = np.abs(oracle.response(loop, 1j * omega)[:, :, 0]).sum(axis=1).max()
+    assert poles.real.max() < 0
+    assert 0.95 * found.gamma <= mu <= found.gamma
+    constant = [Problem("mu", channels_of_mu(p, d), 1, 1) for d in (0.5, 1.0, 2.0)]
+    assert mu <= 1.02 * min(map(oracle.smallest_norm, constant))
 
 
 @pytest.mark.slow
