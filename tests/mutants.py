@@ -55,7 +55,7 @@ LINES = [
      "0.0))"),
     ("estimation/consistency_tests.py", "2 * np.sum(covariance[1:] ** 2)",
      "np.sum(covariance[1:] ** 2)"),
-    ("estimation/filter_models.py", "m, left = model, model.C1 - L_z @ model.C2",
+    ("estimation/kalman.py", "m, left = model, model.C1 - L_z @ model.C2",
      "m, left = model, model.C1"),
     ("plant/realisation.py", "-2.0 * zeta * size",
      "-1.0 * zeta * size"),

@@ -8,16 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, real_array
-from ..certificates import Verified
-from ..errors import CertificateError, SolverError
-from ..lti.lyapunov import difference_of, solve_stein, square_root
-from ..lti.sampling import reaches_at_once
-from ..lti.statespace import StateSpace
-from ..plant import AnyPlant, StandardPlant
-from ..plant.partitioned import require_noise
+from ..arrays import FloatArray, IntArray
+from ..errors import SolverError
+from ..lti.lyapunov import solve_stein, square_root
+from ..plant import AnyPlant
 from ..store import Value
-from .estimator_channels import estimates, poi_channels, sensors
+from .estimator_channels import poi_channels, sensors
 from .left_out_modes import LeftOut
 
 #: error text where a covariance cannot be followed sample by sample
@@ -28,6 +24,9 @@ FEW_DIGITS = (
     "observer.system, "
     "observer.step or close_loop; or give the sensors the asd of their data sheet, checking units."
 )
+
+#: entry of a certificate: number of truncated modes
+LEFT_OUT = "modes left out"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -149,23 +148,6 @@ def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:
     )  # fmt: skip
 
 
-def check_noises(plant: AnyPlant) -> None:
-    """Raise AssumptionError for a sensor without noise, or with direct white noise."""
-    _ = plant.noise_factor  # raises where it is not known
-    read, own = sensors(plant), plant.sensor_noise.diagonal()
-    require_noise({name: own[plant.y.index(name)] for name in read})
-    inner = plant.system
-    loud = [
-        name
-        for name in plant.w
-        if plant.asd.get(name, 0.0) > 0 and ":noise" not in name and name not in plant.held
-    ]
-    direct = inner.D[np.ix_(inner.output_index(read), inner.input_index(loud))]
-    if np.any(direct):
-        row, column = (int(i) for i in np.argwhere(direct)[0])
-        raise reaches_at_once(loud[column], read[row])
-
-
 class Sight(NamedTuple):
     """Effect of state and noise on the POIs: ``z = C1 x + n + D1 u``, rows c = [C1 N].
 
@@ -184,33 +166,6 @@ class Sight(NamedTuple):
         """Return ``c watched + D1 u`` (k, nz) for watched [x; b] (k, n + ny) of moving POIs."""
         found = np.einsum("kzi,ki->kz", self.c, watched)
         return np.asarray(found if u is None else found + np.einsum("kzi,ki->kz", self.D1, u))
-
-
-def filter_system(
-    plant: AnyPlant, model: FilterModel, K: FloatArray, L_z: FloatArray
-) -> StateSpace:
-    """Return the filter, from sensors and u to the estimates of POIs."""
-    # `x+ = A x + B u + K e`, `hat = C1 x + D1 u + L_z e` with the innovation `e = y - C2 x - D2 u`
-    m = model
-    return StateSpace(
-        m.A - K @ m.C2,
-        np.hstack([K, m.B - K @ m.D2]),
-        m.C1 - L_z @ m.C2,
-        np.hstack([L_z, m.D1 - L_z @ m.D2]),
-        plant.dt,
-        inputs=[*m.sensors, *m.commands],
-        outputs=estimates(m.channels),
-        states=plant.system.states,
-        name="kalman",
-        units=plant.units,
-    )
-
-
-def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
-    """Return the variances (nz,) of the error of a filter on its own model."""
-    m, left = model, model.C1 - L_z @ model.C2
-    X = solve_stein(m.A - K @ m.C2, m.driven(K))
-    return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))
 
 
 class FilterGains(NamedTuple):
@@ -282,97 +237,3 @@ class Steady:
         rows = (chosen.c[:, :, :n] / size[:, :, None] / np.sqrt(some.size)).reshape(-1, n)
         H = np.vstack([self.gains.W @ self.model.C2, rows])
         return solve_stein(self.F.T, H.T @ H)
-
-
-#: largest relative difference of the covariances from the Riccati equation and from the gain's
-#: Stein equation; where rounding of the gain matters (`riccati_root`), of twice the standard
-#: deviation
-AGREEMENT, ROUNDED = 1e-6, 1e-2
-
-
-#: entry of a certificate: number of truncated modes
-LEFT_OUT = "modes left out"
-#: route of a residual
-RICCATI = "the Riccati equation, relative, in states of unit variance"
-
-
-def difference_check(difference: float, limit: float = AGREEMENT) -> Verified:
-    """Return the check of two routes to the variances at the POIs."""
-    return Verified("difference", difference, "variances by a Stein equation of the gain", limit)
-
-
-def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:
-    """Return the difference of the POI variances of a gain from those of a covariance.
-
-    The error's covariance follows from the gain alone:
-    ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Sampled.
-    gain : (n, ny) array
-        L.
-    covariance : (n, n) array
-        Claimed covariance, after the measurement.
-
-    Returns
-    -------
-    float
-        Largest relative difference over the POI channels.
-
-    Raises
-    ------
-    CertificateError
-        When the error is not stable or the difference exceeds 1e-6.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> fx.estimation.check_gain(plant, observer.gain, observer.covariance) < 1e-6
-    True
-    """
-    plant = StandardPlant.of(plant)
-    n, p = plant.system.n_states, len(sensors(plant))
-    gain = real_array(gain, "gain", (n, p))
-    covariance = real_array(covariance, "covariance", (n, n))
-    model = filter_model(plant)
-    return error_of(model, gain, model.A @ gain, covariance)[1]
-
-
-def error_of(
-    model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
-) -> tuple[float, float]:
-    """Return spectral radius and difference of a gain L and its predictor gain K, if both hold."""
-    radius = stable_radius(model, predictor)
-    try:
-        truth = own_variances(model, predictor, model.C1 @ gain)
-    except SolverError as error:
-        raise CertificateError(f"the estimation error could not be checked: {error}") from error
-    claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    return radius, agreement(claim, truth)
-
-
-def stable_radius(model: FilterModel, predictor: FloatArray) -> float:
-    """Return the spectral radius of the error of a predictor gain, which is below 1."""
-    closed = model.A - predictor @ model.C2
-    radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
-    if radius >= 1:
-        raise CertificateError(
-            f"the estimation error is not stable: spectral radius {radius:.9f}. The gain is not "
-            "that of a Kalman filter of this plant."
-        )
-    return radius
-
-
-def agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
-    """Return the largest relative difference of POI variances from those of a gain."""
-    difference = difference_of(claim, truth)
-    if not difference <= allowed:
-        raise CertificateError(
-            f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "
-            f"(allowed {allowed:.0e}). The prediction cannot be trusted."
-        )
-    return difference

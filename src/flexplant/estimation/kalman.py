@@ -7,36 +7,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, real_array
 from ..certificates import Certificate, Verified, stability_check
 from ..errors import CertificateError, ModelError, SolverError
-from ..lti.lyapunov import dual_variances
+from ..lti.lyapunov import difference_of, dual_variances, solve_stein
 from ..lti.riccati import filter_dare, riccati_root
-from ..lti.statespace import System
+from ..lti.sampling import reaches_at_once
+from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import AnyPlant
-from ..plant.partitioned import require_sampled
+from ..plant import AnyPlant, StandardPlant
+from ..plant.partitioned import require_noise, require_sampled
 from .error import error_variances
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, poi_channels, read_alike
-from .filter_models import (
-    AGREEMENT,
-    LEFT_OUT,
-    RICCATI,
-    ROUNDED,
-    FilterModel,
-    agreement,
-    check_noises,
-    difference_check,
-    error_of,
-    filter_model,
-    filter_system,
-    stable_radius,
-    weigh,
-)
+from .estimator_channels import checked_plant, estimates, poi_channels, read_alike, sensors
+from .filter_models import LEFT_OUT, FilterModel, filter_model, weigh
 from .left_out_modes import LeftOut, left_out
 from .machine_noise import unsure_noise
 
+#: largest relative difference of the covariances from the Riccati equation and from the gain's
+#: Stein equation; where rounding of the gain matters (`riccati_root`), of twice the standard
+#: deviation
+AGREEMENT, ROUNDED = 1e-6, 1e-2
 #: least fraction of R from the sensors: with less, covariances lose six digits and more
 _OWN = 1e-10
 
@@ -97,7 +88,7 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     """
     plant = checked_plant(plant)
     require_sampled(plant, "this filter runs at samples")
-    check_noises(plant)
+    _check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
@@ -108,6 +99,23 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
         return _judged(plant, found)
     noises = [found, *unsure_noise(found, plant, machines)]
     return min((_judged(plant, noise) for noise in noises), key=_upper_ends)
+
+
+def _check_noises(plant: AnyPlant) -> None:
+    """Raise AssumptionError for a sensor without noise, or with direct white noise."""
+    _ = plant.noise_factor  # raises where it is not known
+    read, own = sensors(plant), plant.sensor_noise.diagonal()
+    require_noise({name: own[plant.y.index(name)] for name in read})
+    inner = plant.system
+    loud = [
+        name
+        for name in plant.w
+        if plant.asd.get(name, 0.0) > 0 and ":noise" not in name and name not in plant.held
+    ]
+    direct = inner.D[np.ix_(inner.output_index(read), inner.input_index(loud))]
+    if np.any(direct):
+        row, column = (int(i) for i in np.argwhere(direct)[0])
+        raise reaches_at_once(loud[column], read[row])
 
 
 def _upper_ends(observer: KalmanEstimator) -> float:
@@ -122,7 +130,7 @@ def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
     complete = error_variances(read_alike(plant, found.whole), observer.system)
     certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}
     if complete.difference > certificate["difference"]:
-        certificate |= Certificate((difference_check(complete.difference, ROUNDED),))
+        certificate |= Certificate((_difference_check(complete.difference, ROUNDED),))
     return observer.replace(certificate=certificate, variances=complete.values)
 
 
@@ -142,9 +150,29 @@ def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     model = filter_model(plant, found)
     design = filter_design(model)
     own = plant if found is None else found.plant
-    system = filter_system(own, model, design.K, design.L_z)
+    system = _filter_system(own, model, design.K, design.L_z)
     return KalmanEstimator(
         system, plant, design.gain, design.covariance, design.certificate, design.variances, found
+    )
+
+
+def _filter_system(
+    plant: AnyPlant, model: FilterModel, K: FloatArray, L_z: FloatArray
+) -> StateSpace:
+    """Return the filter, from sensors and u to the estimates of POIs."""
+    # `x+ = A x + B u + K e`, `hat = C1 x + D1 u + L_z e` with the innovation `e = y - C2 x - D2 u`
+    m = model
+    return StateSpace(
+        m.A - K @ m.C2,
+        np.hstack([K, m.B - K @ m.D2]),
+        m.C1 - L_z @ m.C2,
+        np.hstack([L_z, m.D1 - L_z @ m.D2]),
+        plant.dt,
+        inputs=[*m.sensors, *m.commands],
+        outputs=estimates(m.channels),
+        states=plant.system.states,
+        name="kalman",
+        units=plant.units,
     )
 
 
@@ -166,9 +194,14 @@ class FilterDesign(NamedTuple):
         """Checks of the filter."""
         checks = (
             stability_check(self.radius, sampled=True),
-            Verified("residual", self.residual, RICCATI),
+            Verified("residual", self.residual, "the Riccati equation, in states of unit variance"),
         )
-        return Certificate((*checks, difference_check(self.difference, self.allowed)))
+        return Certificate((*checks, _difference_check(self.difference, self.allowed)))
+
+
+def _difference_check(difference: float, limit: float = AGREEMENT) -> Verified:
+    """Return the check of two routes to the variances at the POIs."""
+    return Verified("difference", difference, "variances by a Stein equation of the gain", limit)
 
 
 def filter_design(model: FilterModel) -> FilterDesign:
@@ -193,7 +226,7 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
     L_z = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    radius, difference = error_of(model, gain, K, covariance)
+    radius, difference = _error_of(model, gain, K, covariance)
     return FilterDesign(gain, K, L_z, covariance, variances, radius, solution.residual, difference)
 
 
@@ -208,7 +241,7 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
     rest = np.hstack([found.L - gain @ (model.C2 @ found.L), gain @ H])
     covariance = rest @ rest.T
     variances = np.sum((model.C1 @ rest) ** 2, axis=1)
-    radius = stable_radius(model, found.K)
+    radius = _stable_radius(model, found.K)
     poi_rows, entering = model.C1 @ gain, G - found.K @ H
     truth = dual_variances(
         model.A - found.K @ model.C2,
@@ -216,8 +249,92 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
         model.C1 - poi_rows @ model.C2,
         np.linalg.norm(found.L, axis=1),
     ) + np.sum((poi_rows @ H) ** 2, axis=1)
-    difference = agreement(variances, truth, ROUNDED)
+    difference = _agreement(variances, truth, ROUNDED)
     L_z = poi_rows + found.weighed(model.N)
     return FilterDesign(
         gain, found.K, L_z, covariance, variances, radius, found.change, difference, ROUNDED
     )
+
+
+def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:
+    """Return the difference of the POI variances of a gain from those of a covariance.
+
+    The error's covariance follows from the gain alone:
+    ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    gain : (n, ny) array
+        L.
+    covariance : (n, n) array
+        Claimed covariance, after the measurement.
+
+    Returns
+    -------
+    float
+        Largest relative difference over the POI channels.
+
+    Raises
+    ------
+    CertificateError
+        When the error is not stable or the difference exceeds 1e-6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> fx.estimation.check_gain(plant, observer.gain, observer.covariance) < 1e-6
+    True
+    """
+    plant = StandardPlant.of(plant)
+    n, p = plant.system.n_states, len(sensors(plant))
+    gain = real_array(gain, "gain", (n, p))
+    covariance = real_array(covariance, "covariance", (n, n))
+    model = filter_model(plant)
+    return _error_of(model, gain, model.A @ gain, covariance)[1]
+
+
+def _error_of(
+    model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
+) -> tuple[float, float]:
+    """Return spectral radius and difference of a gain L and its predictor gain K, if both hold."""
+    radius = _stable_radius(model, predictor)
+    try:
+        truth = _own_variances(model, predictor, model.C1 @ gain)
+    except SolverError as error:
+        raise CertificateError(f"the estimation error could not be checked: {error}") from error
+    claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
+    return radius, _agreement(claim, truth)
+
+
+def _stable_radius(model: FilterModel, predictor: FloatArray) -> float:
+    """Return the spectral radius of the error of a predictor gain, which is below 1."""
+    closed = model.A - predictor @ model.C2
+    radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
+    if radius >= 1:
+        raise CertificateError(
+            f"the estimation error is not stable: spectral radius {radius:.9f}. The gain is not "
+            "that of a Kalman filter of this plant."
+        )
+    return radius
+
+
+def _agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
+    """Return the largest relative difference of POI variances from those of a gain."""
+    difference = difference_of(claim, truth)
+    if not difference <= allowed:
+        raise CertificateError(
+            f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "
+            f"(allowed {allowed:.0e}). The prediction cannot be trusted."
+        )
+    return difference
+
+
+def _own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
+    """Return the variances (nz,) of the error of a filter on its own model."""
+    m, left = model, model.C1 - L_z @ model.C2
+    X = solve_stein(m.A - K @ m.C2, m.driven(K))
+    return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))

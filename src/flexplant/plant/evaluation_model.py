@@ -52,9 +52,9 @@ class EvaluationModel(Value):
     @classmethod
     def of(cls, given: Any) -> EvaluationModel | None:
         """Return the evaluation model of what a user passes; None stays None."""
-        given = getattr(given, "nominal", given)
         if given is None or isinstance(given, cls):
             return given
+        given = getattr(given, "nominal", given)
         if not is_channelled(given):
             instance(given, FEModel | Modes | ReducedModel, "evaluation", _HINT)
         return cls(given)

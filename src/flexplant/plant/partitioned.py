@@ -412,7 +412,7 @@ class Partition(PartitionedSystem):
         An `UncertainPlant` gives its nominal plant, whose `uncertainty` holds what is uncertain.
         LabelError when the labels do not, ModelError when it is neither.
         """
-        given = getattr(given, "nominal", given)
+        given = given if isinstance(given, cls) else getattr(given, "nominal", given)
         if isinstance(given, cls):
             return given
         if is_system(given):

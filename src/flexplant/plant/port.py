@@ -347,7 +347,7 @@ def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
     """Return a stable continuous system of one input and output, named like its port."""
     if given is None:
         return None
-    if hasattr(given, "shape") and hasattr(given, "asd"):
+    if not isinstance(given, StateSpace) and hasattr(given, "shape") and hasattr(given, "asd"):
         kind = type(given).__name__
         raise ModelError(
             f"the {what} of {name!r} is a filter, got {kind}, which is a spectrum: noise and its "
