@@ -147,7 +147,7 @@ def table(result: dict[str, Any]) -> str:
             for number in (found.value, max(found.bound, 0.0))
         )
         lines.append(f"{name:24s}{error:>12s}{value:>12s}{low:>12s}   {' '.join(found.chosen):.24}")
-    lines += ["", "error at the die, modes left out included: predicted, and on the machine"]
+    lines += ["", "error at the die, truncated modes included: predicted, and on the machine"]
     for name, both in result["machine"].items():
         lines.append(f"{name:24s}" + "".join(f"{1e12 * error:9.1f} pm" for error in both))
     pair = result["pair"]

@@ -31,7 +31,7 @@ CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 COLORS = ("0.55", "#E69F00", "#0072B2")  # of the loops
 STORY = """At 0.1 % damping predicted errors hold: of sensors alone (geometry), of filters of the
-drawn or measured model, unless the modes left out are ignored (24 modes).
+drawn or measured model, unless the truncated modes are ignored (24 modes).
 | A design that trusts the updated model is unstable on the machine. A tolerant one holds.
 | The tolerant loop has the |S| on the machine that its model promised (cut at -50 dB).
 | It follows a move of 100 µm with a smaller error at the die than the best servo.
@@ -200,7 +200,7 @@ def claims(cases: dict[float, dict[str, Any]]) -> dict[str, bool]:
     plain, _, wide, *_ = usual["table"].rows.values()
     return {
         f"predicted errors of z, rx and ry hold on the machine within {np.ceil(100 * off):.0f} %: "
-        "modes left out of the model count as noise": off < 0.05,
+        "truncated modes count as noise": off < 0.05,
         f"without them {alone[0]:.1f} nm are predicted where the machine has {alone[1]:.1f} nm; "
         f"with them it has {cured[1]:.1f} nm": alone[1] > max(3.0 * alone[0], 1.5 * cured[1]),
         f"H-infinity for {BANDWIDTH:g} Hz designed as if the updated model were the machine is "

@@ -95,7 +95,7 @@ def table(result: dict[str, Any]) -> str:
     """Return what the page shows, as text."""
     closed = result["closed"]
     lines = [repr(result["design"]), repr(result["loops"].report)]
-    lines.append(f"on the drawing: {closed.decay}; modes left out: {closed.left_out.summary}")
+    lines.append(f"on the drawing: {closed.decay}; truncated modes: {closed.left_out.summary}")
     lines.append(f"predicted error at the die: {1e9 * closed.rms('die:error'):.2f} nm rms")
     return "\n".join(lines)
 

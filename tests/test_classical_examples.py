@@ -39,7 +39,7 @@ def test_damping_first_and_motion_after(found):
     plant = example.machine()
     tuned = example.dampers(plant)
     assert all(one.damping >= 0.15 and one.loop.left_out.is_stable for one in tuned.values())
-    with pytest.warns(fx.errors.FlexplantWarning, match="modes that the plant left out"):
+    with pytest.warns(fx.errors.FlexplantWarning, match="modes that the plant truncates"):
         hinf = example.by_hinf(plant)
         rows = example.table(plant, tuned, hinf)
     assert rows.count("yes") == 4

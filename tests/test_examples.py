@@ -135,7 +135,7 @@ def test_the_measured_poles_stand_in_the_models(result):
 
 
 def test_predicted_errors_are_those_of_the_machine(result):
-    """Within 5 % in z, rx, ry where modes left out are counted; far off where they are not."""
+    """Within 5 % in z, rx, ry where truncated modes are counted; far off where they are not."""
     for case in result["cases"].values():
         for errors in case["axes"]:
             predicted, measured, low, high = errors["measured, all modes"]
@@ -163,7 +163,7 @@ def test_the_closed_loops(result):
     table, loops = case["table"], case["loops"]
     sure, held = table["H-infinity, updated"], table["tolerant, measured"]
     assert sure.decay > 1.001
-    assert not loops["H-infinity, updated"]["model"].is_stable  # the modes left out show it
+    assert not loops["H-infinity, updated"]["model"].is_stable  # the truncated modes show it
     assert held.bandwidth == pytest.approx(78.5, abs=2.0)
     promised = loops["tolerant, measured"]["model"].modulus_margin
     assert promised >= 0.4 * (1 - 1e-6)

@@ -39,7 +39,7 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
     for table in (own, every):
         assert table["failed"].tolist() == [""]
         assert table["stable"].all()
-        # promised on the updated, calibrated model with the modes left out
+        # promised on the updated, calibrated model with the truncated modes
         np.testing.assert_allclose(table["modulus margin"], table["margin expected"], rtol=0.05)
     assert np.all(own["modulus margin"] > 0.4)
     # of 70 Hz asked, from reference to error; this is |S| at u, of all axes together

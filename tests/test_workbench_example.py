@@ -37,7 +37,7 @@ def test_the_drawing_and_its_other_modes_agree(example, result):
     closed = result["closed"]
     assert closed.left_out.is_fine
     assert 1e9 * closed.rms("die:error") == pytest.approx(9.76, abs=0.05)
-    assert "modes left out: stable" in example.table(result)
+    assert "truncated modes: stable" in example.table(result)
 
 
 def test_the_machine_itself_is_stable_with_it(example, result):

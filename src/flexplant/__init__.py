@@ -136,7 +136,7 @@ faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_p
 | 0.1 | 0.2 |
 |---|---|
 | ``larger=whole`` of any function | ``assemble_plant(model, ports, evaluation=whole)`` |
-| ``larger=plant`` (no modes left out) | ``plant.replace(evaluation=None)`` |
+| ``larger=plant`` (no truncated modes) | ``plant.replace(evaluation=None)`` |
 | ``larger_plant(plant, whole)`` | ``plant.evaluation_plant`` |
 | ``PoiVariance(larger=)``, ``LeftOutModes(larger)`` | the plant's evaluation model |
 | ``simulation.MachinePipeline`` | a function for `study`, as in `examples/fleet.py` |

@@ -80,7 +80,7 @@ corner above 0.45 of the rate or the last line.
 Where the laws found for each axis alone do not hold the peak together, those of all axes are
 changed together until they do, for the highest geometric mean of their bandwidths: |S| of each
 axis with the others closed, and the largest singular value of S at u and of S at y, where the
-channels of a side have one unit; with the modes left out too, where these are known. Laws that
+channels of a side have one unit; with the truncated modes too, where these are known. Laws that
 come closest to the peak are returned with a warning that says what ended the search.
 
 No model is needed: the plant may be an Frf. A line is taken to lie anywhere within two standard
@@ -107,7 +107,7 @@ reaches (`Controller.reached`).
 **design_kalman.** The noise model is that of `simulate`: `plant.process_noise` per sample into x
 and `plant.sensor_noise` on a sample of y; delays of u are known exactly. The Riccati equation is
 solved scaled inside, in any units (`flexplant.lti.filter_dare`), and in square roots where noise is
-so little that P has too few digits ([Hewer1971]_, by QR factors). Modes left out add no states.
+so little that P has too few digits ([Hewer1971]_, by QR factors). Truncated modes add no states.
 Their motion under the disturbances is noise with covariances R_t at the sensors, V_t at the POIs
 and N_t between them, and they follow u by their static compliance::
 

@@ -90,11 +90,14 @@ def instance(
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
-    """Return `value`, which must be one of some texts."""
+    """Return the one of some texts that `value` is; an underscore counts as a space."""
     listed = list(choices)
-    if not isinstance(value, str) or value not in listed:
+    if isinstance(value, str) and value in listed:
+        return value
+    spaced = [one for one in listed if isinstance(value, str) and one == value.replace("_", " ")]
+    if not spaced:
         raise ModelError(f"{name} must be one of {listed}, got {short(value)}. Pass one of them.")
-    return value
+    return spaced[0]
 
 
 def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tuple[str, ...]:

@@ -55,7 +55,7 @@ def meshed(size, thickness, elements, stiffer=0.0):
 
 
 def models(machine, size, thickness, elements, seed, zeta=ZETA):
-    """The calibrated model, the one with the modes left out, and what is not known."""
+    """The calibrated model, the one with the truncated modes, and what is not known."""
     drawing = meshed(size, thickness, elements)
     place = (size[0] / 2, size[1] / 4, 0.0)
     at, low = drawing.dofs.nearest(place, "z"), fx.ModalDamping(zeta)
@@ -75,7 +75,7 @@ def models(machine, size, thickness, elements, seed, zeta=ZETA):
 def test_promised_and_measured(name):
     size, thickness, elements, forces = CASES[name]
     own = ports(size, forces)
-    print(f"\n{name}: margin promised, with the modes left out, on the machine; |S| < 1 up to")
+    print(f"\n{name}: margin promised, with the truncated modes, on the machine; |S| < 1 up to")
     for seed, mass in (LONG if name == "long" else MACHINES).items():
         machine = fx.testbeds.wafer_stage(
             size=size,
@@ -99,7 +99,7 @@ def test_promised_and_measured(name):
         margins = [promised, promised.completed, loop]
         said = "  ".join(f"{one.modulus_margin:.3f}" for one in margins)
         print(f"  machine {seed}: {said}  {reach:5.1f} Hz  ({spent:.0f} s of CPU)")
-        # design_stage draws machines with modes left out, shapes and damping off: without shapes
+        # design_stage draws machines with truncated modes, shapes and damping off: without shapes
         # machine 302 of the small plate was 0.33 for 0.43; without less damping of modes that were
         # not measured the long plate 811 was 0.22 for 0.41 (a mode left out, 2 % lower and of a
         # third less damping, half of which the controller takes away)

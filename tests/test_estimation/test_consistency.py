@@ -150,7 +150,7 @@ def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     design = machine().replace(evaluation=modes(1e-2, 9 + more))
     known = judged(design, plant(count=9 + more))
     assert known.causes == ("truncation",)
-    assert f"the plant is correct, they are coloured by the {more} modes left out" in known.text
+    assert f"the plant is correct, they are coloured by the {more} truncated modes" in known.text
     assert "its predicted errors hold" in known.text
 
 

@@ -414,7 +414,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
     [(Predictor(), True), (Filter(), False), (FixedLag(4), True), (Smoother(), False)],
 )
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
-    """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""
+    """Start, a gap, blocks, compliance and noise of truncated modes: row by row the fixed POI's."""
     plant = plate_plant(2e-2, count=5, sensor_asd=1e-10)
     kalman = design_kalman(plant.replace(evaluation=modes(2e-2, 9) if truncated else None))
     model = kalman.model

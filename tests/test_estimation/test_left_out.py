@@ -1,4 +1,4 @@
-"""Modes left out of the filter: noise by the closed form, an honest rms, other machines."""
+"""Truncated modes of the filter: noise by the closed form, an honest rms, other machines."""
 
 from functools import cache
 
@@ -111,7 +111,7 @@ def test_the_prediction_is_the_error_on_the_evaluation_plant_by_frequency():
     estimator = design_kalman(plant.replace(evaluation=modes))
     expected = error_by_frequency(*dictionaries(sampled(modes), estimator.system))
     np.testing.assert_allclose(estimator.variances, expected, rtol=5e-3)
-    assert estimator.certificate["modes left out"] == 16
+    assert estimator.certificate["truncated modes"] == 16
     assert estimator.certificate["difference"] < 1e-9
 
 
@@ -135,10 +135,10 @@ def test_a_filter_that_knows_nothing_of_them_claims_too_little():
         assert blind.rms("die") == pytest.approx(claim, rel=0.02, abs=0)
         assert blind.rms("die", on=whole) == pytest.approx(truth, rel=0.02, abs=0)
         assert "truncation is not in these numbers" in repr(blind)
-        assert blind.certificate.get("modes left out") is None
+        assert blind.certificate.get("truncated modes") is None
         assert knowing.rms("die") == pytest.approx(cured, rel=0.02, abs=0)
         assert knowing.rms("die", on=whole) == pytest.approx(knowing.rms("die"), rel=1e-9, abs=0)
-        assert "with 219 modes left out" in repr(knowing)
+        assert "with 219 truncated modes" in repr(knowing)
 
 
 @pytest.mark.long
@@ -174,7 +174,7 @@ def test_modes_that_the_reduced_model_knows_are_the_default():
     for method in (DesiredDofs(grid), ModalTruncation(9), ModalTruncation(9, static_at=["1:z"])):
         plant = sampled(reduce(real, method))
         found = design_kalman(plant)
-        assert found.certificate["modes left out"] == 31
+        assert found.certificate["truncated modes"] == 31
         assert found.rms("die") == pytest.approx(
             design_kalman(plant.replace(evaluation=real)).rms("die"), rel=1e-6, abs=0
         )
@@ -182,10 +182,10 @@ def test_modes_that_the_reduced_model_knows_are_the_default():
         given = design_kalman(
             sampled(real.select(range(9))).replace(evaluation=reduce(real, method))
         )
-        assert given.certificate["modes left out"] == 31
+        assert given.certificate["truncated modes"] == 31
         # without them truncation is not in the error
         alone = design_kalman(plant.replace(evaluation=None))
-        assert alone.certificate.get("modes left out") is None
+        assert alone.certificate.get("truncated modes") is None
         assert "not judged on a larger model: truncation is not in" in repr(alone)
         assert alone.left_out is None
         assert alone.rms("die") < found.rms("die")

@@ -147,7 +147,7 @@ def test_levels_that_stand_for_modes_left_out_are_warned_of():
         FlexplantWarning, match="do not explain the record.*Give the plant an evaluation"
     ):
         blind = estimate_noise(plant(), recorded(plant(count=12))[0])
-    assert "a mode left out" in blind.verdict
+    assert "a truncated mode" in blind.verdict
 
 
 @pytest.mark.slow

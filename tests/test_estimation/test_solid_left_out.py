@@ -1,4 +1,4 @@
-"""Modes left out of a solid's filter: bending, twisting and stretching in all six directions."""
+"""Truncated modes of a solid's filter: bending, twisting and stretching in all six directions."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_the_prediction_on_a_solid_is_the_error_by_frequency():
     modes = solve_modes(body.with_damping(ModalDamping(0.01)), count=24)
     plant, whole = sampled(modes.select(range(12))), sampled(modes)
     blind, found = design_kalman(plant), design_kalman(plant.replace(evaluation=modes))
-    assert found.certificate["modes left out"] == 12
+    assert found.certificate["truncated modes"] == 12
     g, observer, n = whole.system, found.system, len(PLACES)
     seen = g.output_index(whole.y)
     truth = {"A": g.A, "C1": g.C[:3], "C2": g.C[seen], "factor": whole.noise_factor}

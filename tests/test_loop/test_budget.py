@@ -168,7 +168,7 @@ def test_modes_left_out_are_in_where_they_are_known():
     found = loop.budget("die:error")
     assert found.left_out == pytest.approx(whole.rms("die:error"), rel=1e-9, abs=0)
     assert loop.completed.rms("die:error") == found.left_out
-    assert f"with the modes left out of the model: {1e9 * found.left_out:.5g}" in repr(found)
+    assert f"with the truncated modes: {1e9 * found.left_out:.5g}" in repr(found)
     assert np.isnan(fx.close_loop(plant, *blocks).budget("die:error").left_out)
 
 

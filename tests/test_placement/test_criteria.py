@@ -116,7 +116,7 @@ def test_modes_left_out_count_as_in_the_filter():
         assert claim == pytest.approx(on, rel=1e-9, abs=0.0)
     alone = score_sensors(plant, sets, PoiVariance("die", own_modes=True), candidates=candidates)
     assert alone.values[0] < 0.5 * found.values[0]
-    # a reduced model's own modes left out count by default, and no bound is claimed
+    # a reduced model's own truncated modes count by default, and no bound is claimed
     reduced = reduce(many, ModalTruncation(12))
     default = sampled(reduced)
     judged = goal(default.replace(evaluation=many))

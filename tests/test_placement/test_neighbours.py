@@ -226,7 +226,7 @@ def test_a_short_list_by_the_hinf_level():
 
 def test_what_wrappers_refuse(make):
     plant, sensors, actuators = make(41)
-    with pytest.raises(AssumptionError, match="no modes left out"):
+    with pytest.raises(AssumptionError, match="no truncated modes"):
         place_sensors(plant, sensors, 4, LeftOutModes())
     with pytest.raises(ModelError, match="at least one plant"):
         OverMachines(PoiVariance("die"), [])

@@ -46,10 +46,10 @@ def test_noise_of_amplifiers_is_that_of_doubled_ones_without_their_states():
     double, single = (plant.discretized(RATE, delay=1) for plant in plants)
     rms = [fx.design_kalman(plant).rms("die") for plant in (double, single)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-7, abs=0)
-    # the modes left out are moved by it, too
+    # the truncated modes are moved by it, too
     whole = some_modes(count=40, attached=False)
     both = [fx.design_kalman(plant.replace(evaluation=whole)) for plant in (double, single)]
-    assert both[0].certificate["modes left out"] == both[1].certificate["modes left out"] > 0
+    assert both[0].certificate["truncated modes"] == both[1].certificate["truncated modes"] > 0
     assert both[0].rms("die") == pytest.approx(both[1].rms("die"), rel=1e-7, abs=0)
     assert both[0].rms("die") > 1.001 * rms[0]
 
@@ -78,7 +78,7 @@ def test_weights_placement_and_refusals():
     shaken = bare.replace(y=[*bare.y, Sensor("a", at=INSET[0], quantity="acceleration", asd=1e-6)])
     with pytest.raises(AssumptionError, match=r"'u1:disturbance' reaches 'a' without delay"):
         fx.design_kalman(fx.assemble_plant(reduced(), shaken).discretized(RATE, delay=1))
-    # and the compliance of modes left out does not answer white noise at once
+    # and the compliance of truncated modes does not answer white noise at once
     late = fx.assemble_plant(reduced(), bare).discretized(RATE, delay=1)
     found = fx.design_kalman(late.replace(evaluation=some_modes(count=40, attached=False)))
-    assert found.certificate["modes left out"] > 0
+    assert found.certificate["truncated modes"] > 0

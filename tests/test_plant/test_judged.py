@@ -12,7 +12,7 @@ MODES = fx.solve_modes(PLATE, count=20)
 FEW = fx.assemble_plant(MODES.select(range(9)), ports()).discretized(10e3, delay=1.5)
 JUDGED = FEW.replace(evaluation=MODES)
 SAID = "not judged on a larger model"
-LEFT = "left out"
+LEFT = "truncated"
 YS = ["y1", "y2", "y3", "y4"]
 
 
@@ -42,7 +42,7 @@ ANSWERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ANSWERS)
-@pytest.mark.filterwarnings("ignore:with the modes that the plant left out")
+@pytest.mark.filterwarnings("ignore:with the modes that the plant truncates")
 def test_an_answer_accounts_for_the_modes_left_out_or_says_that_it_does_not(name):
     alone, judged = (repr(ANSWERS[name](plant)) for plant in (FEW, JUDGED))
     assert alone.count(SAID) == 1 and LEFT not in alone
@@ -75,7 +75,7 @@ DESIGNED = ("servo", "H2", "H-infinity", "coprime factors", "loop")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DESIGNED)
-@pytest.mark.filterwarnings("ignore:with the modes that the plant left out")
+@pytest.mark.filterwarnings("ignore:with the modes that the plant truncates")
 def test_a_design_is_judged_on_the_measured_response_or_says_that_it_is_not(name):
     alone, measured = (ANSWERS[name](one) for one in (JUDGED, JUDGED.measured(response())))
     assert repr(alone).count("not judged on a measurement") == 1

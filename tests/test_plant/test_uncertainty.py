@@ -71,7 +71,7 @@ def _upper(pair):
 
 
 def closed(uncertain, values):
-    """The LFT with its Deltas closed by hand; neglected modes left out."""
+    """The LFT with its Deltas closed by hand; neglected truncated modes."""
     g, channels = uncertain.system, uncertain.channels
     n, names = len(channels), list(channels)
     given = np.array([values.get(name, 0.0) for name in channels.values()])

@@ -93,7 +93,7 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     tiles = [words(one) for one in tree.iter("div") if "tile " in one.get("class", "")]
     error = with_unit(loop.rms("die:error"), "m")
     beyond = with_unit(loop.completed.rms("die:error"), "m")
-    assert tiles[0] == f"die:error, rms{error}with the modes left out {beyond}"
+    assert tiles[0] == f"die:error, rms{error}with the truncated modes {beyond}"
     assert tiles[1] == f"stabilitystablespectral radius {loop.spectral_radius:.4f}"
     assert "stablespectral radius" in tiles[2] and "(126 states)" in tiles[2]
     assert f"modulus margin {loop.modulus_margin:.3g}" in tiles[3]
@@ -262,7 +262,7 @@ def test_an_unstable_loop_is_reported_as_such(tmp_path):
     assert "stabilityUNSTABLElargest real part 0.5 rad/s" in said
     assert "No error budget: " in said and "No margins: unstable" in said
     assert (
-        "with the modes left outnot judged on a larger model" in said and "modulus margin" in said
+        "with the truncated modesnot judged on a larger model" in said and "modulus margin" in said
     )
 
 

@@ -41,7 +41,7 @@ def test_kept_and_left_out_are_all_modes(method):
 def test_they_survive_saving_pickling_and_the_update(tmp_path):
     model = reduce(ALL, METHODS["desired"])
     assert model.truncated.n_modes == 21
-    assert "21 modes left out are known" in repr(model)
+    assert "21 truncated modes are known" in repr(model)
     model.save(tmp_path / "model.npz")
     for twin in (fx.load(tmp_path / "model.npz"), pickle.loads(pickle.dumps(model))):
         np.testing.assert_array_equal(twin.truncated.phi, model.truncated.phi)
@@ -54,7 +54,7 @@ def test_they_survive_saving_pickling_and_the_update(tmp_path):
 
 
 def test_attachment_vectors_of_the_known_modes_come_back_too():
-    """Vectors that ModalTruncation leaves out stand behind the modes left out."""
+    """Vectors that ModalTruncation leaves out stand behind the truncated modes."""
     with_vector = solve_modes(PLATE, count=20, damping=ModalDamping(0.01), compliance_at=["1:z"])
     model = reduce(with_vector, ModalTruncation(9))
     assert (model.truncated.n_modes, model.truncated.n_vectors) == (11, 1)

@@ -52,7 +52,7 @@ def test_predicted_and_simulated_and_by_hand():
     assert np.abs(np.array(error[last + 1 :]) - end).max() == pytest.approx(
         found.simulated, rel=1e-6
     )
-    assert found.freq.size >= 4  # the modes left out of the plant are among them
+    assert found.freq.size >= 4  # the truncated modes of the plant are among them
 
 
 @pytest.mark.parametrize("kind", ["ZV", "ZVD", "EI"])

@@ -89,7 +89,7 @@ def test_modes_left_out_are_checked():
     assert fine.system.inputs[-1] == "z:ref"  # which takes no part in the loop
     assert fine.left_out is not None and fine.left_out.is_fine
     fast = tune_loops(P, notches=0)
-    with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
+    with pytest.warns(FlexplantWarning, match="with the modes that the plant truncates"):
         assert not design_loops(P.replace(evaluation=many()), fast.laws).left_out.is_fine
     known = tune_loops(P.replace(evaluation=many()), notches=0)
     assert known.report.is_stable

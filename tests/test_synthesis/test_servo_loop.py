@@ -196,7 +196,7 @@ def test_modes_left_out_count():
     servo = design_servo(plant.replace(evaluation=truth()), bandwidth=50.0, observer=static)
     assert servo.left_out.is_stable
     radius = dense(truth(), static.system, servo.system)
-    key = "spectral radius with modes left out"
+    key = "spectral radius with truncated modes"
     assert servo.certificate[key] == pytest.approx(radius, abs=1e-7)
     quick = {"rolloff": 4000.0, "notches": (), "observer": static}
     reach = servo_bandwidth(plant, **quick)

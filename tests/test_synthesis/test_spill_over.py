@@ -1,4 +1,4 @@
-"""Designs on truncated plants, checked with the modes left out: oracle by dense matrices."""
+"""Designs on truncated plants, checked with the truncated modes: oracle by dense matrices."""
 
 import warnings
 from functools import cache
@@ -92,15 +92,15 @@ def dense(plant, errors, K, kept=None):
 def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     errors, _, found, messages = design()
     assert found.certificate["spectral radius"] < 1
-    radius = found.certificate["spectral radius with modes left out"]
+    radius = found.certificate["spectral radius with truncated modes"]
     assert radius > 1.0015
-    assert found.certificate["modulus margin with modes left out"] == 0.0
+    assert found.certificate["modulus margin with truncated modes"] == 0.0
     whole = sampled(many())
     # oracle: stability() is the radius' logarithm or the like: only its sign counts
     loop = dense(whole, errors, found.system)
     assert np.abs(np.linalg.eigvals(loop[0])).max() == pytest.approx(radius, abs=1e-9)
     assert len(messages) == 1 and f"mode {found.left_out.modes[0]} (" in messages[0]
-    assert "unstable" in repr(found) and "modes left out" in repr(found)
+    assert "unstable" in repr(found) and "truncated modes" in repr(found)
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_the_default_weights_are_stable_with_the_modes_left_out():
     whole = sampled(many())
     loop = dense(whole, errors, found.system)
     radius = np.abs(np.linalg.eigvals(loop[0])).max()
-    assert found.certificate["spectral radius with modes left out"] == pytest.approx(radius)
-    margin = found.certificate["modulus margin with modes left out"]
+    assert found.certificate["spectral radius with truncated modes"] == pytest.approx(radius)
+    margin = found.certificate["modulus margin with truncated modes"]
     assert 0.4 < margin < found.left_out.states
     g, K = whole.system, found.system
     peaks = []
@@ -168,7 +168,7 @@ def test_the_reduced_model_knows_its_modes_by_itself():
     assert other.left_out.modulus_margin == pytest.approx(found.left_out.modulus_margin, rel=1e-6)
     loop = close_loop(sampled(model), errors, found)
     assert loop.left_out.modulus_margin == pytest.approx(found.left_out.modulus_margin, rel=1e-9)
-    assert "with the modes left out: stable" in repr(loop)
+    assert "with the truncated modes: stable" in repr(loop)
 
 
 @pytest.mark.slow
@@ -278,7 +278,7 @@ def test_a_continuous_design_is_checked_in_continuous_time():
     _, problem = weighted(plant, 50.0)
     found = design_hinf(problem.replace(evaluation=many()))
     assert found.left_out.stability < 0
-    assert "largest real part with modes left out" in found.certificate
+    assert "largest real part with truncated modes" in found.certificate
     with pytest.raises(ModelError, match="sampled loops"):
         _ = found.left_out.spectral_radius
 
@@ -289,7 +289,7 @@ def test_what_does_not_go_with_the_plant_is_refused():
     with pytest.raises(LabelError, match="other channels"):
         design_hinf(problem.replace(evaluation=sampled(many(), ports(references=[]))))
     # a loop around weights is judged with the same weights around the evaluation plant
-    with pytest.warns(FlexplantWarning, match="with the modes left out it is unstable"):
+    with pytest.warns(FlexplantWarning, match="with the truncated modes it is unstable"):
         loop = close_loop(problem.replace(evaluation=many()), found)
     assert loop.left_out.stability == pytest.approx(found.left_out.stability, rel=1e-9, abs=0)
 

@@ -250,7 +250,7 @@ def test_one_controller_for_several_machines():
 
 @pytest.mark.long
 def test_the_stage_with_decoupled_laws_at_two_poi_positions():
-    """A stage in SI units, one law for each rigid-body axis; the modes left out are checked."""
+    """A stage in SI units, one law for each rigid-body axis; the truncated modes are checked."""
     P = sampled(small(), ports()).replace(evaluation=many())
     weighted = []
     for plant in (P, P.at(poi=(0.2, 0.35, 0.0))):

@@ -186,7 +186,7 @@ def test_fits_are_calibrated_too():
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore:.*modes that the plant left out")
+@pytest.mark.filterwarnings("ignore:.*modes that the plant truncates")
 def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
     """By its own poles; on this one (and another of eight) a shape at 244 Hz is not the model's.
 

@@ -327,7 +327,7 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     assert answer.rms == pytest.approx(loop.rms("die:error"), rel=1e-9)
     assert np.sqrt(sum(v**2 for _, v in answer.sources)) == pytest.approx(answer.rms, rel=1e-6)
     assert f"{loop.spectral_radius:.9g}" in page.further.object
-    assert "modes left out" in page.further.object
+    assert "truncated modes" in page.further.object
     assert answer.error[0] == pytest.approx(1.0)
     feedback = K.select(inputs=[n for n in K.inputs if n in plant.y and n != "die:ref"])
     assert page.loop.is_stable is bool(

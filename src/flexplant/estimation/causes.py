@@ -299,12 +299,12 @@ def _other_cause(
         "or a disturbance that is missing in the plant. Keep more modes, or add the disturbance."
     )
     if above:
-        out = f"a mode left out (above {nyquist} it appears folded)"
+        out = f"a truncated mode (above {nyquist} it appears folded)"
         return LikelyCause("truncation", f"{_phrase(shown, rate)}, {where}: {out}, {lacks}")
     return LikelyCause(
         "folding",
-        f"{_phrase(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: one left out that lies "
-        f"above {nyquist} and appears folded (from {rate - at:.5g} or {rate + at:.5g} Hz, say), "
+        f"{_phrase(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: a truncated one "
+        f"above {nyquist} appears folded (from {rate - at:.5g} or {rate + at:.5g} Hz, say), "
         + lacks,
     )
 
@@ -317,14 +317,14 @@ def _phrase(peak: ExcessPeak, rate: float) -> str:
 
 
 def left_modes(whole: AnyPlant, numbers: IntArray) -> SampledModes:
-    """Return the modes left out of an evaluation plant."""
+    """Return the truncated modes of an evaluation plant."""
     every = sampled_modes(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))
     return SampledModes(every.numbers[at], every.freq[at])
 
 
 def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
-    """Return which mode left out appears at a frequency [Hz], or None."""
+    """Return which truncated mode appears at a frequency [Hz], or None."""
     rate = 1.0 / observer.plant.dt
     seen = folded(left.freq, rate)
     i = int(np.argmin(np.abs(seen - at)))
@@ -357,6 +357,6 @@ def known_verdict(
     return LikelyCause(
         "folding" if left.freq[i] > 0.5 * rate else "truncation",
         "the innovations agree with the evaluation model: the plant is correct, they are coloured "
-        f"by the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
+        f"by the {counted(left.freq.size, 'truncated mode')} (most at {at:.4g} Hz, next to "
         f"{left.named(i)} in the evaluation model)). {end}",
     )

@@ -26,7 +26,7 @@ FEW_DIGITS = (
 )
 
 #: entry of a certificate: number of truncated modes
-LEFT_OUT = "modes left out"
+LEFT_OUT = "truncated modes"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -125,7 +125,7 @@ def _upper_ends(observer: KalmanEstimator) -> float:
 
 
 def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
-    """Return the filter of a plant and of modes left out, with its errors on the larger plant."""
+    """Return the filter of a plant and of truncated modes, with its errors on the larger plant."""
     observer = _observer(plant, found)
     complete = error_variances(read_alike(plant, found.whole), observer.system)
     certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}

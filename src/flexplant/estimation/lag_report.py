@@ -102,7 +102,7 @@ class LagReport(Value):
         cells = [(n, *("-" if np.isnan(v) else f"{v:.4g}" for v in r)) for n, r in rows.items()]
         lines = ["rms error at the POIs by lag", *aligned(("", *heads), cells)]
         if beyond:
-            lines.append("* on the plant with the modes left out, which are white noise above")
+            lines.append("* on the plant with the truncated modes, which are white noise above")
         if self.note:
             lines.append(f"no static relation: {self.note}")
         return "\n".join(lines)
@@ -258,7 +258,7 @@ class StaticEstimator(PoiEstimator):
 
         It includes the deformation by disturbances (also of known truncated modes) and the sensor
         noise; free motions have no error. `channel` and `on`, a plant, are as for
-        `KalmanEstimator.rms`; `on` None is its own with the modes left out. AssumptionError also
+        `KalmanEstimator.rms`; `on` None is its own with the truncated modes. AssumptionError also
         when the plant is continuous (a sample of white sensor noise has no variance then),
         SolverError when an elastic mode is not damped.
         """

@@ -37,13 +37,13 @@ def beyond_text(plant: AnyPlant, count: int | None) -> str:
     """Return a text on the truncated modes in predicted errors, and their number."""
     if count is None:
         alone = f"{NOT_JUDGED}: truncation is not in these numbers"
-        return alone if plant.unjudged else "no modes are left out"
-    return f"with {counted(count, 'mode')} left out" if count else "as if no modes were left out"
+        return alone if plant.unjudged else "no modes are truncated"
+    return f"with {counted(count, 'truncated mode')}" if count else "as if no modes were truncated"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOut(Value):
-    """Effect of the modes left out of a plant on its sensors y and POIs z.
+    """Effect of the truncated modes of a plant on its sensors y and POIs z.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class LeftOut(Value):
 def left_out(plant: AnyPlant, whole: AnyPlant) -> LeftOut | None:
     """Return the effect of modes of an evaluation plant that a plant lacks; None without any.
 
-    With the poles lambda of the modes left out, b what white noise of unit intensity drives and c
+    With the poles lambda of the truncated modes, b what white noise of unit intensity drives and c
     what is seen, ``X_ij = - b_i b_j^* / (lambda_i + lambda_j^*)`` is the stationary covariance,
     ``c X c*`` that of the motions. For modes with modal damping this is::
 
@@ -216,7 +216,7 @@ def _motion_covariance(blocks: _Blocks, chosen: IntArray, plant: AnyPlant) -> Fl
     poles = blocks.poles[chosen].reshape(-1)
     if np.any(poles.real >= 0):
         raise ModelError(
-            "a mode left out has no damping: its motion under white noise has no variance. Give "
+            "a truncated mode has no damping: its motion under white noise has no variance. Give "
             "solve_modes(damping=...)."
         )
     omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)

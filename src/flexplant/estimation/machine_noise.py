@@ -21,7 +21,7 @@ def unsure_noise(found: LeftOut, plant: AnyPlant, machines: Any) -> list[LeftOut
     """Return noises for a filter that weighs modes by their uncertainty, one for each of `PARTS`.
 
     The stationary covariance of what the sensors and POIs of a machine show beyond the model of
-    the filter, both driven by the same disturbances, takes the place of that of the modes left out:
+    the filter, both driven by the same disturbances, replaces that of the truncated modes:
     the mean over the machines, of which the covariance on the evaluation model is a part.
     """
     if machines.missing:

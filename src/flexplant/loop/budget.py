@@ -120,11 +120,11 @@ class ErrorBudget(Value):
         rows.append(("total", f"{self.rms / size:.3f}", f"{1:.1%}", ""))
         lines = [f"{head} by source", *aligned(("", "rms", "share", "half below"), rows)]
         if np.isinf(self.left_out):
-            lines.append("with the modes left out of the model the loop is unstable")
+            lines.append("with the truncated modes the loop is unstable")
         elif np.isnan(self.left_out):
             lines.append(NOT_JUDGED)
         else:
-            lines.append(f"with the modes left out of the model: {self.left_out / size:.5g}")
+            lines.append(f"with the truncated modes: {self.left_out / size:.5g}")
         lines += [f"total: {self.interval}"] if self.interval else []
         return "\n".join(lines)
 

@@ -102,7 +102,7 @@ class ClosedLoop(Value):
         if unread := [name for name in self.plant.y if name in self.plant.w and name not in read]:
             lines.append(f"  references that no block reads: {' '.join(unread)}")
         if self.left_out is not None:
-            lines.append(f"  with the modes left out: {self.left_out.summary}")
+            lines.append(f"  with the truncated modes: {self.left_out.summary}")
         elif self.plant.unjudged:
             lines.append(f"  {self.plant.unjudged}")
         measured = self.on_measurement
@@ -573,7 +573,7 @@ def close_loop(
         )
     elif loop.is_stable and found is not None and not found.is_stable:
         warn(
-            "the loop is stable on its plant, but with the modes left out it is "
+            "the loop is stable on its plant, but with the truncated modes it is "
             f"{found.summary}. The machine has these modes: lower the bandwidth, keep them in "
             "the plant, or let the controller roll off (or notch) below them."
         )

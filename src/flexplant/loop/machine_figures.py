@@ -83,8 +83,8 @@ def loop_interval(
 ) -> FigureInterval:
     """Return the interval of a figure or a channel's rms; see `ClosedLoop.interval`."""
     known = loop.plant.machine.machines
-    if not callable(figure) and figure not in loop.monitored.outputs:
-        one_of(figure, "figure", (*FIGURES, *loop.monitored.outputs))
+    if isinstance(figure, str):
+        figure = one_of(figure, "figure", (*FIGURES, *loop.monitored.outputs))
     if known is None or known.missing:
         return interval(known, lambda: np.zeros(0), level, "")
     loops = loop.on_machines

@@ -103,7 +103,7 @@ class SpillOver(Value):
     @property
     def certificate(self) -> Certificate:
         """Checks on the plant with the truncated modes."""
-        beyond = " with modes left out"
+        beyond = " with truncated modes"
         margin = Verified(f"modulus margin{beyond}", self.modulus_margin, "a sweep of |1 + L|")
         return Certificate((stability_check(self.stability, self.sampled, of=beyond), margin))
 

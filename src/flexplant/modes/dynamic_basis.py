@@ -57,7 +57,7 @@ class DynamicBasis:
 
     V holds the modes, the static responses ``u = G f`` to the loads (inertia relief), ``G M u``,
     and the static responses to the forces of dampers, M-orthonormal and diagonal in K. Responses
-    between loads then have an error of order ``(f / f_cut)^8`` of what the modes left out give,
+    between loads then have an error of order ``(f / f_cut)^8`` of what the truncated modes give,
     f_cut being the last frequency of the modes.
     """
 

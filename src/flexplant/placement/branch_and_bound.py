@@ -181,7 +181,7 @@ class Screened(Search):
     All choices are ranked where there are at most 20 000; else that on which exchanges by the fast
     criterion end, and all that differ from it by one candidate. For a plant with many modes:
     ``Screened(OverMachines(PoiVariance(), [plant_with_few_modes]))``, confirmed by
-    `PoiVariance` on a plant with an evaluation model, where modes left out are noise.
+    `PoiVariance` on a plant with an evaluation model, where truncated modes are noise.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -89,8 +89,9 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
 class Places:
     """Names of the candidates, the points of each (p, 3) [m] and those of the POIs.
 
-    Points of negative weight are what a port measures (or pushes) against. A POI is only where it
-    is `mounted`, at its points of positive weight; a candidate is at all of its points.
+    Points of negative weight are what a port measures (or pushes) against. A relative POI is only
+    where it is mounted, at its points of positive weight, or at the others if only the positive
+    ones are touched by the plant's own relative sensors; a candidate is at all of its points.
     """
 
     names: tuple[str, ...]
@@ -160,7 +161,8 @@ def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
     if plant.model is None:  # foreign matrices: no places are known
         return Places(names, (), ())
     dofs, pois = plant.model.full_dofs, plant.ports.z
-
+    relative = [port.at for port in plant.ports.y if isinstance(port.at, Mapping)]
+    touched = {place for at in relative for place in at}
     own = (*plant.y, *plant.u)
     located = bool(np.any(np.ptp(dofs.xyz, axis=0)))
 
@@ -175,18 +177,22 @@ def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
 
     return Places(
         names,
-        tuple(
-            points(list(port.at) if isinstance(port.at, Mapping) else port.at)
-            for port in candidates
-        ),
-        tuple(points(_mounted(poi.at)) for poi in pois),
+        tuple(points(_several(port.at)) for port in candidates),
+        tuple(points(_mounted(poi.at, touched)) for poi in pois),
         tuple(points(_mounted(port.at)) for port in candidates),
         tuple(name for name in names if name in own),
     )
 
 
-def _mounted(at: Any) -> Any:
-    """Return a place, or the places of positive weight among several; all where none is."""
-    if not isinstance(at, Mapping):
-        return at
-    return [place for place, weight in at.items() if weight > 0] or list(at)
+def _several(at: Any) -> list[Any]:
+    """Return the places of a port as a list."""
+    return list(at) if isinstance(at, Mapping) else [at]
+
+
+def _mounted(at: Any, touched: Set[Any] = frozenset()) -> list[Any]:
+    """Return the places of positive weight; the others if only the positive ones are `touched`."""
+    weights = at if isinstance(at, Mapping) else {at: 1.0}
+    positive = [place for place, weight in weights.items() if weight > 0]
+    others = [place for place in weights if place not in positive]
+    swapped = not touched.isdisjoint(positive) and touched.isdisjoint(others)
+    return (others if swapped else positive) or list(weights)

@@ -169,7 +169,7 @@ class PoiVariance(Criterion):
     ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, or the largest of these terms, P after the
     measurement, at sample instants: the square of `design_kalman(plant).rms(...)`. Of the plant's
     own modes more sensors never make it larger, a score is one Riccati equation, and searches have
-    a bound. With modes left out it is the error on the plant with these modes: each choice is a
+    a bound. With truncated modes it is the error on the plant with these modes: each choice is a
     separate filter, without a bound.
 
     Parameters

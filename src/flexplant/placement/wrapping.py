@@ -54,9 +54,9 @@ class Share(Scorer):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOutModes(Criterion):
-    """Share of the modes left out of the plant in what devices measure or excite.
+    """Share of the truncated modes of the plant in what devices measure or excite.
 
-    ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the elastic modes left out, over the same
+    ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the elastic truncated modes, over the same
     sum for those of the plant: squared H2 norms of the modes. A controller that is fast there
     excites the former by spill-over.
 
@@ -96,7 +96,7 @@ class LeftOutModes(Criterion):
         more = None if whole is None else shapes_of(whole, candidates)
         if more is None or more.omega.size <= kept.omega.size:
             raise AssumptionError(
-                "no modes left out of the plant are known: give it an evaluation model with more "
+                "no truncated modes of the plant are known: give it an evaluation model with more "
                 "modes, assemble_plant(model, ports, evaluation=)."
             )
         # modes are in order of their frequency: the plant has the first of them

@@ -120,7 +120,7 @@ def direct_effect(
     if order < 2:
         return direct
     # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
-    # adds, up to modes left out; on a held structure a part stays, that of the held DOFs' inertia
+    # adds, up to truncated modes; on a held structure a part stays, that of the held DOFs' inertia
     along = ground @ one.carried
     total: FloatArray = direct + along
     held = isinstance(model, FEModel) and model.held_inertia is not None

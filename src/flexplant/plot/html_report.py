@@ -359,11 +359,11 @@ def html_or_why(make: Callable[[], str]) -> str:
 def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
     if found is None:
         return (f"{channel}, rms", "none", "see below", "bad")
-    beside, kind = "modes left out: not known", ""
+    beside, kind = "truncated modes: not known", ""
     if np.isinf(found.left_out):
-        beside, kind = "unstable with the modes left out", "bad"
+        beside, kind = "unstable with the truncated modes", "bad"
     elif np.isfinite(found.left_out):
-        beside = f"with the modes left out {with_unit(found.left_out, found.unit)}"
+        beside = f"with the truncated modes {with_unit(found.left_out, found.unit)}"
     if found.interval:
         beside += f"; {found.interval}"
     return (f"{channel}, rms", with_unit(found.rms, found.unit), beside, kind)
@@ -377,10 +377,10 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     found = [("stability", "stable" if stable else "UNSTABLE", own, "good" if stable else "bad")]
     left = loop.left_out
     if left is None:
-        return [*found, ("with the modes left out", NOT_JUDGED, "assemble_plant(evaluation=)", "")]
+        return [*found, ("with the truncated modes", NOT_JUDGED, "assemble_plant(evaluation=)", "")]
     word, kind = "stable" if left.is_stable else "UNSTABLE", "good" if left.is_fine else "bad"
     beside = left.named_modes if left.modes else one_line({stability_name(sampled): left.stability})
-    what = f"with the modes left out ({counted(left.states, 'state')})"
+    what = f"with the truncated modes ({counted(left.states, 'state')})"
     return [*found, (what, word, beside, kind)]
 
 

@@ -73,7 +73,7 @@ class ReducedModel(Value):
         then more accurate.
     n_vectors : int
         Number of shapes that are attachment vectors. The same number of modes of the model are not
-        modes of the structure; they represent the compliance of the modes left out.
+        modes of the structure; they represent the compliance of the truncated modes.
     static_at : sequence of str
         Places whose static compliance is exact.
     joint_motions : (k, m) array, optional
@@ -142,7 +142,7 @@ class ReducedModel(Value):
         left = ""
         if self.truncated is not None:
             count = self.truncated.n_modes
-            known = "modes left out are" if count > 1 else "mode left out is"
+            known = "truncated modes are" if count > 1 else "truncated mode is"
             left = f", {count} {known} known"
         grows = f", {self.n_unstable} unstable" if self.n_unstable else ""
         return (
@@ -264,7 +264,7 @@ class ReducedModel(Value):
     def calibrated(self, measured: Any) -> ReducedModel:
         """Return the model with the measured poles of some modes; the shapes stay.
 
-        ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, D* likewise. Modes left out stay as
+        ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, D* likewise. Truncated modes stay as
         they are, rigid-body modes at 0.
 
         Parameters
@@ -318,7 +318,7 @@ class ReducedModel(Value):
             dofs=self.full_dofs.select(()),
             full_dofs=self.full_dofs,
             rigid_body=np.vstack([self.rigid_body[kept], np.zeros((k, r))]),
-            method=f"{self.method}, with {counted(more.n_modes, 'mode')} left out",
+            method=f"{self.method}, with {counted(more.n_modes, 'truncated mode')}",
             condition=self.condition,
             condition_of=self.condition_of,
             coordinates=[

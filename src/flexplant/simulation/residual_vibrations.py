@@ -128,7 +128,7 @@ def residual_vibration(
     own_plant = loop.machine.evaluation_plant
     own = loop if own_plant is None else loop.around(own_plant)
     if not own.plant.dt or not own.is_stable:
-        where = "" if own_plant is None else " with the modes left out"
+        where = "" if own_plant is None else " with the truncated modes"
         raise ModelError(
             f"need a stable loop around a sampled plant, this one is "
             f"{'continuous' if not own.plant.dt else 'not stable' + where}. Use "

@@ -298,6 +298,8 @@ def named_references(
     if reference is None:
         return {}
     if isinstance(reference, Mapping):
+        known = [name for name in plant.w if name in plant.y]
+        require_known("reference", reference, known, "the plant's w")
         return reference
     name = only_one("reference", references(plant), None, "reference={name: signal}")
     return {name: reference}

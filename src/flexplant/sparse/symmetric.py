@@ -114,7 +114,8 @@ def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray
     squares, mix = _eigh(K, M, X)
     X = mixed(X, mix)
     end = squares.size
-    while end > 1 and squares[0] < SPREAD * squares[end - 1]:
+    # a largest eigenvalue of zero or below is rounding
+    while end > 1 and squares[0] < SPREAD * squares[end - 1] > 0.0:
         end = soft_group(squares[:end])
         part = np.ascontiguousarray(X[:, :end])
         squares[:end], mix = _eigh(K, M, part)

@@ -107,7 +107,7 @@ class Controller(Value):
             own = {k: v for k, v in self.certificate.items() if "left out" not in k}
             lines.append(f"  verified: {one_line(own)}")
         if self.left_out is not None:
-            lines.append(f"  with the modes left out: {self.left_out.summary}")
+            lines.append(f"  with the truncated modes: {self.left_out.summary}")
         if self.tolerances is not None:
             lines.append(f"  {self.tolerances.summary}")
         lines += [f"  {note}" for note in self.notes]
@@ -250,7 +250,7 @@ def checked_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
     found = loop.left_out
     if found is not None and not found.is_fine:
         warn(
-            f"with the modes that the plant left out the loop is {found.summary}. The machine has "
+            f"with the modes that the plant truncates the loop is {found.summary}. The machine has "
             f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
             "the plant, or weight the efforts (or roll the controller off) before them."
         )

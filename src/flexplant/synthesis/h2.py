@@ -44,14 +44,14 @@ def design_h2(
     plant : StandardPlant
         Continuous or sampled. A labelled StateSpace (ours or python-control's) serves too.
     u, y
-        As for `design_hinf`, with its warning of modes left out.
+        As for `design_hinf`, with its warning of truncated modes.
 
     Returns
     -------
     Controller
         `gamma` is the H2 norm of the closed loop, `lower` the least one by the formula (none where
         noise or effort had to be added), `certificate` what was checked, `left_out` the check
-        with the modes left out.
+        with the truncated modes.
 
     Raises
     ------

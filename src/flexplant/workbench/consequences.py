@@ -1,4 +1,4 @@
-"""What takes longer than a slider may wait: all axes, modes left out, error, time; tuning."""
+"""What takes longer than a slider may wait: all axes, truncated modes, error, time; tuning."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def open_page(
     design : LoopDesign, optional
         To go on with; else each axis begins with PID and low-pass well below its resonances.
     model : StandardPlant or StateSpace, optional
-        Model of a measured plant: drawn with it, for its error and the modes left out.
+        Model of a measured plant: drawn with it, for its error and the truncated modes.
     before, after, rate, delay, hold, rigid, unstable, references
         As for `design_loops`; by default those of the plant or model: the axes that it drives.
     channel : str, optional

@@ -426,7 +426,7 @@ class Page:
         if answer.radius:
             rows.append(("on the model", answer.radius, None))
         if answer.left_out:
-            rows.append(("modes left out", answer.left_out, answer.left_out_fine))
+            rows.append(("truncated modes", answer.left_out, answer.left_out_fine))
         if np.isfinite(answer.rms):
             factor, unit = in_unit(answer.rms, answer.unit)
             rows.append((f"rms of {answer.channel}", f"{answer.rms / factor:.4g} {unit}", None))

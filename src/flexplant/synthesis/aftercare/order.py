@@ -116,7 +116,7 @@ def reduce_controller(
     Warns
     -----
     FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When the truncated modes make the loop unstable, or bring |S| at u above 8 dB.
 
     References
     ----------
@@ -336,7 +336,7 @@ def discretise_controller(
     Warns
     -----
     FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When the truncated modes make the loop unstable, or bring |S| at u above 8 dB.
 
     Examples
     --------

@@ -164,7 +164,7 @@ class _StageTask:
                 "plant.uncertain(frequency=0.005)."
             )
         self.plant: AnyPlant = uncertain.plant
-        #: with the modes left out: a controller of the reduced plant may make them unstable
+        #: with the truncated modes: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
         #: inputs of the controller: the sensors themselves without references
         followed = self.plant.assembled.ports.references

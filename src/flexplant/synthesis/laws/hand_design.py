@@ -302,7 +302,7 @@ class LoopDesign(Value):
         return {name: found[name] for name in self.axes if name in found}
 
     def loops(self, plant: Any) -> DesignedLoops:
-        """Return the loops on a plant, all axes closed: report, check with the modes left out.
+        """Return the loops on a plant, all axes closed: report, check with the truncated modes.
 
         Parameters
         ----------

@@ -57,7 +57,7 @@ class DesignedLoops(Value):
         lines += [f"  {line}" for line in repr(self.report).splitlines()]
         lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:
-            lines.append(f"  with the modes left out: {self.left_out.summary}")
+            lines.append(f"  with the truncated modes: {self.left_out.summary}")
         if self.tolerances is not None:
             lines.append(f"  {self.tolerances.summary}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])

@@ -102,7 +102,7 @@ def design_servo(
     Controller
         From the references `die:ref`, ... (if any) and the estimates `die:hat`, `die:rx:hat`, ...
         to the actuators. The certificate holds spectral radius and modulus margin of the plant with
-        the observer, and with the modes left out; the frequency up to which |S| of every reference
+        the observer, and with the truncated modes; the frequency up to which |S| of every reference
         is below 1; where |S| at u exceeds 6 dB, the largest bandwidth.
 
     Raises
@@ -120,8 +120,8 @@ def design_servo(
     Warns
     -----
     FlexplantWarning
-        When the loop on the POI itself is unstable, or the modes left out make it unstable or bring
-        |S| at u above 8 dB.
+        When the loop on the POI itself is unstable, or the truncated modes make it unstable or
+        bring |S| at u above 8 dB.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def design_servo(
         certificate |= {"|S| of the references below 1 up to [Hz]": suppressed_up_to(closed)}
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
-            f"with the modes that the plant left out the servo's loop at {at} is "
+            f"with the modes that the plant truncates the servo's loop at {at} is "
             f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
             f"{advice}"
         )
@@ -291,7 +291,7 @@ class ServoTask:
 
     @property
     def loop(self) -> ServoLoop:
-        """Over frequency, with the modes left out where they are known."""
+        """Over frequency, with the truncated modes where they are known."""
         whole = self.plant.evaluation_plant or self.plant
         return servo_loop(whole, self.observer, self.reading, self.plant)
 

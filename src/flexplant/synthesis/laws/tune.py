@@ -174,7 +174,7 @@ def _pid_law(axes: Axes, peak: float) -> Law:
 def _joint_plants(
     plant: Any, axes: Axes, rigid: int, measured: Mapping[str, Any]
 ) -> list[JointPlant]:
-    """Return the plant in its own channels, and the one with the modes left out where known."""
+    """Return the plant in its own channels, and the one with the truncated modes where known."""
     u, y, static = axes.before.outputs, axes.after.inputs, (axes.before.D, axes.after.D)
     if isinstance(axes.plant, Frf):
         given = plant if isinstance(plant, Frf) else Frf.from_control(plant)
@@ -187,7 +187,7 @@ def _joint_plants(
         if reading is not None:
             read = [name for name in reading.inputs if name in more.y]
             G = series(G.select(read), reading.select(inputs=read))
-        kind = " with the modes left out"
+        kind = " with the truncated modes"
         found.append(JointPlant(G.select(y, u), *static, axes.names, rigid, kind))
     return found
 

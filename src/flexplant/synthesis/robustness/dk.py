@@ -113,7 +113,7 @@ def design_mu(
     order : int
         Most states of D for each Delta and side.
     progress
-        As for `design_hinf`, with its warning of modes left out.
+        As for `design_hinf`, with its warning of truncated modes.
 
     Returns
     -------

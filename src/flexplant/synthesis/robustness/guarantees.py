@@ -102,7 +102,7 @@ class RobustStability(Value):
         shown = ", ".join(f"{k} {v:.4g}" for k, v in self.certificate.items())
         lines.append(f"  verified: {shown}")
         if self.left_out is not None:
-            lines.append(f"  with the modes left out: {self.left_out.summary}")
+            lines.append(f"  with the truncated modes: {self.left_out.summary}")
         return "\n".join(lines) + ">"
 
 
