@@ -347,9 +347,8 @@ class OffPoi(Constraint):
 
     Sensors are never placed on the point of a POI, but for those that the plant has. A radius keeps
     all off the whole die; a negative one allows all places. A POI that is relative to another body,
-    ``at={"tip:x": 1, "frame:x": -1}``, is where its positive weights are, or where the negative ones
-    are if the plant's own sensors touch only the positive places: sensors may measure against the
-    frame.
+    ``at={"tip:x": 1, "frame:x": -1}``, is where its positive weights are, or at the others if the
+    plant's own relative sensors touch only the positive ones: others may measure against the frame.
 
     Parameters
     ----------
