@@ -25,7 +25,7 @@ from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant
 from ..plant.machine_plants import LEVEL, FigureInterval, interval, interval_text
 from ..store import Value
-from ..tolerances import ROUNDING, SAME, TINY, TYPED, divisor
+from ..tolerances import ROUNDING, TINY, TYPED, divisor
 from ..words import sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
@@ -64,11 +64,6 @@ def error_variances(plant: AnyPlant, observer: StateSpace) -> Variances:
     are treated in the same way. The elastic states are solved mode by mode, O(n^2) of them. The
     dual equation, from the output back to the noises, gives the same variances by another way.
     """
-    if not np.isclose(plant.dt, observer.dt, rtol=SAME, atol=0.0):
-        raise ModelError(
-            "the error of an observer needs a plant of its sampling time, "
-            f"{observer.dt:g} s, got {plant.dt:g} s."
-        )
     joint, missed = _apart(_joint(plant, observer))
     primal, dual = _two_ways(joint)
     size = divisor(primal)

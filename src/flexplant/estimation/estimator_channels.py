@@ -12,6 +12,7 @@ from ..errors import AssumptionError, LabelError, ModelError, ShapeError, short,
 from ..lti.statespace import System
 from ..parallel import PIECE
 from ..plant import AnyPlant, GeneralizedPlant, plant_of, standard_plant
+from ..tolerances import SAME
 
 #: z channels that are not motions of a POI
 DERIVED = (":error", ":effort")
@@ -59,8 +60,13 @@ def poi_channels(plant: AnyPlant) -> tuple[str, ...]:
 
 
 def same_pois(plant: AnyPlant, on: AnyPlant | System) -> AnyPlant:
-    """Return another plant that has the sensors and POIs of the first."""
+    """Return another plant that has the sensors, POIs and sampling time of the first."""
     other = read_alike(plant, plant_of(on).machine)
+    if not np.isclose(other.dt, plant.dt, rtol=SAME, atol=0.0):
+        raise ModelError(
+            "the error of an estimator needs a plant of its sampling time, "
+            f"{plant.dt:g} s, got {other.dt:g} s. Sample both at one rate."
+        )
     for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
         for name in names:
             if name not in getattr(other, side):

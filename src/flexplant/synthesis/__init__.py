@@ -6,7 +6,8 @@ evaluation model of the plant (with the truncated modes), and the allowed error 
 - `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
 - `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf`;
-  `design_structured` (fixed order, PID and notches).
+  `design_structured` (fixed order, PID and notches; your own objective derives from
+  `MeasuredObjective`).
 - `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
 - `damp_modes`: velocity feedback, positive position feedback, integral resonant control.
 - `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
