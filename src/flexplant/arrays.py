@@ -21,6 +21,11 @@ Shape: TypeAlias = tuple[int | None, ...]
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = FloatArray | sp.csc_array
 
+#: number of numbers of a piece of work that stays in the cache of a processor
+CACHED = 200_000
+#: number of columns that are processed together: one pass over a matrix serves all of them
+COLUMNS = 32
+
 
 def real_array(
     value: Any,

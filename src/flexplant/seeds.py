@@ -12,6 +12,8 @@ from .words import several
 
 #: what seeds chance
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
+#: number of refused draws in a row after which there is nothing to draw
+REFUSED = 200
 #: draws, runs or machines in one call
 MOST_DRAWS = 10**7
 #: of machines or starts that are each a search: days on any computer, so that more is a mistake

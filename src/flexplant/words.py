@@ -9,21 +9,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import constants
 
 from .errors import FlexplantError, LabelError, ModelError, ShapeError, short
 
 _PREFIXES = (
-    (1e-15, "f"),
-    (1e-12, "p"),
-    (1e-9, "n"),
-    (1e-6, "\N{MICRO SIGN}"),
-    (1e-3, "m"),
+    (constants.femto, "f"),
+    (constants.pico, "p"),
+    (constants.nano, "n"),
+    (constants.micro, "\N{MICRO SIGN}"),
+    (constants.milli, "m"),
     (1.0, ""),
-    (1e3, "k"),
-    (1e6, "M"),
+    (constants.kilo, "k"),
+    (constants.mega, "M"),
 )
 #: units that take a prefix, alone or before others: m^2, N m, rad/s
 _PREFIXED = re.compile(r"(m|g|s|N|rad|Hz|V|A|W|J|Pa|T)(?:\^(\d))?(?![A-Za-z])")
+#: number of names, rows or findings that a text shows of many
+SHOWN = 4
 
 
 def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:

@@ -491,7 +491,7 @@ def test_what_is_refused(monkeypatch):
     rom = fx.reduce(
         models["stage"], fx.reduction.CraigBampton(["1:x", "1:y", "1:z", "4:y", "4:z", "9:z"])
     )
-    monkeypatch.setattr(join_module, "_LARGEST", 20)
+    monkeypatch.setattr(join_module, "LARGEST_FULL", 20)
     with pytest.raises(ModelError, match=r"are too many .* Reduce the large components first"):
         join(models=models | {"stage": rom})
     with pytest.raises(ModelError, match=r"times as stiff as its components .* for a rigid joint"):

@@ -102,6 +102,6 @@ def test_what_is_not_found_is_refused(monkeypatch):
     model = machine(False)
     with pytest.raises(ModelError, match="take no attachment vectors"):
         fx.solve_modes(model, count=8, compliance_at="low/1:z")
-    monkeypatch.setattr(solve, "_STEPS", 2)
+    monkeypatch.setattr(solve, "MOST_STEPS", 2)
     with pytest.raises(SolverError, match="complex modes leave a relative residual"):
         fx.solve_modes(model, count=8)

@@ -321,7 +321,7 @@ def test_below_a_frequency_is_sparse_from_some_hundred_dofs_on(monkeypatch):
 
 def test_too_many_modes_of_a_large_model_are_refused(monkeypatch):
     model = make_plate(elements=(24, 24))
-    monkeypatch.setattr(counted, "_MOST", 40)
+    monkeypatch.setattr(counted, "LARGEST_FULL", 40)
     with pytest.raises(ModelError, match="more than 40 are not solved for at once"):
         solve_modes(model, below=12000.0)
 

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -31,9 +32,9 @@ def test_lines_differ_without_colour():
         for i, one in enumerate(looks):
             for other in looks[:i]:
                 dark, light = sorted(luminance(look["color"]) for look in (one, other))
-                ratio = max(one["linewidth"], other["linewidth"]) / min(
-                    one["linewidth"], other["linewidth"]
-                )
+                usual = mpl.rcParams["lines.linewidth"]
+                widths = [look.get("linewidth", usual) for look in (one, other)]
+                ratio = max(widths) / min(widths)
                 contrast = (light + 0.05) / (dark + 0.05)
                 assert one["linestyle"] != other["linestyle"] or ratio > 1.5 or contrast > 1.8
 

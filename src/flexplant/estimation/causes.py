@@ -8,8 +8,9 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import counted
+from ..modes.matching import NEAR
 from ..plant import AnyPlant
-from ..tolerances import SAME, TINY, divisor
+from ..tolerances import NEGLIGIBLE, SAME, TINY, divisor
 from ..words import with_unit
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root
@@ -19,9 +20,6 @@ from .mode_changes import ModeChange, explained_by_change, peak_band
 Cause = Literal[
     "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"
 ]
-#: relative distance up to which a peak may belong to a mode: the peak of the innovations lies
-#: beyond the machine's mode, as seen from the model's
-_NEAR = 0.12
 #: the same next to a higher peak of another cause: typical drift of a machine
 _DRIFTED = 0.03
 #: largest fraction of outliers, and their number allowed in a short record
@@ -30,8 +28,6 @@ _RARE, _FEW = 0.01, 20
 _APART, _BURST = 5, 0.5
 #: largest number of samples over which the effect of an outlier is followed
 _FOLLOWED = 2000
-#: relative distance up to which peaks of two spectra are the same
-_AGAIN = 2e-3
 #: largest number of examined peaks
 _PEAKS = 12
 #: number of lines next to 0 with which an offset is compared
@@ -204,7 +200,7 @@ class Examined(NamedTuple):
     @classmethod
     def of(cls, tried: list[float], whole: AnyPlant | None) -> Examined:
         """Return the peaks; known truncated modes may cause others near kept modes."""
-        return cls(np.array(tried), _NEAR if whole is None else _DRIFTED)
+        return cls(np.array(tried), NEAR if whole is None else _DRIFTED)
 
 
 def peak_verdicts(
@@ -224,20 +220,20 @@ def peak_verdicts(
     seen = folded(kept.freq, rate)
     if not plant.modal_blocks.size:  # its modes cannot be changed separately
         highest = max(peaks, key=lambda one: one.height)
-        near = _modes_near(seen, highest.freq * rate, _NEAR)
+        near = _modes_near(seen, highest.freq * rate, NEAR)
         if near.size:
             return [LikelyCause("frequency", _wrong_mode(highest, rate, kept.named(int(near[0]))))]
     causes: list[LikelyCause] = []
     handled: set[int] = set()
     for rank, peak in enumerate(sorted(peaks, key=lambda one: -one.height)[:_PEAKS]):
         at = peak.freq * rate
-        near = _modes_near(seen, at, before.reach if rank or before.tried.size else _NEAR)
+        near = _modes_near(seen, at, before.reach if rank or before.tried.size else NEAR)
         if whole is not None:  # a truncated mode may be closer
             others = folded(left_modes(*whole).freq, rate)
             near = near[np.abs(seen[near] - at) <= np.min(np.abs(others - at), initial=np.inf)]
         if handled.intersection(near.tolist()):
             continue  # explained already
-        if np.any(np.abs(before.tried - peak.freq) <= _AGAIN * peak.freq):
+        if np.any(np.abs(before.tried - peak.freq) <= NEGLIGIBLE * peak.freq):
             near = near[:0]
         for i in near.tolist() if plant.modal_blocks.size else ():
             band = peak_band(lines, U, level, rate, at, float(seen[i]))
@@ -328,7 +324,7 @@ def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> 
     rate = 1.0 / observer.plant.dt
     seen = folded(left.freq, rate)
     i = int(np.argmin(np.abs(seen - at)))
-    if abs(seen[i] - at) > _NEAR * at:
+    if abs(seen[i] - at) > NEAR * at:
         return None
     name = f"{left.named(i)} in the evaluation model), which is truncated in the plant"
     cure = (

@@ -50,7 +50,7 @@ from .left_out_modes import left_out
 from .mode_changes import ModeChange, MovedModes, moved_modes
 
 #: fewest samples for a verdict
-_FEWEST = 200
+FEWEST = 200
 #: number of tests that share the level
 _TESTS = 5
 #: largest number of samples compared with an evaluation plant, since its response is computed at
@@ -249,9 +249,9 @@ def consistency(
     white = estimate.whitened.T
     there = np.isfinite(white).all(axis=1)
     count = int(there.sum())
-    if count < _FEWEST:
+    if count < FEWEST:
         raise ModelError(
-            f"a verdict needs at least {_FEWEST} samples with all innovations, got {count}. Pass "
+            f"a verdict needs at least {FEWEST} samples with all innovations, got {count}. Pass "
             "a longer record."
         )
     normal = (estimate.innovations / estimate.innovation_deviations).T

@@ -23,28 +23,14 @@ from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant
-from ..plant.machine_plants import LEVEL, FigureInterval, interval, interval_text
+from ..plant.machine_plants import FigureInterval, interval, interval_text
 from ..store import Value
-from ..tolerances import ROUNDING, TINY, TYPED, divisor
-from ..words import sizes_of
+from ..tolerances import CLOSE, INTERVAL, MISSED, ROOT, ROUNDING, TINY, TYPED, divisor
+from ..words import SHOWN, sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
-#: largest relative difference of a variance by two routes, half a per cent of an rms, which is
-#: better than the knowledge of any machine
-_AGREEMENT = 1e-2
-#: largest fraction of a rigid-body motion that may enter the error
-_SEEN = 1e-7
-#: missed fraction of a mode below which it is treated separately: otherwise it keeps 12 of 16
-#: digits
-_FOLLOWED = 1e-2
-#: modulus of a sampled pole above which a mode counts as undamped
-ON_CIRCLE = 1.0 - ROUNDING
-#: ``1 - |lambda|^2`` below which it counts as hardly damped: it rings for 1e8 samples
-_HARDLY = 2e-8
 #: fraction of a variance above which such modes are named
 _MOST = 0.5
-#: number of channels in a repr
-_SHOWN = 4
 
 
 class Variances(NamedTuple):
@@ -70,10 +56,10 @@ def error_variances(plant: AnyPlant, observer: StateSpace) -> Variances:
     # both have the same poles, so that neither shows the effect of rounding on their damping
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
     difference = difference_of(dual, primal) + float(np.max(rounded / size, initial=0.0))
-    if not difference <= _AGREEMENT:
+    if not difference <= CLOSE:
         raise CertificateError(
             "the variance of the estimation error on a plant and its dual differ by "
-            f"{difference:.1e} (allowed {_AGREEMENT:.0e}): the number cannot be trusted. Look for "
+            f"{difference:.1e} (allowed {CLOSE:.0e}): the number cannot be trusted. Look for "
             "poles within rounding of the unit circle, and damp them."
         )
     _note_hardly_damped(plant, missed, size)
@@ -88,7 +74,7 @@ def _two_ways(joint: _Joint) -> tuple[FloatArray, FloatArray]:
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
         primal, dual = _primal(joint), _gain_trace(joint)
-    if not difference_of(dual, primal) <= _AGREEMENT:  # squares that cancel: by their roots
+    if not difference_of(dual, primal) <= CLOSE:  # squares that cancel: by their roots
         with suppress(SolverError):  # poles on the circle: refused by the difference
             L = stein_root(joint.A, joint.noise)
             dual = dual_variances(joint.A, joint.noise, joint.E, np.linalg.norm(L, axis=1))
@@ -106,7 +92,7 @@ class _Missed(NamedTuple):
 
 def _note_hardly_damped(plant: AnyPlant, missed: _Missed, total: FloatArray) -> None:
     """Warn when most of a variance comes from the missed part of nearly undamped motions."""
-    slow = missed.gap < _HARDLY
+    slow = missed.gap < ROOT
     shares = np.sum(missed.variances[:, slow], axis=1) / total
     if not np.any(shares > _MOST):
         return
@@ -201,7 +187,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     terms, missed = (np.abs(see) + np.abs(keep @ V)) * moved, np.abs(see + keep @ V) * moved
     size = np.linalg.norm(terms, axis=1, keepdims=True)
     part = [np.linalg.norm(x / divisor(size), axis=0) for x in (missed, terms)]
-    known = part[0] < _FOLLOWED * part[1]
+    known = part[0] < CLOSE * part[1]
     if joint.modal is not None:
         known = np.repeat(known.reshape(-1, 2).all(axis=1), 2)
     # one of each pair: the real and the imaginary part are its motion
@@ -227,7 +213,7 @@ def moving_parts(plant: AnyPlant) -> tuple[IntArray, IntArray]:
     g, factor = plant.system, plant.noise_factor
     states = plant.modal_states.reshape(-1, 2)
     blocks = g.A[states[:, :, None], states[:, None, :]]
-    undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= ON_CIRCLE
+    undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= (1.0 - ROUNDING)
     undamped[: plant.n_rigid] = True
     kept = states[undamped].reshape(-1)
     reached = np.any(factor != 0, axis=1)
@@ -248,7 +234,7 @@ def _solve_sylvester(A: FloatArray, n: int, entering: FloatArray, kept: FloatArr
 
 def _check_seen(plant: AnyPlant, seen: FloatArray, motion: FloatArray) -> None:
     worst = np.linalg.norm(seen, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), TINY)
-    if np.max(worst) > _SEEN:
+    if np.max(worst) > MISSED:
         raise AssumptionError(
             f"the estimate of {poi_channels(plant)[int(np.argmax(worst))]!r} misses "
             f"{np.max(worst):.2g} of a rigid-body motion or undamped mode of the plant: its error "
@@ -357,7 +343,7 @@ class PoiEstimator(Value):
     system: StateSpace
     plant: AnyPlant
 
-    def interval(self, channel: str, level: float = LEVEL) -> FigureInterval:
+    def interval(self, channel: str, level: float = INTERVAL) -> FigureInterval:
         """Return the interval of the rms error over machines with the same measurement.
 
         Parameters
@@ -384,7 +370,9 @@ class PoiEstimator(Value):
         given = "" if known is None else known.densities
         return interval(known, lambda: self.on_machines[:, row], level, unit, given)
 
-    def compared(self, other: PoiEstimator, channel: str, level: float = LEVEL) -> FigureInterval:
+    def compared(
+        self, other: PoiEstimator, channel: str, level: float = INTERVAL
+    ) -> FigureInterval:
         """Return where this error over that of another estimator lies, machine by machine.
 
         Is one place of a sensor better than another on 95 % of the machines? Design an estimator
@@ -457,14 +445,14 @@ class PoiFilter(PoiEstimator):
         if known is None:
             return sizes_of({name: self.rms(name) for name in channels}, units)
         said: list[str] = []
-        for name in channels[:_SHOWN]:
+        for name in channels[:SHOWN]:
             low, high, sentence = self.interval(name)
             if low is None or high is None:
                 return f"{sizes_of({n: self.rms(n) for n in channels}, units)}\n  ({sentence})"
             ends = interval_text(low, high, units.get(name, ""))
-            on = "" if said else f" on {100 * LEVEL:.3g} % of such machines{known.densities}"
+            on = "" if said else f" on {100 * INTERVAL:.3g} % of such machines{known.densities}"
             said.append(f"{sizes_of({name: self.rms(name)}, units)} ({ends}{on})")
-        more = [f"... ({len(channels) - _SHOWN} more)"] if len(channels) > _SHOWN else []
+        more = [f"... ({len(channels) - SHOWN} more)"] if len(channels) > SHOWN else []
         return ",\n    ".join(said + more)
 
     def rms(self, channel: str, *, on: AnyPlant | ClosedLoop | System | None = None) -> float:

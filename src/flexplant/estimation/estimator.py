@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import COLUMNS, FloatArray, positive, real_array
 from ..certificates import Certificate
 from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
@@ -284,10 +284,6 @@ class KalmanEstimator(PoiFilter):
         return filterpy_twin(self.model, self.predicted_covariance)
 
 
-#: points of a path that are assembled together
-_TOGETHER = 128
-
-
 def moving_sight(
     plant: AnyPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
 ) -> Sight:
@@ -312,8 +308,8 @@ def moving_sight(
         distinct, which = np.unique(points, axis=0, return_inverse=True)
         which = which.reshape(-1)
         rows = [model.channels.index(pois[name].channel(axis)) for axis in pois[name].axes]
-        for first in range(0, len(distinct), _TOGETHER):
-            some = distinct[first : first + _TOGETHER]
+        for first in range(0, len(distinct), COLUMNS):
+            some = distinct[first : first + COLUMNS]
             there = _model_at(plant, found, pois[name], some)
             at = np.flatnonzero((which >= first) & (which < first + len(some)))
             place = which[at] - first

@@ -17,6 +17,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant, StandardPlant
 from ..plant.partitioned import require_noise, require_sampled
+from ..tolerances import RESIDUAL
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, estimates, poi_channels, read_alike, sensors
@@ -28,8 +29,6 @@ from .machine_noise import unsure_noise
 #: Stein equation; where rounding of the gain matters (`riccati_root`), of twice the standard
 #: deviation
 AGREEMENT, ROUNDED = 1e-6, 1e-2
-#: least fraction of R from the sensors: with less, covariances lose six digits and more
-_OWN = 1e-10
 
 
 @one_thread()
@@ -208,7 +207,7 @@ def filter_design(model: FilterModel) -> FilterDesign:
     """Return the gains of a model whose sensors may include the noise of truncated modes."""
     own = np.sum(model.H[:, ~np.any(model.G, axis=0)] ** 2, axis=1)
     # R is nearly all noise that moves the states too, the sensors' own part lost in it
-    if np.any(own < _OWN * np.sum(model.H**2, axis=1)):
+    if np.any(own < RESIDUAL * np.sum(model.H**2, axis=1)):
         return _design_in_roots(model, None)
     try:
         return _design_by_covariance(model)

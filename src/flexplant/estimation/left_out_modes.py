@@ -13,7 +13,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, counted
 from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
-from ..modes.matching import assigned
+from ..modes.matching import NEAR, assigned
 from ..plant import AnyPlant, StandardPlant
 from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
 from ..plant.evaluation_model import NOT_JUDGED
@@ -26,9 +26,6 @@ from ..store import Value
 from ..tolerances import TINY, divisor
 from .estimator_channels import read_alike, sensors
 
-#: relative difference of frequency within which modes of the plant and of the evaluation model are
-#: equal
-_SAME = 0.15
 #: weight of a different shape relative to a different frequency when modes are paired
 _SHAPE = 0.02
 
@@ -195,7 +192,7 @@ def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntAr
     alike = np.abs(one @ two.T) / divisor(lengths)
     apart = np.abs(np.log(kept.omega[genuine][:, None] / every.omega))
     partner = assigned(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
-    near = (partner >= 0) & (apart[np.arange(partner.size), partner] < _SAME)
+    near = (partner >= 0) & (apart[np.arange(partner.size), partner] < NEAR)
     return genuine[near], partner[near]
 
 

@@ -36,8 +36,6 @@ _LINEAR = 0.3
 _WIDTH, _LOG = 0.02, 0.02
 #: largest relative distance of the end of a fit from its peak: peaks are found within a few lines
 _NEAR = 5e-3
-#: largest step of a search: widths of a mode, and logarithm of damping
-_FAR = 1.0
 
 
 class ModeChange(NamedTuple):
@@ -168,7 +166,7 @@ def moved_modes(
     information = np.eye(theta.size)
     now = task.at(theta)
     steps = np.r_[_WIDTH * task.widths, np.full(task.widths.size, _LOG)]
-    reach = np.r_[task.widths, np.ones(task.widths.size)] * _FAR
+    reach = np.r_[task.widths, np.ones(task.widths.size)]
     J, log_size = None, np.zeros(theta.size)
     for _ in range(_STEPS):
         if J is None:

@@ -15,7 +15,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..store import Value
-from ..tolerances import SETTLED, SPLIT, TINY
+from ..tolerances import CHANCE, SETTLED, SPLIT, TINY
 from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
@@ -28,8 +28,6 @@ from .kalman import design_kalman
 _PASSES, _SETTLED = 6, 1e-3
 #: largest number of scoring steps, and slope relative to its deviation at which they end
 _STEPS, _FLAT = 60, 1e-4
-#: probability that a correct model gives no warning
-_LEVEL = 0.999
 _EVALUATION = " Give the plant an evaluation model, if it lacks truncated modes."
 #: lags of the autocovariances of the start
 _LAGS = 40
@@ -140,7 +138,7 @@ def estimate_noise(
         )
     now = _scaled(whole, channels, ratios)
     final = design_kalman(now)
-    verdict = consistency(final, final.estimate(records, gate=gate), level=_LEVEL)
+    verdict = consistency(final, final.estimate(records, gate=gate), level=(1.0 - CHANCE))
     if not verdict.holds:
         warn(
             "the noise levels do not explain the record: "
@@ -165,7 +163,7 @@ def _whole_plant(plant: AnyPlant) -> AnyPlant:
 
 def _advice(observer: KalmanEstimator, estimate: Estimate, alone: bool) -> str:
     """Return the result of the record for the plant if levels are not found, and advice."""
-    said = consistency(observer, estimate, level=_LEVEL)
+    said = consistency(observer, estimate, level=(1.0 - CHANCE))
     if said.cause in ("none", "noise level", "noise ratio"):
         return "Pass a plant with densities closer to the true ones, or a longer record."
     return f"With the last ones {said.text}{_EVALUATION if alone else ''}"

@@ -13,8 +13,7 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..lti.discretisation import Recursion
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
-from ..tolerances import ROUNDING, TYPED
-from .error import ON_CIRCLE
+from ..tolerances import FOUR_DIGITS, RESIDUAL, ROUNDING, TYPED
 from .estimator_channels import Recorded
 from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
@@ -317,8 +316,6 @@ class Walk:
         return x
 
 
-#: largest remaining uncertainty of a state relative to its stationary variance
-_LARGEST = 1e4
 #: number of samples of the first and of the longest stretch; it doubles each time
 FIRST, LONGEST = 64, 1024
 
@@ -343,7 +340,7 @@ def excess(
         if found is None or found.open.size:
             return None
         X = Z @ found.X
-        if np.any(np.sum(X**2, axis=1) > _LARGEST * steady.P.diagonal().max()):
+        if np.any(np.sum(X**2, axis=1) > (1.0 / FOUR_DIGITS) * steady.P.diagonal().max()):
             return None
         more = more + X @ X.T
     sizes, vectors = np.linalg.eigh(0.5 * (more + more.T))
@@ -371,11 +368,6 @@ def shown_so_far(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     covariance = np.linalg.inv(np.cumsum(information, axis=0))
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
-
-
-#: root of the information on a direction, relative to the best known one, above which it counts as
-#: known
-_FOUND = 1e-10
 
 
 class KnownParameters(NamedTuple):
@@ -412,7 +404,7 @@ class Unknowns:
         """Return the present knowledge."""
         R = self.root[: self.count, : self.count]
         U, sizes, V = np.linalg.svd(R, full_matrices=True)
-        rank = int(np.count_nonzero(sizes > _FOUND * np.max(sizes, initial=0.0)))
+        rank = int(np.count_nonzero(sizes > RESIDUAL * np.max(sizes, initial=0.0)))
         X = V[:rank].T / sizes[:rank]
         value = X @ (U[:, :rank].T @ self.root[: self.count, self.count])
         return KnownParameters(value, X, V[rank:].T)
@@ -459,6 +451,6 @@ def kept_states(A: FloatArray) -> IntArray:
     for part in range(count):
         states = np.flatnonzero(owner == part)
         radius = np.max(np.abs(np.linalg.eigvals(A[np.ix_(states, states)])))
-        if radius >= ON_CIRCLE:
+        if radius >= (1.0 - ROUNDING):
             kept.append(states)
     return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import ComplexArray, IntArray
 from ..errors import ModelError, ShapeError, SolverError, attempted, counted, warn
 from ..lti.frequency import Frf
-from ..modes.matching import mac_matrix
+from ..modes.matching import ALIKE, mac_matrix
 from ..parallel import Progress, expect
 from ..tolerances import TINY
 from .diagram import (
@@ -22,15 +22,7 @@ from .diagram import (
     weighted_by_remainder,
 )
 from .line_weights import NARROW, PreparedLines, Rejected, mains_multiple
-from .model_error import (
-    ALIKE,
-    NOISE,
-    Disagreement,
-    disagreement,
-    outputs_disagree,
-    strength,
-    twin_poles,
-)
+from .model_error import NOISE, Disagreement, disagreement, outputs_disagree, strength, twin_poles
 from .pole_test import (
     UPPER,
     dropped,

@@ -13,17 +13,12 @@ from ..arrays import ComplexArray, FloatArray, IntArray, between, positive
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known, short
 from ..lti.frequency import Frf
 from ..store import Value
-from ..tolerances import TINY
+from ..tolerances import CERTAIN, TINY
 from ..words import instance
 from .line_weights import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, error_statistics, records
 
-#: least height of a pulse in standard deviations of the force's noise: one of 10^8 samples exceeds
-#: it
-NOISE = 6.0
-#: ratio of the standard deviation of normal noise to the median of |x|
-NORMAL = 1.4826
 #: number of equal samples at the extreme value of a channel that indicate clipping, and number of
 #: quanta that one of the two preceding steps must exceed. The same number of equal samples at a
 #: smooth peak, ``p - c t^2``, means that c is at most a quantum, with preceding steps of ``3 c``
@@ -358,6 +353,8 @@ def _blows(
     data: Records, f: FloatArray, e: int, level: float, length: int, full: Mapping[str, float]
 ) -> Iterator[tuple[Blow, int, int, tuple[int, int]]]:
     """Yield the blows of experiment e: input, start of the segment, samples before, width."""
+    from scipy.stats import median_abs_deviation
+
     largest = float(np.abs(f).max())
     pulses = sorted(
         (begin, end, i)
@@ -366,7 +363,7 @@ def _blows(
     )
     before = 2 + max((end - begin for begin, end, _ in pulses), default=0)
     # a force is at rest nearly all the time, within its noise; for responses this is not known
-    rest = NOISE * NORMAL * np.median(np.abs(f[e]), axis=1)
+    rest = CERTAIN * median_abs_deviation(f[e], axis=1, scale="normal")
     limited = _limited(data.u[e], data.inputs, full, rest)
     limited |= _limited(data.y[e], data.outputs, full, np.zeros(len(data.outputs)))
     begins = [pulse[0] for pulse in pulses]
@@ -386,9 +383,11 @@ def _blows(
 
 def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, int]]:
     """Return start and end of pulses; pulses closer than the width of one are merged."""
+    from scipy.stats import median_abs_deviation
+
     size = float(np.abs(force).max())
-    noise = NORMAL * float(np.median(np.abs(force)))
-    high = np.flatnonzero(np.abs(force) > max(level * size, NOISE * noise))
+    noise = float(median_abs_deviation(force, scale="normal"))
+    high = np.flatnonzero(np.abs(force) > max(level * size, CERTAIN * noise))
     if size < level * largest or not high.size:
         return []
     found = [(int(high[0]), int(high[0]) + 1)]

@@ -11,18 +11,16 @@ import scipy.sparse as sp
 from ..arrays import BoolArray, ComplexArray, FloatArray, frequency_band
 from ..errors import ModelError
 from ..lti.frequency import Frf
+from ..tolerances import CHANCE
 from ..words import instance
+from .frf_estimation import STRETCH
 
-#: number of lines over which the residual of a fit is averaged to a variance
-WINDOW = 41
 #: frequencies [Hz] of mains
 MAINS = (50.0, 60.0)
 #: width of a resonance in lines below which it looks like a disturbance with a single frequency
 NARROW = 0.5
 #: number of lines over which windows spread a mains multiple, and of lines for the comparison
 SPREAD, COMPARED = 2, 8
-#: probability that noise anywhere in the band is taken for mains
-CHANCE = 1e-3
 
 #: frequency [Hz], damping ratio and the reason why a pole, or a line, is not reported
 Rejected = tuple[float, float, str]
@@ -105,14 +103,14 @@ class PreparedLines:
 
         # row by row: SciPy is five times as fast with one axis
         rows = power.reshape(-1, power.shape[2])
-        median = np.array([ndi.median_filter(row, WINDOW, mode="nearest") for row in rows])
+        median = np.array([ndi.median_filter(row, STRETCH, mode="nearest") for row in rows])
         return self._weighted(median.reshape(power.shape) / np.log(2.0), fitted_share)
 
     def from_residuals(self, error: ComplexArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from the residual of a fit, averaged over lines."""
         import scipy.ndimage as ndi
 
-        power = ndi.uniform_filter1d(np.abs(error) ** 2, WINDOW, axis=2, mode="nearest")
+        power = ndi.uniform_filter1d(np.abs(error) ** 2, STRETCH, axis=2, mode="nearest")
         return self._weighted(power, fitted_share)
 
     def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:

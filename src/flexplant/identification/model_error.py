@@ -7,13 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
-from ..modes.matching import mac_matrix
-from ..tolerances import TINY
+from ..modes.matching import ALIKE, mac_matrix
+from ..tolerances import CERTAIN, MOST_STEPS, NEGLIGIBLE, TINY
 from .refine import PoleFit, scaled_inverse
 
-#: MAC above which two shapes count as equal: they differ by less than the effect of a neighbouring
-#: mode
-ALIKE = 0.9
 #: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
 #: may be one resonance; one bandwidth where the weaker pole is the broader: the remainder of a
 #: distorted circle is broad, a resonance on a broad background is not
@@ -25,15 +22,9 @@ MOSTLY = 0.9
 NOISE = 1.5
 #: number of standard deviations by which chi-square may exceed its degrees of freedom
 LIMIT = 3.0
-#: fraction of a misfit that remains with separate poles and shared participation
-NEXT_TO_NONE = 1e-3
-#: number of bisections for a variance with nine digits
-BISECTIONS = 30
 #: ratio of the damping of an output's own pole to the usual one above which it is a different pole:
 #: the mass of a sensor changes frequencies, but hardly the damping
 BROAD = 3.0
-#: number of deviations of the frequencies above which an output counts as an outlier
-ODD = 6.0
 #: distance from a pole, in lines and in half-widths, over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
@@ -56,7 +47,7 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     free = max(1.0, 2 * lines.data.size - lines.inflation * count)
     if parts == 1 or fit.cost < NOISE * free:
         return False
-    noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEXT_TO_NONE * (fit.cost - free)
+    noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEGLIGIBLE * (fit.cost - free)
     limit, alone = min(least, free + noise, fit.cost / NOISE), 0.0
     for place in range(parts):
         alone += fit.own_of(place).cost
@@ -168,7 +159,7 @@ def disagreement(fit: PoleFit, least: float, excess: float) -> Disagreement | No
     size = 1.4826 * float(np.median(np.abs(away))) * np.sqrt(count / (count - 1.0))
     off = np.median(away, axis=1)
     worst = int(np.argmax(np.abs(off)))
-    odd = (worst, float(off[worst])) if abs(off[worst]) > ODD * size else None
+    odd = (worst, float(off[worst])) if abs(off[worst]) > CERTAIN * size else None
     return Disagreement(size, poles, spread, deviation, weighted.T @ weighted, odd)
 
 
@@ -220,7 +211,7 @@ def random_effects(
     low = np.zeros(places.shape[1])
     # sum (x - mean)^2 / t is below the goal there
     high = np.sum((places - places.mean(axis=0)) ** 2, axis=0) / goal
-    for _ in range(BISECTIONS):
+    for _ in range(MOST_STEPS):
         middle = (low + high) / 2
         above = np.sum(at(middle)[2] ** 2, axis=0) > goal
         low, high = np.where(above, middle, low), np.where(above, high, middle)

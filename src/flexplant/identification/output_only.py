@@ -10,7 +10,8 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, below_half_rate, frequency_band, positive, whole
 from ..errors import ModelError, SolverError
-from ..modes.matching import assigned, mac_matrix
+from ..lti.sampling import LIGHT
+from ..modes.matching import NEAR, assigned, mac_matrix
 from ..parallel import Progress, expect, tick
 from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
@@ -18,10 +19,6 @@ from .spectra import signals
 
 #: number of periods of the lowest frequency over which covariances are used by default
 PERIODS = 2.0
-#: largest damping ratio of a pole
-HEAVY = 0.2
-#: largest relative difference of a frequency between two parts of the record
-NEAR = 0.1
 #: the same between two orders; largest relative standard deviation of frequency and of damping:
 #: noise poles vary more
 SAME, LOOSE = 0.02, 0.6
@@ -207,7 +204,7 @@ def _order_poles(
     poles = np.log(mu[keep]) / step
     shapes = np.asarray(O[:n] @ vectors[:, keep], dtype=np.complex128)
     freq = np.abs(poles) / (2 * np.pi)
-    right = (poles.imag > 0) & (poles.real < 0) & (-poles.real < HEAVY * np.abs(poles))
+    right = (poles.imag > 0) & (poles.real < 0) & (-poles.real < LIGHT * np.abs(poles))
     right &= (freq >= band[0]) & (freq <= band[1])
     chosen = np.flatnonzero(right)[np.argsort(freq[right], kind="stable")]
     shapes = shapes[:, chosen] / np.linalg.norm(shapes[:, chosen], axis=0)

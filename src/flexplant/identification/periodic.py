@@ -12,11 +12,9 @@ from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..seeds import generator
 from ..store import Value, checked
-from ..tolerances import TINY, TYPED
+from ..tolerances import CHANCE, DEVIATIONS, NEGLIGIBLE, TINY, TYPED
 from .spectra import Records, error_statistics
 
-#: relative size of the weakest direction of the inputs above which a line counts as excited
-EXCITED = 1e-3
 #: fraction of the power of an output that counts as rounding
 ROUNDING = 1e-28
 
@@ -88,7 +86,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     freq = lines / method.period
     X = U if data.r is None else line_spectra(data.r, samples, periods)
     singular = np.linalg.svd(_mean_spectra(X), compute_uv=False)[:, -1]
-    keep = singular > EXCITED * singular.max(initial=0.0)
+    keep = singular > NEGLIGIBLE * singular.max(initial=0.0)
     if method.band is not None:
         keep &= (freq >= method.band[0]) & (freq <= method.band[1])
     if not np.any(keep):
@@ -290,8 +288,6 @@ PERIODIC = 10.0
 #: ratio of the difference of the inputs after another period below which that period counts as
 #: better
 BETTER = 0.25
-#: relative difference of the inputs below which it is rounding or the last digit of a file
-SAME = 1e-6
 #: number of periods and of lines (3 and 9) over which a transient is searched
 MOST, STRETCHES = 12, (3, 9)
 #: least fraction of the response in a transient from rest
@@ -299,11 +295,7 @@ LEAST = 0.5
 #: least fraction of the largest transient within this number of lines
 PEAK, NEAR = 0.03, 61
 #: fractions of a transient that may remain after a period; a slower transient looks like drift
-RADII = (0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.86)
-#: least bias of the mean in standard deviations of its noise
-VISIBLE = 2.0
-#: probability of a false alarm anywhere
-CHANCE = 1e-3
+RADII = np.linspace(0.03, 0.87, 13)
 
 
 def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: float) -> bool:
@@ -322,7 +314,7 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     here = float(change[samples])
     lags = np.arange(samples // 2, 3 * n_time // 4)
     best = int(lags[np.argmin(change[lags])])
-    if here > SAME and change[best] < BETTER * here:
+    if here > TYPED and change[best] < BETTER * here:
         warn(
             f"the inputs repeat after {best} samples, {best / rate:.6g} s, more exactly than "
             f"after the stated period of {samples} samples (they change by "
@@ -348,8 +340,6 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     return True
 
 
-#: largest relative change of the power of periodic inputs between periods
-REPEATED = 1e-3
 #: mean fourth power over squared power of pulses that fill 1/60 of a record; noise has 3
 PULSES = 60.0
 
@@ -382,7 +372,7 @@ def _period(x: FloatArray) -> int:
     apart = np.flatnonzero(change > 0.5)
     if not apart.size:
         return 0
-    alike = np.flatnonzero(change[apart[0] :] < REPEATED) + apart[0]
+    alike = np.flatnonzero(change[apart[0] :] < NEGLIGIBLE) + apart[0]
     if not alike.size:
         return 0
     run = alike[: int(np.argmax(np.diff(alike, append=alike[-1] + 2) > 1)) + 1]
@@ -424,7 +414,7 @@ def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard
     shared = np.einsum("eapf,ebpf->ab", e, e.conj())
     outputs = float(np.trace(shared).real ** 2 / np.sum(np.abs(shared) ** 2))
     spread = np.einsum("eopf,eoqf->fpq", e, e.conj(), optimize=True).reshape(freq.size, -1)
-    z = (np.array(RADII)[:, None] * np.exp(2j * np.pi * np.arange(48) / 48)).ravel()
+    z = (RADII[:, None] * np.exp(2j * np.pi * np.arange(48) / 48)).ravel()
     powers = z[:, None] ** np.arange(count)
     mean = np.array(
         [np.mean(one ** np.arange(discard - first, discard - first + kept)) for one in z]
@@ -457,7 +447,7 @@ def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard
         peak = mine > PEAK * ndi.maximum_filter1d(mine, NEAR)
         bias = tau * np.abs(mean[best]) ** 2 / (rest / kept)
         for k in np.flatnonzero(
-            (mine > limit * rest) & (bias > VISIBLE**2) & peak & (start > LEAST**2 * power)
+            (mine > limit * rest) & (bias > DEVIATIONS**2) & peak & (start > LEAST**2 * power)
         ):
             decay = float(np.abs(z[best[k]]))
             more = int(np.ceil(np.log(10.0 * bias[k]) / (-2.0 * np.log(decay))))

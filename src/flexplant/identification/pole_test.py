@@ -11,11 +11,10 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
+from ..tolerances import CERTAIN, CHANCE, CLOSE, SAME
 from .model_error import coherence, own_cost, twin_poles
 from .refine import Lines, PoleFit, pivoted, refined
 
-#: probability that noise anywhere in the band is taken for a pole
-CHANCE = 1e-3
 #: probability that noise is taken for outputs that disagree; real differences are far larger
 ALARM = 1e-9
 
@@ -340,14 +339,8 @@ def missed_poles(fit: PoleFit) -> Proposals:
 STRETCHES = (3, 9, 27, 81)
 #: number of highest groups of each length, and number of peaks at which a pole is tried
 PLACES, TRIED = 4, 6
-#: number of standard deviations of chi-square above which a group counts as not explained
-LIMIT = 6.0
 #: damping ratios tried for a missed pole, in addition to the width of its group
-DAMPING = (0.0005, 0.002, 0.008, 0.03)
-#: data without noise leave rounding, which does not count as noise
-ROUNDING = 1e-9
-#: without noise, fraction of the response below which the residual is seldom a mode
-SHARE = 0.01
+DAMPING = np.geomspace(0.0005, 0.03, 4)
 #: for a mode: number of lines around a peak, and standard deviations of their sum without the two
 #: highest
 AROUND, NEARBY = 6, 2.5
@@ -390,11 +383,11 @@ def unexplained(fit: PoleFit) -> list[Peak]:
         height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
         if noiseless:
             share = total / np.convolve(measured, ones, mode="valid")
-            height = np.where(share > SHARE**2, height, 0.0)
+            height = np.where(share > CLOSE**2, height, 0.0)
         for _ in range(PLACES):
             best = int(np.argmax(height))
             highest = float(height[best])
-            if highest <= LIMIT:
+            if highest <= CERTAIN:
                 break
             height[max(0, best - 2 * length) : best + 2 * length + 1] = 0.0
             seen = slice(best, best + length)
@@ -438,7 +431,7 @@ def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
 def _is_exact(fit: PoleFit) -> bool:
     """Whether a fit leaves rounding only."""
     data = fit.lines.data
-    return bool(la.norm(data - fit.model) < ROUNDING * la.norm(data))
+    return bool(la.norm(data - fit.model) < SAME * la.norm(data))
 
 
 def _is_smooth(lines: Lines, model: ComplexArray) -> bool:

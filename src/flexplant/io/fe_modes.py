@@ -17,13 +17,12 @@ from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.unit_systems import Units
 from ..structure.unit_systems import units as unit_system
+from ..tolerances import FOUR_DIGITS
 from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
 #: distance of generalised masses from 1 that few digits of mass-normalised shapes explain
 _ONE = 1e-5
-#: largest relative deviation from orthonormality of shapes in single precision
-_SINGLE = 1e-4
 MISSING = (
     "no residual attachment vectors: the static motion of truncated modes is missing "
     "(write residual vectors as further modes: RESVEC)"
@@ -142,7 +141,7 @@ def check_mass(phi: FloatArray, M: Any, path: str) -> float:
         )
     gram = phi.T @ np.asarray(M @ phi)
     off = np.abs(gram - np.eye(gram.shape[0]))
-    if off.max(initial=0.0) > _SINGLE:
+    if off.max(initial=0.0) > FOUR_DIGITS:
         mode = int(np.argmax(off.max(axis=0)))
         raise ModelError(
             f"the shapes of {path!r} are not mass-normalised with M: phi^T M phi of mode "

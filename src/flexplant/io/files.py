@@ -258,6 +258,8 @@ def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
 
 #: stands for the matrix with a usual name, if there is one
 USUAL = "usual"
+#: largest number of characters of a line of numbers; lines of cards have 80
+LINE = 4096
 #: number of bytes at the beginning of a file that must show its format
 HEAD = 20000
 

@@ -20,6 +20,7 @@ from ..structure import FEMatrices
 from ..structure.matrices import completed
 from .files import (
     FORMATS,
+    LINE,
     Format,
     check_count,
     check_whole,
@@ -242,8 +243,6 @@ FORMATS.append(
 )
 
 
-#: largest number of characters of a line; lines of cards have 80
-_LINE = 4096
 _FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
 
 
@@ -338,7 +337,7 @@ def _fortran_format(text: str) -> tuple[int, int]:
     if match is None:
         raise ValueError(f"format {text.strip()!r}")
     per_line, width = int(match[1] or 1), int(match[3])
-    if not 0 < per_line * width <= _LINE:
+    if not 0 < per_line * width <= LINE:
         raise ValueError(f"format {text.strip()!r}")
     return per_line, width
 

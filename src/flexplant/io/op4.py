@@ -17,7 +17,7 @@ from ..labels import DofSet
 from ..structure.definite import digits_of
 from ..structure.matrices import FEMatrices, completed
 from ..words import name_list
-from .files import FORMATS, USUAL, Format, check_count, damaged, file_path, fixed_numbers
+from .files import FORMATS, LINE, USUAL, Format, check_count, damaged, file_path, fixed_numbers
 from .nastran import named_matrices
 
 
@@ -225,8 +225,6 @@ def _broken(path: str, at: int, name: str) -> FlexplantError:
 
 #: digits of single precision (types 1 and 3), however many are printed
 _SINGLE = 7
-#: characters of a line at most
-_LINE = 4096
 _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
 
@@ -297,7 +295,7 @@ class _Reader:
                 f"{shown!r}"
             )
         self.per_line, self.width = int(match[2]), int(match[3])
-        if not 0 < self.per_line * self.width <= _LINE:
+        if not 0 < self.per_line * self.width <= LINE:
             self.at -= 1
             raise self.wrong(f"numbers as {shown!r}")
         check_count(max(columns, abs(rows)), sum(map(len, self.lines)), self.path)

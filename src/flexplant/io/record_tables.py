@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import FlexplantError, ModelError
+from ..tolerances import NEGLIGIBLE
 from .files import damaged, decimal, numbers_of_lines, refused, text_of, unread, wrong_line_of
 from .record_channels import RecordedChannels
 from .unit_labels import plain_label, seconds_of, unit_of
@@ -21,9 +22,6 @@ _RATE = re.compile(
     r"(?:sampl\w*[\s_-]*(?:rate|freq\w*)|\bfs\b)[^0-9\n]*?([0-9][0-9.,eE+]*)\s*(k?)(?:hz)?",
     re.IGNORECASE,
 )
-#: fraction of a step by which times may deviate from a grid, in addition to the rounding of printed
-#: digits
-_OFF = 1e-3
 #: ratio of a step to the usual one above which samples are missing: rounding to two digits gives
 #: 1.5
 _GAP = 1.75
@@ -134,7 +132,7 @@ def _even_rate(time: FloatArray, path: Path, first: int) -> tuple[float, float]:
     off = np.abs(time - time[0] - step * np.arange(time.size))
     digits = next((n for n in range(16) if np.allclose(time, np.round(time, n), 0, 1e-13)), 16)
     gap = steps.min() <= 0 or steps.max() > _GAP * np.median(steps)
-    if gap or off.max() > 10.0**-digits + _OFF * step:
+    if gap or off.max() > 10.0**-digits + NEGLIGIBLE * step:
         k = int(np.argmax(np.abs(steps - np.median(steps))))
         raise ModelError(
             f"{str(path)!r} was not sampled in equal steps: {np.median(steps):.6g} s, and "

@@ -11,13 +11,11 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..labels import DIRECTIONS
-from ..tolerances import SAME
+from ..tolerances import FOUR_DIGITS, SAME
 from .coordinate_systems import BASIC, CARTESIAN, CYLINDRICAL, SPHERICAL, System, axes_along
 from .files import damaged, defined_twice, parsing, refused, unread
 from .uff_records import datasets
 
-#: cosines below this are zero: the points of dataset 18 have six digits
-_STRAIGHT = 1e-4
 #: types of dataset 2420; those of dataset 18 are described nowhere, but for 0
 _TYPES = {0: CARTESIAN, 1: CYLINDRICAL, 2: SPHERICAL}
 _EXPORT = "Export nodes and results in global coordinates and directions."
@@ -72,7 +70,7 @@ class UffNodes:
             if system.kind == CYLINDRICAL:
                 places = self.xyz()
                 found |= {int(self.ids[row]): system.axes_at(places[row]) for row in own}
-            elif np.abs(system.axes - np.eye(3)).max() > _STRAIGHT:
+            elif np.abs(system.axes - np.eye(3)).max() > FOUR_DIGITS:
                 found |= dict.fromkeys(listed, system.axes)
         return found
 
@@ -135,9 +133,9 @@ def _systems(sets: list[dict[str, Any]], path: str) -> dict[int, System | str]:
 def _alike(first: System | str, second: System | str) -> bool:
     if isinstance(first, str) or isinstance(second, str):
         return first == second
-    same = np.abs(first.axes - second.axes).max() <= _STRAIGHT
+    same = np.abs(first.axes - second.axes).max() <= FOUR_DIGITS
     size = max(1.0, np.abs(first.origin).max())
-    near = np.abs(first.origin - second.origin).max() <= _STRAIGHT * size
+    near = np.abs(first.origin - second.origin).max() <= FOUR_DIGITS * size
     return first.kind == second.kind and bool(same and near)
 
 
@@ -147,7 +145,7 @@ def _of_2420(part: dict[str, Any]) -> dict[int, System | str]:
     for number, kind, matrix in listed:
         # rows 1 to 3 are the axes, row 4 is the origin
         axes, origin = np.asarray(matrix, dtype=np.float64)[:3].T, np.asarray(matrix)[3]
-        straight = np.abs(axes.T @ axes - np.eye(3)).max() < _STRAIGHT
+        straight = np.abs(axes.T @ axes - np.eye(3)).max() < FOUR_DIGITS
         if not straight or np.linalg.det(axes) < 0:
             found[int(number)] = "has axes that are not orthogonal, of unit length and right-handed"
         elif int(kind) not in _TYPES:
@@ -207,7 +205,9 @@ def turning(
     for (node, kind), rows in groups.items():
         local = np.array([DIRECTIONS.index(labels[row].partition(":")[2]) % 3 for row in rows])
         missing = np.setdiff1d(np.arange(3), local)
-        known = np.flatnonzero(np.abs(axes[node][:, missing]).max(axis=1, initial=0.0) < _STRAIGHT)
+        known = np.flatnonzero(
+            np.abs(axes[node][:, missing]).max(axis=1, initial=0.0) < FOUR_DIGITS
+        )
         if known.size != local.size:
             seen = ", ".join(
                 np.array2string(column, precision=4) for column in axes[node][:, local].T
@@ -225,4 +225,4 @@ def turning(
 
 def is_permutation(turn: FloatArray) -> bool:
     """Return whether a turn leaves every direction along one axis."""
-    return bool(np.all(np.abs(turn).max(axis=1, initial=0.0) > 1 - _STRAIGHT))
+    return bool(np.all(np.abs(turn).max(axis=1, initial=0.0) > 1 - FOUR_DIGITS))

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import re
 
+from scipy import constants
+
 from ..structure.unit_systems import GRAVITY, LENGTHS, POUND
 
 #: prefixes of SI are case-sensitive: mN is a millinewton and MN a meganewton
-PREFIXES = {"": 1.0, "M": 1e6, "k": 1e3, "m": 1e-3, "u": 1e-6, "n": 1e-9}
+PREFIXES = {
+    "": 1.0,
+    "M": constants.mega,
+    "k": constants.kilo,
+    "m": constants.milli,
+    "u": constants.micro,
+    "n": constants.nano,
+}
 
 
 def prefixed(unit: str, prefixes: str) -> dict[str, float]:

@@ -11,7 +11,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..tolerances import SAME, divisor
+from ..tolerances import CLOSE, RANK, ROOT, SAME, divisor
 from ..words import flag, instance, mapping
 from .frf_joints import (
     FrfLink,
@@ -24,9 +24,6 @@ from .frf_joints import (
     warn_of_bending,
 )
 from .joint import Joint, joint_list
-
-#: relative error of each response where it is not known: typical of a good measurement
-_USUAL = 0.01
 
 
 class MeasuredParts(NamedTuple):
@@ -88,11 +85,11 @@ def warn_of_errors(
     """Warn of lines at which the total error of all results exceeds the results."""
     # `error` is the variance or, where it is not `known`, the sum of errors as large as the
     # responses
-    answer, part = np.sum(np.abs(data) ** 2, axis=(0, 1)), 1.0 if known else _USUAL**2
+    answer, part = np.sum(np.abs(data) ** 2, axis=(0, 1)), 1.0 if known else CLOSE**2
     hidden = part * np.sum(error, axis=(0, 1)) > answer
     if not hidden.any():
         return
-    whose = "by their variances" if known else f"of {100 * _USUAL:.0f} % in each response"
+    whose = "by their variances" if known else f"of {100 * CLOSE:.0f} % in each response"
     where = f"{freq[hidden][0]:.5g} to {freq[hidden][-1]:.5g} Hz"
     warn(
         f"errors {whose} exceed the result at {np.count_nonzero(hidden)} of {freq.size} lines "
@@ -101,10 +98,6 @@ def warn_of_errors(
     )
 
 
-#: condition number of the interface above which measurement errors hide the result
-_CONDITION = 1e8
-#: condition number of the interface above which an error is raised
-_SINGULAR = 1e14
 #: largest relative gap in a joint of the result
 _GAP = SAME
 #: prefix of the names of removed components
@@ -326,13 +319,13 @@ def _coupled_response(
     with np.errstate(divide="ignore", invalid="ignore"):
         condition = np.nan_to_num(values[:, 0] / values[:, -1], nan=np.inf)
     worst = int(np.argmax(condition))
-    if not condition[worst] < _CONDITION:
+    if not condition[worst] < 1.0 / ROOT:
         said = (
             f"the interface has the condition {condition[worst]:.2g} at {freq[worst]:.5g} Hz: "
             "errors of the responses are multiplied by it. Join fewer channels, those that move "
             "independently, or leave such frequencies out."
         )
-        if not condition[worst] < _SINGULAR:
+        if not condition[worst] < 1.0 / RANK:
             raise ModelError(said)
         warn(said)
     turned, back = (np.swapaxes(part, 1, 2).conj() for part in (right_part, left_part))

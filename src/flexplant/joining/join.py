@@ -19,20 +19,16 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.statics import static_response
 from ..reduction import ReducedModel
+from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL
 from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value, frozen
 from ..structure import FEModel
-from ..structure.rigid import SPANNED, rigid_body_basis
-from ..tolerances import NULL, SAME, TINY, divisor
+from ..structure.rigid import rigid_body_basis
+from ..tolerances import MISSED, NEGLIGIBLE, NULL, RESIDUAL, ROOT, SAME, TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
 from .links import Link, eliminated, links_of, machine_size, stretch_rows, warn_of_missing_statics
-
-#: largest number of coordinates of a machine with reduced components, limited by memory
-_LARGEST = 5000
-#: ratio of a spring to the stiffness of its components above which these keep less than six digits
-_STIFFEST = 1e10
 
 
 @overload
@@ -155,14 +151,6 @@ def joined(
     return machine.model(motions, certificate, name)
 
 
-#: largest relative gap, imbalance and error of the inertia
-_LIMIT = 1e-7
-#: relative error up to which a reduced component contains a rigid-body motion
-_MADE = 1e-8
-#: fraction of the largest entry of a motion that counts in the rounding of every entry
-_ENTRY = 1e-3
-
-
 class JoinedMachine:
     """Components and the axes of their joints, with the motions that satisfy the rigid ones."""
 
@@ -190,11 +178,11 @@ class JoinedMachine:
         made = np.abs([link.stiffness for link in self.soft]) * most**2
         ratio = np.divide(made, there, out=np.zeros(made.size), where=there > 0)
         stiffest = int(np.argmax(ratio))
-        if ratio[stiffest] > _STIFFEST:
+        if ratio[stiffest] > 1.0 / RESIDUAL:
             raise ModelError(
                 f"the spring {self.soft[stiffest].joint!r} is {ratio[stiffest]:.2g} times as stiff "
-                f"as its components there (limit {_STIFFEST:g}): the digits of their K would be "
-                "lost. Leave out stiffness= for a rigid joint."
+                f"as its components there (limit {1.0 / RESIDUAL:g}): the digits of their K would "
+                "be lost. Leave out stiffness= for a rigid joint."
             )
 
     def _reach(self) -> FloatArray:
@@ -208,12 +196,12 @@ class JoinedMachine:
 
     def _matrices(self) -> dict[str, Any]:
         """Return M, D and K of the machine; D is None where nothing has damping."""
-        if self.is_reduced and self.done.kept.size > _LARGEST:
+        if self.is_reduced and self.done.kept.size > LARGEST_FULL:
             raise ModelError(
                 f"a machine with reduced components has full matrices: {self.done.kept.size} "
-                f"coordinates are too many (limit {_LARGEST}). Reduce the large components first, "
-                "by fx.reduction.CraigBampton(boundary=[...]) at their joints, or join models and "
-                "reduce the machine."
+                f"coordinates are too many (limit {LARGEST_FULL}). Reduce the large components "
+                "first, by fx.reduction.CraigBampton(boundary=[...]) at their joints, or join "
+                "models and reduce the machine."
             )
         bare = [part.name for part in self.parts if not part.is_damped]
         damped = len(bare) < len(self.parts)
@@ -349,7 +337,7 @@ class JoinedMachine:
             allowed = la.null_space(stretch / divisor(size)[:, None], rcond=SAME)
             beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
             size = np.linalg.norm(whole, axis=0)
-            clean = (missed < SPANNED) & (size > 0) & (beside <= SAME * size)
+            clean = (missed < NEGLIGIBLE) & (size > 0) & (beside <= SAME * size)
             candidates = motions[self.done.kept] @ np.hstack([whole[:, clean], allowed])
             found.append(orthonormalised(self.matrices["M"], candidates, dependent="drop"))
         return np.hstack(found)
@@ -384,9 +372,9 @@ class JoinedMachine:
             patches=patches,
         )
         # springs may have a resultant force, rigid joints may not
-        if balance > _LIMIT or not found.certificate.holds:
+        if balance > MISSED or not found.certificate.holds:
             raise CertificateError(
-                f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer "
+                f"the joined machine fails its check (limit {MISSED:g}): {found!r}. Join fewer "
                 "axes, or look for joints that nearly repeat each other."
             )
         if found.n_rigid != expected:
@@ -411,7 +399,7 @@ class JoinedMachine:
         whole = np.vstack(own)[self.done.kept]
         size = np.sqrt(np.maximum(np.diag(apart), TINY))
         error = np.abs(whole.T @ np.asarray(self.matrices["M"] @ whole) - apart)
-        error, made = error / np.outer(size, size), missed < _MADE
+        error, made = error / np.outer(size, size), missed < ROOT
         return apart, float(error[np.ix_(made, made)].max(initial=0.0))
 
 
@@ -427,13 +415,11 @@ def _force(K: Any, motions: FloatArray) -> float:
     """Return the largest elastic force of motions (k, r), relative to the terms that cancel."""
     force = np.linalg.norm(np.asarray(K @ motions), axis=0)
     # a motion without spring forces has only rounding of its largest entries there
-    moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
+    moved = np.abs(motions) + NEGLIGIBLE * np.abs(motions).max(axis=0, initial=0.0)
     most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
     return float(np.max(force / divisor(most), initial=0.0))
 
 
-#: largest number of displacements of an examined patch: each is a load case of the component
-_MOST = 1000
 #: singular values of the compliance of a patch below this, relative to the largest, count as zero
 _RANK = NULL
 
@@ -467,7 +453,7 @@ def compliances(
     W, A, _ = patch.mean(part.dofs, point)
     model = part.model
     # a component with rigid-body modes only has no elastic compliance
-    if rows.size > _MOST or model.n_unstable or model.rigid_body.shape[1] == model.K.shape[0]:
+    if rows.size > DENSE_LIMIT or model.n_unstable or model.rigid_body.shape[1] == model.K.shape[0]:
         return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
     loads = dense(part.T[rows].T)
     C = loads.T @ static_response(model, loads)
@@ -541,9 +527,9 @@ class JoiningReport(Value):
         """Invariants of the machine, each relative to the terms that cancel."""
         return Certificate(
             (
-                Verified("gap", self.gap, "opening of the rigid joints", _LIMIT),
-                Verified("inertia", self.inertia_error, "sum over the components", _LIMIT),
-                Verified("rigid force", self.rigid_force, "K times rigid-body motions", _LIMIT),
+                Verified("gap", self.gap, "opening of the rigid joints", MISSED),
+                Verified("inertia", self.inertia_error, "sum over the components", MISSED),
+                Verified("rigid force", self.rigid_force, "K times rigid-body motions", MISSED),
                 Verified("balance", self.balance, "resultants between components"),
             )
         )

@@ -15,7 +15,7 @@ from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, DofSet
 from ..store import Value
 from ..structure.rigid import rigid_motions
-from ..tolerances import SAME
+from ..tolerances import ROOT, SAME
 from ..words import instance, name_list
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
@@ -151,10 +151,6 @@ def _end_text(end: Any) -> str:
     return repr(end) if isinstance(end, Patch) else str(end)
 
 
-#: singular values of the motions of a patch below this, relative to the largest, count as zero
-_RANK = 1e-8
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Patch(Value):
     """Nodes of a component whose mean motion is joined, as by NASTRAN's RBE3.
@@ -271,8 +267,8 @@ def mean_motions(
     scale = np.array([1.0] * 3 + [radius] * 3)
     root = np.sqrt(weights)[:, None]
     spread = root * A / scale
-    inverse = np.linalg.pinv(spread, rcond=_RANK)
-    made = np.linalg.norm(inverse @ spread - np.eye(6), axis=0) < _RANK
+    inverse = np.linalg.pinv(spread, rcond=ROOT)
+    made = np.linalg.norm(inverse @ spread - np.eye(6), axis=0) < ROOT
     by_node = (inverse * root.T) / scale[:, None]
     by_node[~made] = 0.0
     return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]

@@ -16,14 +16,12 @@ from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
-from ..tolerances import SAME, TYPED
+from ..tolerances import NEGLIGIBLE, PRECISION, ROOT, SAME, TYPED
 from .component import Component, Model, Pose, components_of
 from .joint import Joint, JointEnd, joint_axes, joint_list
 
 #: relative stretch of a joint in a motion of the whole machine below which it counts as zero
 BALANCED = SAME
-#: fraction of a joint's row that static shapes of a reduced component may miss
-_STATIC = 1e-3
 
 
 class Felt(NamedTuple):
@@ -150,7 +148,7 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
         known, wanted = part.static_rows[:, some], wanted[:, some]
         left = wanted - (wanted @ np.linalg.pinv(known)) @ known
         part_left = np.linalg.norm(left, axis=1) / np.linalg.norm(wanted, axis=1)
-        lost = [felt[i][0] for i in np.flatnonzero(part_left > _STATIC)]
+        lost = [felt[i][0] for i in np.flatnonzero(part_left > NEGLIGIBLE)]
         if lost:
             more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
             warn(
@@ -244,8 +242,6 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
 
 
-#: size of diagonal entries of R relative to the first below which a joint repeats others
-_RANK = 1e-8
 #: the same size below which it nearly repeats others
 _DOUBTFUL = 1e-5
 #: preference for later components as followers; far above rounding
@@ -253,8 +249,6 @@ _LATER, _WITHIN = 1e-2, 1e-4
 #: size relative to the largest in its constraint above which a coordinate may follow without
 #: further search
 _HEAVY = 0.3
-#: relative size of entries of the expansion below which they count as zero
-_ROUNDING = 1e-15
 
 
 class Elimination(NamedTuple):
@@ -351,7 +345,7 @@ def _follower_rows(
     prefer = 1.0 + _LATER * order / (order.max() + 1) + _WITHIN * np.arange(k) / k
     R, pivots = la.qr(scaled * prefer, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(R))
-    rank = int(np.count_nonzero(diagonal > _RANK * diagonal[0]))
+    rank = int(np.count_nonzero(diagonal > ROOT * diagonal[0]))
     if rank and diagonal[rank - 1] < _DOUBTFUL * diagonal[0]:
         warn(
             f"joints nearly repeat each other (a pivot is {diagonal[rank - 1] / diagonal[0]:.1g} "
@@ -364,5 +358,5 @@ def _follower_rows(
     if rank < rows.size:  # those that decide
         rows = la.qr(scaled[:, lead].T, mode="r", pivoting=True)[1][:rank]
     X = np.linalg.solve(scaled[rows][:, lead], -scaled[rows][:, rest])
-    X[np.abs(X) < _ROUNDING * np.abs(X).max(initial=0.0)] = 0.0
+    X[np.abs(X) < PRECISION * np.abs(X).max(initial=0.0)] = 0.0
     return lead, X * size[lead][:, None] ** -1 * size[rest] if rank else X

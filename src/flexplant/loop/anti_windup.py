@@ -8,14 +8,10 @@ import scipy.linalg as la
 from ..arrays import FloatArray
 from ..errors import ModelError, counted
 from ..lti.lyapunov import solve_lyapunov, solve_stein
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import NEGLIGIBLE, ROUNDING, TINY, divisor
 
-#: tolerance of the decay of a pole relative to 1 / recovery
-_SHORT = 1e-3
 #: reached fraction of the wanted decay where several poles coincide, which rounding splits
 _REACHED = 0.5
-#: least observability of slow states by the commands, relative to the largest
-_SEEN = 1e-12
 
 
 def recovery_gain(A: FloatArray, C: FloatArray, recovery: float, dt: float) -> FloatArray:
@@ -24,7 +20,7 @@ def recovery_gain(A: FloatArray, C: FloatArray, recovery: float, dt: float) -> F
     Slower poles move to that decay and keep their frequency; the others do not change.
     """
     wanted = -1.0 / recovery
-    limit = wanted * (1.0 - _SHORT)
+    limit = wanted * (1.0 - NEGLIGIBLE)
     unit = divisor(np.linalg.norm(C, axis=1))
     C = C / unit[:, None]
     L = np.zeros(C.T.shape)
@@ -84,7 +80,7 @@ def _is_seen(S: FloatArray, see: FloatArray, level: float, dt: float) -> bool:
     X = _gramian(S, see / np.abs(see).max(initial=TINY), level, dt)
     size = np.sqrt(divisor(X.diagonal()))
     values = np.linalg.eigvalsh(X / size / size[:, None])
-    return bool(values.min(initial=1.0) > _SEEN * values.max(initial=1.0))
+    return bool(values.min(initial=1.0) > ROUNDING * values.max(initial=1.0))
 
 
 def _mirroring(S: FloatArray, see: FloatArray, level: float, dt: float) -> FloatArray:

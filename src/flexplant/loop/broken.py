@@ -9,14 +9,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import COLUMNS, ComplexArray, FloatArray
 from ..errors import LabelError, short
 from ..lti.frequency_sweep import SOUGHT, climbed_grid, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..tolerances import TINY
+from ..tolerances import MOST_STEPS, RANK, TINY
 from ..words import instance
 from .blocks import references
 
@@ -29,8 +29,6 @@ _NEAR = 0.8
 _POINTS = 100
 #: cache of prepared plants, which loops with other controllers use again
 _KEPT = 8
-#: relative change of a loop gain of 1 that makes I - L regular
-_BESIDE = 1e-15
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,7 @@ def inverted(L: ComplexArray) -> ComplexArray:
     try:
         return np.asarray(np.linalg.inv(eye - L))
     except np.linalg.LinAlgError:  # a marginal loop at the frequency of its pole
-        return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
+        return np.asarray(np.linalg.inv(eye - (1.0 - RANK) * L))
 
 
 def largest_sensitivity(L: ComplexArray, scaled: bool) -> FloatArray:
@@ -183,15 +181,11 @@ def movable_outputs(g: StateSpace) -> tuple[str, ...]:
     return tuple(name for name, one in zip(g.outputs, moves, strict=True) if one)
 
 
-#: number of sweeps that balance rows against columns
-_SWEEPS = 30
 #: powers of singular values whose sum is minimised in turn, and steps for each: the largest value
 #: is within n^(1/p) of the power mean, 2 % for 4 axes at 64
 _POWERS, _STEPS = (1, 2, 4, 8, 16, 32, 64), 12
 #: largest step of a logarithm, where a loop acts on others but no loop acts on it
 _LARGEST = 1.0
-#: number of frequencies optimised together
-_CHUNK = 32
 
 
 def scaled_size(S: ComplexArray) -> FloatArray:
@@ -204,8 +198,8 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
         return size
     best, order = 0.0, np.argsort(-size, kind="stable")
-    for begin in range(0, order.size, _CHUNK):
-        some = order[begin : begin + _CHUNK]
+    for begin in range(0, order.size, COLUMNS):
+        some = order[begin : begin + COLUMNS]
         if size[some[0]] <= best:
             break
         size[some] = _optimised(S[some], log[some], size[some])
@@ -224,7 +218,7 @@ def _log_scaling(S: ComplexArray) -> FloatArray:
     power[:, range(n), range(n)] = 0.0
     # a coupling of 1e-12 of the whole is rounding; all sums are squares
     least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + TINY
-    for _ in range(_SWEEPS if n > 1 else 0):
+    for _ in range(MOST_STEPS if n > 1 else 0):
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
             # it acts on others, and no loop acts on it

@@ -25,15 +25,13 @@ from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.response_solvers import responder
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
+from ..parallel import PIECE
 from ..plant import AnyPlant, standard_plant
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import MOST_STEPS, ROOT, TYPED, divisor
 from ..words import in_unit, instance
 
-#: relative tolerances of the variance: by two Lyapunov equations, and by the integral of the
-#: spectrum
-AGREEMENT = 1e-6
 #: name of the contribution of a set-point
 RESIDUE = "set-point residue"
 
@@ -145,7 +143,7 @@ def source_variances(
     other = float((c @ solve(monitored.A, G @ G.T) @ c.T + D @ D.T)[0, 0])
     total = float(variances.sum())
     difference = abs(other - total) / total if total else 0.0
-    if not difference <= AGREEMENT:
+    if not difference <= TYPED:
         raise CertificateError(
             f"the variance of {monitored.outputs[row]!r} is {total:.9g} by the observability "
             f"Gramian and {other:.9g} by the covariance of the states: a closed-loop pole is too "
@@ -170,7 +168,7 @@ def error_budget(
     total = float(variances.sum())
     off = float(np.max(np.abs(cumulative[:, -1] - variances), initial=0.0))
     integral = off / total if total else 0.0
-    if not integral <= AGREEMENT:
+    if not integral <= TYPED:
         raise CertificateError(
             f"the integral of the spectrum of {channel!r} differs from its variance by "
             f"{integral:.1e} of it: a resonance of the closed loop is too narrow to be integrated. "
@@ -222,13 +220,8 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
 
 #: function that gives densities (n_source, n_freq) at frequencies [Hz]
 Densities = Callable[[FloatArray], FloatArray]
-#: relative error of the integral of each source at which halving of intervals ends
-TOLERANCE = 1e-8
-ROUNDS = 40  # an interval of 1e-12 of the first has no error
 #: number of edges over all frequencies for a picture; distances from resonances in half-widths
 _STAIRS, _BESIDE = 150, (0.0, 3.0, 20.0)
-#: number of frequencies computed together
-STEP = 2048
 
 
 class Spectrum(NamedTuple):
@@ -266,8 +259,8 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
 
     def found(freq: FloatArray) -> FloatArray:
         out = np.empty((len(noises), freq.size))
-        for start in range(0, freq.size, STEP):
-            part = slice(start, start + STEP)
+        for start in range(0, freq.size, PIECE):
+            part = slice(start, start + PIECE)
             # transposed, not conjugated: C (z I - A)^-1 of the same z
             back = reach(freq[part])[:, 0].T
             for i, one in enumerate(noises):
@@ -303,11 +296,11 @@ def integrated(
     known = np.vstack([edges[:-1], edges[1:]])  # the ends of each interval
     fine, error = values(*known)
     size = divisor(variances)[:, None]
-    for _ in range(ROUNDS):
+    for _ in range(MOST_STEPS):
         share = np.max(error / size, axis=0, initial=0.0)
-        if share.sum() <= TOLERANCE:
+        if share.sum() <= ROOT:
             break
-        bad = share > TOLERANCE / share.size
+        bad = share > ROOT / share.size
         middle = known[:, bad].mean(axis=0)
         halves = np.hstack([[known[0, bad], middle], [middle, known[1, bad]]])
         more, missed = values(*halves)
@@ -350,10 +343,6 @@ def periodogram(signal: FloatArray, dt: float) -> Spectrum:
     size: FloatArray = np.abs(np.fft.rfft(signal)) ** 2 * (2.0 * dt / n)
     size[[0, -1] if n % 2 == 0 else [0]] *= 0.5
     return Spectrum(np.fft.rfftfreq(n, dt).astype(np.float64), size)
-
-
-#: relative tolerance: noise factors of single disturbances must add up to that of the plant
-_ADDS_UP = 1e-6
 
 
 class WhiteNoise(NamedTuple):
@@ -438,7 +427,7 @@ def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatAr
         if all(factor.shape[0] == total.shape[0] for factor in found.values()):
             own = np.sum(total**2, axis=1)
             added = np.sum([np.sum(factor**2, axis=1) for factor in found.values()], axis=0)
-            if np.allclose(added, own, rtol=_ADDS_UP, atol=0.0):
+            if np.allclose(added, own, rtol=TYPED, atol=0.0):
                 return found
     return {" + ".join(white): total}
 

@@ -19,9 +19,10 @@ from ..lti.modal_map import Obstacle, obstacle
 from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
-from ..plant.machine_plants import LEVEL, FigureInterval
+from ..plant.machine_plants import FigureInterval
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
+from ..tolerances import INTERVAL
 from ..words import name_list
 from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
@@ -325,7 +326,11 @@ class ClosedLoop(Value):
         return MachineLoops(self, known)
 
     def interval(
-        self, figure: str | Callable[[ClosedLoop], float], level: float = LEVEL, *, unit: str = ""
+        self,
+        figure: str | Callable[[ClosedLoop], float],
+        level: float = INTERVAL,
+        *,
+        unit: str = "",
     ) -> FigureInterval:
         """Return the interval of a figure of the loop over machines with the same measurement.
 

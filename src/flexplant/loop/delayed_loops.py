@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import AssumptionError, ModelError, SolverError, counted
 from ..lti.delays import Delayed, delayed
 from ..store import Value
-from ..tolerances import ROUNDING
+from ..tolerances import FOUR_DIGITS, ROUNDING, SETTLED
 from ..words import one_of
 
 #: the loop gain below which a loop no longer turns, over its distance to 1 at infinity
@@ -23,10 +23,6 @@ _QUIET = 0.1
 _POINTS, _TURN, _STEP = 200, 0.2, 0.5
 #: points of the contour at most
 _MOST = 2_000_000
-#: radius of the detours around poles on the axis, over the slowest frequency that matters
-_DETOUR = 1e-4
-#: relative error of the simulated steps
-_EXACT = 1e-9
 #: peaks that are refined
 _PEAKS = 5
 
@@ -150,7 +146,7 @@ class DelayedLoop(Value):
         every = np.concatenate([even, turns, swing.ravel()])
         every = np.unique(every[(every >= low) & (every <= high)])
         undamped = np.abs(modes.imag[np.abs(modes.real) <= self._edge(modes)])
-        away = np.abs(every[:, None] - undamped).min(axis=1, initial=np.inf) > _DETOUR * low
+        away = np.abs(every[:, None] - undamped).min(axis=1, initial=np.inf) > FOUR_DIGITS * low
         return np.asarray(every[away] / (2 * np.pi))
 
     @cached_property
@@ -158,7 +154,7 @@ class DelayedLoop(Value):
         """Points from the positive real axis along the imaginary one, and det(I + L) there."""
         poles = self.gain.system.poles()
         on_axis = poles[np.abs(poles.real) <= self._edge(poles)]
-        radius = _DETOUR * self._slow
+        radius = FOUR_DIGITS * self._slow
         s: ComplexArray = np.asarray(2j * np.pi * self.lines, dtype=np.complex128)
         around = [radius * np.exp(0.5j * np.pi * np.linspace(0.0, 1.0, 40))]
         around.append(1j * np.geomspace(radius, self._slow, 400)[1:])
@@ -278,7 +274,13 @@ class DelayedLoop(Value):
             start, end = k * late, (k + 1) * late
             slopes: Any = _driven(g.A, g.B, before, late)
             own = solve_ivp(
-                slopes, (start, end), x, method="DOP853", rtol=_EXACT, atol=1e-12, dense_output=True
+                slopes,
+                (start, end),
+                x,
+                method="DOP853",
+                rtol=SETTLED,
+                atol=1e-12,
+                dense_output=True,
             )
 
             def output(at: float, own: Any = own, v: Any = before) -> FloatArray:

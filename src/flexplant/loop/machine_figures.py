@@ -10,7 +10,8 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..lti.frequency_sweep import crossings
-from ..plant.machine_plants import LEVEL, FigureInterval, PlantMachines, interval, interval_text
+from ..plant.machine_plants import FigureInterval, PlantMachines, interval, interval_text
+from ..tolerances import INTERVAL
 from ..words import one_of
 from .broken import axis_sensitivities
 
@@ -111,7 +112,7 @@ def interval_line(loop: Any) -> str:
     known = loop.plant.machine.machines
     if known is None:
         return ""
-    found = {figure: loop_interval(loop, figure, LEVEL) for figure in FIGURES}
+    found = {figure: loop_interval(loop, figure, INTERVAL) for figure in FIGURES}
     if found[MARGIN].low is None:
         return found[MARGIN].sentence
     parts = []
@@ -123,4 +124,4 @@ def interval_line(loop: Any) -> str:
                 else interval_text(one.low, one.high, "Hz" if figure == BANDWIDTH else "")
             )
             parts.append(f"{figure} {ends}")
-    return f"on {100 * LEVEL:.3g} % of such machines:\n    " + ", ".join(parts)
+    return f"on {100 * INTERVAL:.3g} % of such machines:\n    " + ", ".join(parts)

@@ -13,7 +13,7 @@ from ..lti.frequency import Frf, frequency_response
 from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..tolerances import TINY
+from ..tolerances import SAME, TINY
 from ..words import flag, instance
 from .broken import BrokenLoop
 
@@ -235,8 +235,6 @@ _END = 0.25 * np.pi
 _SLOPE = 0.75
 #: range below the lowest line, relative to it, to which a measured plant is extrapolated
 _BELOW = 1e-3
-#: size of a pole of the controller, relative to its fastest pole, below which it is an integrator
-_INTEGRATES = 1e-9
 
 
 class NyquistCount(NamedTuple):
@@ -328,7 +326,7 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
             None,
             f"{grid.size} lines are too few to judge stability, {FEWEST} are needed: measure more",
         )
-    zero = np.abs(distance) <= _INTEGRATES * scale
+    zero = np.abs(distance) <= SAME * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
     plant = parts.plant(grid)
     rigid = free_motions(grid, plant) if rigid is None else rigid

@@ -32,7 +32,7 @@ from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..plant.building import sampled_motions
 from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs
-from ..tolerances import SAME, SETTLED, TINY
+from ..tolerances import SAME, SETTLED, SPLIT, TINY
 from .broken import BrokenLoop, inverted
 
 #: largest relative change of a frequency whose polynomials are exact
@@ -50,8 +50,6 @@ _WITHIN, _DIVISIONS = 6, 3
 #: fraction of the wanted |S|: a point below it with the mode at both ends of its range, and without
 #: a resonance between, is not examined
 _NEAR = 0.25
-#: least relative change of a frequency that matters: poles are not measured more accurately
-_LEAST = 1e-6
 #: number of changes tried for a margin, and number of bisections before the first that fails
 _TRIED, _HALVINGS = 16, 8
 #: number of points between the lines next to the highest one, for the maximum of a peak
@@ -420,7 +418,7 @@ def size_reached(
     few, freq = every.take(near), freq[near]
     found = np.array(stable)  # unless the margin is reached before, or the peak is too narrow
     for side, sign in enumerate((-1.0, 1.0)):
-        start = np.minimum(_LEAST, 0.5 * ends[:, side])
+        start = np.minimum(SPLIT, 0.5 * ends[:, side])
         steps = np.geomspace(start, ends[:, side], _TRIED)
         highest = np.array([few.highest(sign * step, count) for step in steps])
         reached = highest >= 1.0

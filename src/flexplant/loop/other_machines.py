@@ -19,7 +19,8 @@ from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
-from ..tolerances import TINY
+from ..tolerances import CLOSE, TINY
+from ..words import SHOWN
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
 
@@ -28,8 +29,6 @@ _TAKES_PART = 0.3
 #: |S| at u with truncated modes above which a warning is given (8 dB), and ratio to |S| without
 #: them
 _HIGH, _LARGER = 2.5, 1.1
-#: number of modes named in a message
-_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -141,8 +140,8 @@ def _db(margin: float) -> str:
 def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
     """Return a text of modes, the first few of many."""
     listed = [f"mode {n} (at {f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
-    more = len(listed) - _NAMED
-    first = ", ".join(listed[:_NAMED]) or "no mode named"
+    more = len(listed) - SHOWN
+    first = ", ".join(listed[:SHOWN]) or "no mode named"
     return first + (f" and {more} more" if more > 0 else "")
 
 
@@ -185,9 +184,6 @@ def growing_modes(
 
 #: number of grid points per half-width around a mode, and largest number on either side
 _TO_A_WIDTH, _ASIDE = 2, 400
-#: range of the grid around a mode relative to the largest change, including the flanks of the
-#: resonance
-_PASSED = 1.2
 #: searched range of relative changes of damping: without damping, a mode that the loop does not
 #: affect is marginal
 _DAMPINGS = (-0.999, 2.0)
@@ -195,13 +191,9 @@ _DAMPINGS = (-0.999, 2.0)
 _SAFE = 2.0
 #: modulus margin for which tolerances are stated: |S| at u of 2.9, 9 dB
 MARGIN = 0.35
-#: relative change of a frequency to which a report follows a mode: a model that was updated is
-#: seldom further off
-_FOLLOWED = 0.01
-#: ratio of the search range to the requested change, so that a crossing lies inside
+#: ratio of the search range, or that of a grid, to the requested change, so that a crossing and the
+#: flanks of a resonance lie inside
 BEYOND = 1.25
-#: number of rows of the table
-_SHOWN = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -312,10 +304,10 @@ class ModeTolerances(Value):
             )
             if mode in self.critical
         ]
-        more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN else ""
+        more = f" and {len(said) - SHOWN} more" if len(said) > SHOWN else ""
         warn(
             "the loop depends on frequencies that are not known accurately enough: "
-            f"{'; '.join(said[:_SHOWN])}{more}. Measure these modes, or design for their "
+            f"{'; '.join(said[:SHOWN])}{more}. Measure these modes, or design for their "
             "uncertainty: design_stage(plant.uncertain(...))."
         )
 
@@ -323,14 +315,14 @@ class ModeTolerances(Value):
         lines = [f"<ModeTolerances of {counted(self.modes.size, 'mode')}: {self.summary}"]
         head = ("mode", "Hz", f"|S| at u of {1 / self.margin:.3g}", "unstable", "known to", "")
         rows = []
-        for i in np.argsort(self.least, kind="stable")[:_SHOWN]:
+        for i in np.argsort(self.least, kind="stable")[:SHOWN]:
             row = [_percent(ends, self.limit[i]) for ends in (self.within[i], self.stable[i])]
             own = "" if self.known is None else f"{100 * self.known[i]:.2g} %"
             mark = "!" if self.modes[i] in self.critical else ""
             rows.append((str(self.modes[i]), f"{self.freq[i]:.5g}", *row, own, mark))
         lines += [f"  {line}" for line in aligned(head, rows)]
-        if self.modes.size > _SHOWN:
-            lines.append(f"  ... and {self.modes.size - _SHOWN} more")
+        if self.modes.size > SHOWN:
+            lines.append(f"  ... and {self.modes.size - SHOWN} more")
         return "\n".join(lines) + ">"
 
 
@@ -388,7 +380,7 @@ def mode_tolerances(
     ends = np.outer(limits, [-1.0, 1.0])
     stable = axis_crossings(swept, each, every[at], "freq", ends)
     damping = axis_crossings(swept, each, every[at], "damping", np.tile(_DAMPINGS, (modes.size, 1)))
-    passed = np.abs(every[at] / freq[mode] - 1.0) <= _PASSED * limits[mode]
+    passed = np.abs(every[at] / freq[mode] - 1.0) <= BEYOND * limits[mode]
     within = size_reached(swept, each, every[at], passed, stable, limits, 1.0 / margin)
     return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
 
@@ -409,7 +401,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
 
 def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
     """Return the tolerances of a stable loop to the changes that a report follows."""
-    limit = min(max(_FOLLOWED, BEYOND * _SAFE * max(known.values(), default=0.0)), LIMIT)
+    limit = min(max(CLOSE, BEYOND * _SAFE * max(known.values(), default=0.0)), LIMIT)
     try:
         return mode_tolerances(
             loop.plant, loop.broken, margin=MARGIN, known=known or None, limit=limit
@@ -434,7 +426,7 @@ def _around(freq: float, zeta: float, limit: float, grid: FloatArray, dt: float)
     """Return frequencies [Hz] over the possible range of a mode, and around it."""
     count = int(np.ceil(limit * _TO_A_WIDTH / max(zeta, TINY)))
     count = min(max(count, 2 * _TO_A_WIDTH), _ASIDE)
-    fine = freq * (1.0 + _PASSED * limit * np.linspace(-1.0, 1.0, 2 * count + 1))
+    fine = freq * (1.0 + BEYOND * limit * np.linspace(-1.0, 1.0, 2 * count + 1))
     near = np.union1d(fine, grid[(grid > 0.5 * freq) & (grid < 2.0 * freq)])
     return np.asarray(near[near < 0.5 / dt] if dt else near)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
-from ..lti.frequency_sweep import crossings, highest
+from ..lti.frequency_sweep import ROUNDS, crossings, highest
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
@@ -25,8 +25,6 @@ from .sensitivity_functions import Loop, taken_apart
 _REAL = 0.05
 #: slope of its size over frequency at the first line below which it counts as constant
 _LEVEL = 0.5
-#: number of divisions of the lines next to the largest |S|
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -278,7 +276,7 @@ def loop_margins(
     above = [factor for _, factor in gains if factor > 1.0]
     below = [factor for _, factor in gains if factor < 1.0]
     near = min(((abs(np.log(factor)), place) for place, factor in gains), default=(0.0, np.nan))
-    rounds = 0 if exact is None else _ROUNDS
+    rounds = 0 if exact is None else ROUNDS
     peak, where = highest(lambda f: closeness(find(f)), freq, rounds, closeness(L))
     return LoopMargins(
         name,

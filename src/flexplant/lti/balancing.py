@@ -10,15 +10,13 @@ from ..arrays import FloatArray, positive
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..store import Value
+from ..tolerances import RANK
 from .interconnection import parallel, series
 from .lyapunov import compressed, controllability_factor, observability_factor
 from .modal import StableSplit, split_stable
 from .modal_map import obstacle
 from .norms import axis_peak, h2_norm, peak_gain
 from .statespace import StateSpace, System, as_statespace
-
-#: Hankel singular values below this fraction of the largest one count as zero
-RANK = 1e-14
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import FloatArray, between, positive
 from ..errors import ModelError
+from ..parallel import PIECE
 from ..tolerances import ROUNDING
 from .blocks_of_states import bilinear_matrices, trapezoidal
 from .statespace import StateSpace, System, as_statespace
@@ -86,10 +87,8 @@ def bilinear(sys: System, rate: float) -> StateSpace:
     return g.replace(A=A, B=B, C=C, D=D, dt=0.0, blocks=None)
 
 
-#: number of samples in a piece, whose arrays fit the cache; a multiple of any block size
-PIECE = 4096
 #: sizes of a block [samples]
-_SIZES = (1, 2, 4, 8, 16, 32, 64, 128)
+_SIZES = [2**k for k in range(8)]
 #: cost of an operation with a single vector, and of a call, relative to an operation in a matrix
 #: product
 ONE_VECTOR, CALL = 3.0, 3e4

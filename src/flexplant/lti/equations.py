@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError
-from ..tolerances import SPLIT, TINY, divisor
+from ..tolerances import MOST_STEPS, PRECISION, SPLIT, TINY, TYPED, divisor
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
@@ -90,17 +90,11 @@ def reciprocal(size: FloatArray) -> FloatArray:
 
 
 _Schur = tuple[ComplexArray, ComplexArray]
-#: number of doublings, 2^60 terms of a series; a slower decay counts as no decay
-DOUBLINGS = 60
-#: relative size of a term below rounding (2e-16), which ends the sum
-_LAST = 1e-17
 #: a doubled Riccati equation has converged: the next term would be the square of this
 _CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
 #: relative tolerances: eigenvalues of a Hamiltonian that lie, or may lie, on the imaginary axis; Q
 #: - S R^-1 S' that counts as zero
 _AXIS, _NEARLY, _CANCELLED = 1e-10, 1e-9, 1e-12
-#: largest residual of an equation with indefinite R: near the least gamma X grows without bound
-_OFF = 1e-6
 #: number of examined residuals, with a Newton correction between them, which squares the error
 _CORRECTIONS = 4
 
@@ -114,13 +108,13 @@ def relative(residual: FloatArray, *sizes: float) -> float:
 def doubled(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return the sum of ``A^k Q A'^k``, k = 0, 1, ..., by doubling."""
     X, A = Q, A.copy()
-    for _ in range(DOUBLINGS):
+    for _ in range(MOST_STEPS):
         step = A @ X @ A.T
         X = symmetrised(X + step)
         size, change = np.linalg.norm(X), np.linalg.norm(step)
         if not np.isfinite(size):
             break
-        if change <= _LAST * size:
+        if change <= PRECISION * size:
             return X
         A = A @ A
     raise SolverError(
@@ -185,7 +179,7 @@ def doubled_riccati(
     # fast test: converged when no variance grows by 1e-8; a barely stable closed loop may pass it,
     # so that the residual must be checked
     n = A.shape[0]
-    for k in range(1, DOUBLINGS + 1):
+    for k in range(1, MOST_STEPS + 1):
         inner = G @ H
         inner.flat[:: n + 1] += 1.0
         _, _, solution, info = la.lapack.dgesv(inner, np.concatenate([A, G], axis=1), 1, 1)
@@ -201,7 +195,7 @@ def doubled_riccati(
             return H, k
         if quick and np.all(step.diagonal() <= _CONVERGED_QUICKLY * H.diagonal()):
             return H, k
-    raise SolverError(f"no convergence in {DOUBLINGS} doublings: no stabilising solution.")
+    raise SolverError(f"no convergence in {MOST_STEPS} doublings: no stabilising solution.")
 
 
 class OnAxisError(Exception):
@@ -229,7 +223,7 @@ def stabilising(
         moved, bent = drift.T @ X, X @ spread @ X
         residual = moved + moved.T - bent + rest
         # relative to Q: where it cancels with S R^-1 S' the solution is zero except for rounding
-        if relative(residual, *(float(np.linalg.norm(term)) for term in (moved, bent, Q))) <= _OFF:
+        if relative(residual, *(float(np.linalg.norm(term)) for term in (moved, bent, Q))) <= TYPED:
             return X, np.asarray(-(BR @ X + SR))
         closed = (drift - spread @ X).T
         X = X + lyapunov(closed * d[:, None] / d, residual * d * d[:, None]) / d / d[:, None]

@@ -9,30 +9,24 @@ import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
-from ..tolerances import ROUNDING, SPLIT, TINY
+from ..tolerances import ROOT, ROUNDING, SPLIT, TINY, TYPED
 from .response_solvers import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
+#: number of log-spaced frequencies of a search for peaks, and of refinements of these
+POINTS, ROUNDS = 200, 6
 #: [rad] largest change of a phase between neighbours; a dip between them changes it by more
 TURN = 0.6
-#: ratio to the other channels of its row and column below which a channel counts as zero
-FLOOR = 1e-6
-#: damping ratio below which the response at the frequency of a pole is not computed
-UNDAMPED = 1e-12
-#: relative width of the narrowest interval to halve
-NARROWEST = 1e-8
 #: largest number of local maxima that are refined, and their least fraction of the highest one
 _PEAKS, _HIGH = 6, 0.5
 #: number of inner points of the halves of a bracket and of all of it; relative gain below which a
 #: maximum is found
 _ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
 _SIXTEENTHS = np.arange(1, 16) / 16.0
-#: relative accuracy of the frequencies of crossings, for margins with nine digits
-_ACCURATE = 1e-12
 #: grid around a resonance in units of its half-power half-width: for a drawn curve, and for a
 #: search that finds the maximum between points
-DRAWN = (0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0)
-SOUGHT = (0.0, 0.7, 2.0, 6.0)
+DRAWN = tuple(np.sinh(0.5 * np.arange(7)).tolist())
+SOUGHT = DRAWN[::2]
 
 
 def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) -> FloatArray:
@@ -89,7 +83,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
         if low < f < high and z < 0.3:
             # narrower ones are lines at any scale of a plot
             near = f * (1 + max(z, 1e-6) * around)
-            if z <= UNDAMPED:  # infinite there: the grid has a gap
+            if z <= ROUNDING:  # infinite there: the grid has a gap
                 near, undamped = np.delete(near, around.size // 2), [*undamped, f]
             freq.append(near)
     grid = np.unique(np.concatenate(freq))
@@ -111,7 +105,7 @@ def _halve_intervals(
     left, right = left[whole], right[whole]
     while left.size and grid.size < points:
         middle = 0.5 * (grid[left] + grid[right])
-        open_ = grid[right] - grid[left] > NARROWEST * middle
+        open_ = grid[right] - grid[left] > ROOT * middle
         left, right, middle = left[open_], right[open_], middle[open_]
         if not middle.size:
             break
@@ -130,7 +124,7 @@ def _log_channels(data: ComplexArray) -> ComplexArray:
     """Return log H (n_channel, n_freq), entries negligible in row and column flattened."""
     size = np.abs(data)
     scale = np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
-    floor = np.maximum(FLOOR * scale, TINY)
+    floor = np.maximum(TYPED * scale, TINY)
     shown = np.where(size > floor, data, floor)
     return np.asarray(np.log(shown).reshape(-1, data.shape[2]))
 
@@ -167,10 +161,15 @@ def resonance_grid(
     base = np.geomspace(low, high, points)
     swing = s.imag > 0
     centre, width = s.imag[swing] / (2 * np.pi), np.abs(s.real[swing]) / (2 * np.pi)
-    steps = np.concatenate([np.negative(around[:0:-1]), around])
+    steps = around_resonance(around)
     near = (centre[:, None] + width[:, None] * steps).ravel()
     grid = np.unique(np.concatenate([base, near]))
     return np.asarray(grid[(grid >= low) & (grid <= high)])
+
+
+def around_resonance(around: Sequence[float] = DRAWN) -> FloatArray:
+    """Return a grid on both sides of a resonance, in units of its half-power half-width."""
+    return np.concatenate([np.negative(around[:0:-1]), around])
 
 
 def local_maxima(values: FloatArray) -> IntArray:
@@ -274,7 +273,7 @@ def crossings(
         found[real] = find_root(
             find,
             (low[real], high[real]),
-            tolerances={"xatol": 0.0, "xrtol": _ACCURATE, "fatol": 0.0, "frtol": 0.0},
+            tolerances={"xatol": 0.0, "xrtol": ROUNDING, "fatol": 0.0, "frtol": 0.0},
         ).x
     return np.asarray(found)
 

@@ -10,10 +10,9 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
-from ..tolerances import divisor
+from ..tolerances import MOST_STEPS, RESIDUAL, SETTLED, divisor
 from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .equations import (
-    DOUBLINGS,
     accumulated,
     even_scale,
     lyapunov,
@@ -227,14 +226,10 @@ def _modal_gramian(
     return symmetrised(padded[np.ix_(keep, keep)])
 
 
-#: largest residual relative to the terms of the equation: rounding of some hundred states is 1e-13
-TOLERANCE = 1e-10
-
-
 def _check(residual: float, equation: str) -> None:
-    if not residual <= TOLERANCE:
+    if not residual <= RESIDUAL:
         raise SolverError(
-            f"{equation}: the residual is {residual:.1e} of its terms, more than {TOLERANCE:.0e}. "
+            f"{equation}: the residual is {residual:.1e} of its terms, more than {RESIDUAL:.0e}. "
             "A is too close to instability, or too badly conditioned, for double precision."
         )
 
@@ -304,10 +299,6 @@ def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
     return compressed(np.hstack([L.real, L.imag]))
 
 
-#: relative term of a standard deviation that ends the sum: later terms add its square to a variance
-_LAST_ROOT = 1e-9
-
-
 def square_root(X: FloatArray) -> FloatArray:
     """Return L with ``L L' = X``, which is positive semidefinite apart from rounding."""
     # by its eigenvectors, each row scaled to unit size before
@@ -320,12 +311,12 @@ def square_root(X: FloatArray) -> FloatArray:
 def stein_root(F: FloatArray, G: FloatArray) -> FloatArray:
     """Return L with ``L L'`` the sum of ``F^k G G' F'^k``, k = 0, 1, ..., by doubling."""
     L = G
-    for _ in range(DOUBLINGS):
+    for _ in range(MOST_STEPS):
         more = F @ L
         L = triangular(np.hstack([L, more]))
         if not np.isfinite(L).all():
             break
-        if np.all(np.linalg.norm(more, axis=1) <= _LAST_ROOT * np.linalg.norm(L, axis=1)):
+        if np.all(np.linalg.norm(more, axis=1) <= SETTLED * np.linalg.norm(L, axis=1)):
             return L
         F = F @ F
     raise SolverError("the sum of squares does not end: the filter is not strictly stable.")

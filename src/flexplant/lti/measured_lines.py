@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, between, complex_array
 from ..errors import ModelError, ShapeError
 from ..tolerances import ROUNDING, SAME, TINY
+from .frequency_sweep import around_resonance
 
 #: number of samples of a window that represents all lengths
 SAMPLES = 256
@@ -102,16 +103,11 @@ def _window_overlap(distance: FloatArray, window: Any, overlap: float) -> FloatA
     return np.asarray(power / own)
 
 
-#: relative change of a response between two lines below which it is a straight line
-_STRAIGHT = 1e-9
 #: relative third difference that counts as rounding, and distance assigned to the pole of such
 #: lines
 _ROUNDING, _FAR = 1e-14, 1e6
 #: number of neighbouring lines for a fit of a mode plus a straight line
 LINES = 4
-#: points that fill an interval: relative to its length, and around a resonance to its half-width
-_SHARES = (0.25, 0.5, 0.75)
-AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
 
 
 def between_lines(
@@ -143,12 +139,12 @@ def on_lines(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> Complex
 def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> FloatArray:
     """Return frequencies [Hz] in some intervals, dense where the circles through lines turn."""
     low, wide = lines[places], lines[places + 1] - lines[places]
-    found = [low + share * wide for share in _SHARES]
+    found = list(np.linspace(low, low + wide, LINES + 1)[1:-1])
     for first in (places - 1, places):
         first = np.clip(first, 0, lines.size - 3)
         c = _circle(lines, data, first)[1]
         pole = lines[first] - 1.0 / np.where(c == 0.0, TINY, c)
-        near = pole.real + np.abs(pole.imag) * AROUND[:, None]
+        near = pole.real + np.abs(pole.imag) * around_resonance()[:, None]
         found += list(np.clip(near, low + 0.01 * wide, low + 0.99 * wide))
     return np.unique(np.concatenate(found))
 
@@ -178,7 +174,7 @@ def _circle(
     g1, g2, g3 = (data[..., first + k] for k in range(3))
     slope, second = ((g - g1) / (lines[first + k] - lines[first]) for k, g in ((1, g2), (2, g3)))
     apart = g3 - g2
-    bent = np.abs(apart) > _STRAIGHT * (np.abs(g1) + np.abs(g2) + np.abs(g3))
+    bent = np.abs(apart) > SAME * (np.abs(g1) + np.abs(g2) + np.abs(g3))
     c = np.where(bent, (slope - second) / np.where(bent, apart, 1.0), 0.0)
     return slope + c * (g2 - g1), c
 
@@ -189,7 +185,7 @@ def _circle_values(
     a, c = _circle(lines, data, first)
     h = freq - lines[first]
     below = 1.0 + c * h
-    below = np.where(np.abs(below) > _STRAIGHT, below, _STRAIGHT)
+    below = np.where(np.abs(below) > SAME, below, SAME)
     return np.asarray(data[..., first] + a * h / below)
 
 
@@ -318,7 +314,7 @@ def _hidden_modes(
     )
     near = [middle + at.mean(axis=0) for at in (p, p + d)]
     through = np.concatenate(
-        [at[found].real + np.abs(at[found].imag) * AROUND[:, None] for at in near]
+        [at[found].real + np.abs(at[found].imag) * around_resonance()[:, None] for at in near]
     )
     through = through[(through > freq[0]) & (through < freq[-1])]
     return HiddenModes(

@@ -10,34 +10,20 @@ import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..arrays import ComplexArray, FloatArray, between
-from ..tolerances import TINY
+from ..tolerances import CLOSE, RANK, ROOT, SAME, SPLIT, TINY, TYPED
 from .blocks_of_states import block_matrix, is_block_diagonal, joined_blocks
 from .equations import reciprocal, state_scale
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
-from .modal_map import DOUBLE, eigenvalues_with_error
+from .modal_map import eigenvalues_with_error
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
-#: relative size of contributions and Hankel singular values below which they count as zero
-NOISE = 1e-13
-#: relative distance of poles below which they are judged together: of two copies of one mode a
-#: state is redundant, with a contribution of the square of their distance relative to their damping
-SAME = 1e-6
 #: largest meaningful condition numbers of a pole: for a double pole, then for any multiplicity
-DEFECTIVE = (DOUBLE, 1e12)
-#: condition number of the bases of modes above which modes are not judged separately
-LARGEST = 1e6
+DEFECTIVE = ((1.0 / ROOT), 1e12)
 #: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
 #: resonances and zeros
 BESIDE = 0.1
-#: the same, so close that every damped pole shows its full peak
-NEAR = 1e-9
-#: relative distance from the frequency of a mode at which the result is compared, since undamped
-#: modes are infinite at their frequency
-OFF = 0.01
-#: largest accepted relative change of a response: above rounding in bases of condition LARGEST
-AGREEMENT = 1e-6
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
@@ -115,7 +101,7 @@ def _pole_groups(g: StateSpace) -> list[_Group]:
         return _dense_groups(g)
     poles = g.poles()
     owner = np.repeat(np.arange(len(g.blocks or ())), g.blocks or ())
-    label = _labels(poles, SAME * np.abs(poles), owner[:, None] == owner)
+    label = _labels(poles, SPLIT * np.abs(poles), owner[:, None] == owner)
     plain = g.replace(D=0 * g.D)
     return [
         _Group(part_of(plain, label == k), _omega(poles[label == k], g.dt))
@@ -129,7 +115,7 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
     A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
     for largest in DEFECTIVE:
         poles, vectors, error = eigenvalues_with_error(A, largest)
-        same = SAME * np.abs(poles)
+        same = SPLIT * np.abs(poles)
         conjugate = np.abs(poles[:, None] - poles.conj()) <= same
         label = _labels(poles, np.maximum(same, error), conjugate)
         bases = _bases(A, poles, vectors, error, label)
@@ -137,7 +123,7 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
         units = np.linalg.norm(V, axis=1)  # units in which the signals of a cascade have equal size
         V = V / units[:, None]
         whole = V.shape == A.shape and bool(np.all(np.isfinite(V)))
-        apart = whole and float(np.linalg.cond(V)) <= LARGEST
+        apart = whole and float(np.linalg.cond(V)) <= 1.0 / SPLIT
         if apart:
             break
     centre = 1.0 if g.dt else 0.0
@@ -216,8 +202,8 @@ def _visible(groups: list[_Group], tol: float) -> list[_Group]:
     kept = []
     for group, w, end in zip(groups, omega, last, strict=True):
         unit = size[end - len(w) : end]
-        beside, near = (np.abs(_gains(group.part, w, off)) * unit for off in (BESIDE, NEAR))
-        if np.max(beside) > NOISE and np.max(near) > tol:
+        beside, near = (np.abs(_gains(group.part, w, off)) * unit for off in (BESIDE, SAME))
+        if np.max(beside) > RANK and np.max(near) > tol:
             kept.append(group)
     return kept
 
@@ -239,10 +225,10 @@ def _equalisers(gains: FloatArray) -> FloatArray:
 
 def _agree(found: StateSpace, g: StateSpace, omega: FloatArray) -> bool:
     """Return whether two systems have the same responses next to the frequencies of modes."""
-    omega = (1.0 - OFF) * omega
+    omega = (1.0 - CLOSE) * omega
     ours, wanted = (responses(s, omega / (2.0 * np.pi)).transpose(2, 0, 1) for s in (found, g))
     unit = _equalisers(np.abs(wanted))
-    return bool(np.max(np.abs(ours - wanted) * unit, initial=0.0) <= AGREEMENT)
+    return bool(np.max(np.abs(ours - wanted) * unit, initial=0.0) <= TYPED)
 
 
 def _less(g: StateSpace, tol: float) -> StateSpace:
@@ -262,7 +248,7 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
     seen = observability_factor(judged)
     left, values, right = np.linalg.svd(seen.T @ reached)
     d = state_scale(judged.A, judged.B, judged.C)[:, None]
-    rounding = NOISE * float(np.linalg.norm(seen * d) * np.linalg.norm(reached / d))
+    rounding = RANK * float(np.linalg.norm(seen * d) * np.linalg.norm(reached / d))
     r = int(np.sum(values > max(tol * values[0], rounding)))
     if r == n:
         return g

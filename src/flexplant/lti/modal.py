@@ -10,18 +10,11 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import SolverError, counted
 from ..store import Value
+from ..tolerances import NEGLIGIBLE, SAME, SPLIT
 from .blocks_of_states import block_eigenvalues, is_block_diagonal
 from .equations import state_scale
 from .modal_map import eigenvalues_with_error, uncertain_poles
 from .statespace import StateSpace, System, as_statespace
-
-#: speed of a rigid-body pair, relative to A, below which it counts as zero
-RIGID = 1e-6
-#: relative distance of two poles, and sine of the angle between their eigenvectors, below which
-#: they share a block: separately, each contribution would be a thousand times their sum
-_PARALLEL = 1e-3
-#: largest accepted distance of the transformed A from the blocks, relative to A
-RESIDUAL = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,7 +104,7 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
         return ModalForm(g, np.eye(n), condition, 0.0, reason)
     new = np.linalg.solve(V, A @ V)
     residual = float(np.linalg.norm(new - pairs) / np.linalg.norm(A))
-    if residual > RESIDUAL:
+    if residual > SAME:
         reason = f"dense form kept: the blocks leave {residual:.1e} of A out"
         return ModalForm(g, np.eye(n), condition, residual, reason)
     B = np.asarray(np.linalg.solve(V, g.B / d[:, None]), dtype=np.float64)
@@ -169,14 +162,14 @@ def _parallel(
     """Return the pole whose eigenvector is nearly parallel to that of pole k, or None."""
     # the other of two real poles, or the conjugate: a double one that rounding split
     others = values == values[k].conj() if values[k].imag else (values.imag == 0.0) & ~done
-    others &= np.abs(values - values[k]) < _PARALLEL * np.abs(values[k])
+    others &= np.abs(values - values[k]) < NEGLIGIBLE * np.abs(values[k])
     others[k] = False
     if not others.any():
         return None
     along = vectors[:, k].conj() @ vectors
     sine = np.linalg.norm(vectors - np.outer(vectors[:, k], along), axis=0)
     twin = int(np.argmin(np.where(others, sine, np.inf)))
-    return twin if sine[twin] < _PARALLEL else None
+    return twin if sine[twin] < NEGLIGIBLE else None
 
 
 def _invariant_plane(A: FloatArray, values: ComplexArray, two: list[int]) -> FloatArray:
@@ -200,7 +193,7 @@ def _chains(N: FloatArray, count: int) -> tuple[FloatArray, FloatArray] | None:
     left, speed, right = la.svd(inner)
     half = count // 2
     size = np.linalg.norm(N)
-    if speed[half - 1] < RIGID * size or np.max(speed[half:]) > RIGID * size:
+    if speed[half - 1] < SPLIT * size or np.max(speed[half:]) > SPLIT * size:
         return None  # simple poles at the centre, or chains of another length
     pairs = np.empty((N.shape[0], count))
     pairs[:, 0::2] = space @ left[:, :half]

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
+from ..tolerances import ROOT, SPLIT
 from .blocks_of_states import diagonal_blocks, is_block_diagonal
 from .equations import even_scale, state_scale
 from .statespace import StateSpace
@@ -123,16 +124,8 @@ def block_form(g: StateSpace) -> Diagonal | None:
     return Diagonal(own.poles, own.seen(C.reshape(-1, n)), own.driven(B.reshape(n, -1)))
 
 
-#: distance from the axis relative to the size of A below which the condition of a pole is examined
-NEAR = 1e-6
-
-
 #: number of roundings of A that a pole may contain
 ROUNDINGS = 4.0
-
-
-#: largest condition number of a pole: a double pole moves by the root of rounding
-DOUBLE = 1.0 / float(np.sqrt(np.finfo(float).eps))
 
 
 class Obstacle(NamedTuple):
@@ -185,17 +178,17 @@ def uncertain_poles(
     A = g.A * d / d[:, None]
     gap = np.abs(np.abs(poles) - 1.0 if g.dt else poles.real)
     size = float(np.linalg.norm(A))  # at least the norm, which costs more
-    if np.any(gap <= NEAR * size):
+    if np.any(gap <= SPLIT * size):
         size = float(np.linalg.norm(A, 2))
     error = np.finfo(float).eps * size * np.ones(poles.size)
-    if not np.any(gap <= NEAR * size):
+    if not np.any(gap <= SPLIT * size):
         return poles, error
     poles, _, error = eigenvalues_with_error(A)
     return poles, error
 
 
 def eigenvalues_with_error(
-    A: FloatArray, largest: float = DOUBLE
+    A: FloatArray, largest: float = 1.0 / ROOT
 ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return eigenvalues, eigenvectors and the uncertainty of each eigenvalue by rounding."""
     # in the units of LAPACK's balancing, in which blocks of different speed do not affect each

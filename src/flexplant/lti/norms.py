@@ -9,9 +9,10 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
+from ..tolerances import MISSED, MOST_STEPS, SAME, SETTLED
 from .blocks_of_states import bilinear_matrices, is_block_diagonal
 from .equations import axis_frequencies, state_scale
-from .frequency_sweep import SOUGHT, highest, largest_gains, resonance_grid
+from .frequency_sweep import POINTS, ROUNDS, SOUGHT, highest, largest_gains, resonance_grid
 from .lyapunov import (
     controllability_factor,
     controllability_gramian,
@@ -22,11 +23,6 @@ from .modal_map import obstacle
 from .peaks import Residues, proved_peak, residues
 from .response_solvers import points, responder
 from .statespace import StateSpace, System, as_statespace
-
-#: the norm lies between the gain found and (1 + TOLERANCE) times it
-TOLERANCE = 1e-9
-#: the gain from residues and that of the system at the peak agree to this
-AGREEMENT = 1e-9
 
 
 def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
@@ -107,7 +103,7 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
     >>> round(gain, 3), round(freq, 4)  # 1 / (2 zeta sqrt(1 - zeta^2)), near 1 / (2 pi) Hz
     (50.003, 0.1591)
     """
-    with Progress(LEVELS, "levels of the norm", progress=progress) as bar:
+    with Progress(MOST_STEPS, "levels of the norm", progress=progress) as bar:
         return _peak_gain(as_statespace(sys), bar)
 
 
@@ -155,20 +151,20 @@ def _peak_gain(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[f
     problem = obstacle(g, axis_only=axis_only, known=poles)
     if problem:
         return float("inf"), problem.freq
-    return _proved(g, model) or level_set_peak(g, TOLERANCE, bar)
+    return _proved(g, model) or level_set_peak(g, SETTLED, bar)
 
 
 def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None:
     """Return the peak proved from residues, None without a proof."""
     if model is None or not model.poles.size:
         return None
-    found = proved_peak(model, TOLERANCE)
+    found = proved_peak(model, SETTLED)
     if found is None:
         return None
     omega = found[1]
     freq = float(np.arctan(omega) / (np.pi * g.dt) if g.dt else omega / (2.0 * np.pi))
     gain = _gain_at(g, freq)
-    return (gain, freq) if abs(found[0] - gain) <= AGREEMENT * gain else None
+    return (gain, freq) if abs(found[0] - gain) <= SAME * gain else None
 
 
 def _gain_at(g: StateSpace, freq: float) -> float:
@@ -256,13 +252,6 @@ def _trace_of_factor(C: FloatArray, L: FloatArray) -> tuple[float, float]:
     return float(np.sum((C @ L) ** 2)), float(np.sum(deviation**2))
 
 
-LEVELS = 30  # each step squares the error, so that more steps mean rounding
-#: relative distance of a level above the gain of the feedthrough at which rounding does not matter
-CLEAR = 1e-7
-#: tolerance of the sweep before the level sets, which decide
-_POINTS, _ROUNDS = 200, 6
-
-
 def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[float, float]:
     """Return the largest gain and its frequency [Hz] of a system without poles on the axis."""
     # from the midpoints between crossings of its level, until no crossing remains at (1 +
@@ -277,11 +266,11 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
     if not gain:
         return 0.0, 0.0
     level = _Level(g)
-    for _ in range(LEVELS):
+    for _ in range(MOST_STEPS):
         bar.advance()
         # just above the feedthrough the Hamiltonian matrix is nearly singular: a level more
-        close = gain <= (1 + CLEAR) * level.through
-        levels = (tolerance, CLEAR) if close else (tolerance,)
+        close = gain <= (1 + MISSED) * level.through
+        levels = (tolerance, MISSED) if close else (tolerance,)
         found = [level.crossings(gain * (1 + one)) for one in levels]
         middles = np.concatenate([one for c in found for one in (c, 0.5 * (c[1:] + c[:-1]))])
         middles = middles[middles < top]
@@ -291,8 +280,8 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
         best = int(np.argmax(sizes))
         gain, freq = float(sizes[best]), float(middles[best])
     raise SolverError(
-        f"the level set of the H-infinity norm of {g!r} did not converge in {LEVELS} levels (last "
-        f"gain {gain:.9g} at {freq:.6g} Hz). Report this system."
+        f"the level set of the H-infinity norm of {g!r} did not converge in {MOST_STEPS} "
+        f"levels (last gain {gain:.9g} at {freq:.6g} Hz). Report this system."
     )
 
 
@@ -300,9 +289,9 @@ def _swept_peak(
     g: StateSpace, find: Callable[[FloatArray], FloatArray], top: float
 ) -> tuple[float, float]:
     """Return the largest gain of a sweep, including the feedthrough, and its frequency [Hz]."""
-    grid = np.append(0.0, resonance_grid(g.poles(), g.dt, points=_POINTS, around=SOUGHT))
+    grid = np.append(0.0, resonance_grid(g.poles(), g.dt, points=POINTS, around=SOUGHT))
     through = np.linalg.norm(g.evaluated(-1.0) if g.dt else g.D, 2)
-    return max((float(through), top), highest(find, grid, _ROUNDS))
+    return max((float(through), top), highest(find, grid, ROUNDS))
 
 
 class _Level:

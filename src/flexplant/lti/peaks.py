@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray
-from ..tolerances import divisor
+from ..arrays import CACHED, ComplexArray, FloatArray
+from ..tolerances import TINY, TYPED, divisor
 from .modal_map import block_form, diagonal_form
 from .statespace import StateSpace
 
@@ -19,17 +19,10 @@ STEPS, SETTLED = 12, 1e-5
 #: radius of an interval, relative to the distance to the poles, below which its series is used
 NEAR = 0.6
 #: points from -1 to 1 at which an interval is divided otherwise: finer towards its ends
-CUTS = np.array([-1.0, -0.9, -0.4, 0.4, 0.9, 1.0])
+CUTS = -np.cos(np.linspace(0.0, np.pi, 6))
 MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
-#: relative distance from the gain of the feedthrough below which levels are not examined
-CLEAR = 1e-6
-#: number of entries of the largest arrays: intervals times poles or channels
-CHUNK = 1_000_000
-#: relative distance from the largest eigenvalue below which eigenvalues are treated together with
-#: it
-TOGETHER = 1e-6
 #: radii tried around a peak, in distances to the nearest pole
-ZONES = np.array([0.4, 0.3, 0.2, 0.1, 0.03, 0.01])
+ZONES = np.geomspace(0.4, 0.01, 6)
 
 
 class Peaks(NamedTuple):
@@ -73,7 +66,7 @@ class _Expansion(NamedTuple):
     @property
     def together(self) -> npt.NDArray[np.bool_]:
         """Which eigenvalues (n_omega, m) count as the largest one: modes may be repeated."""
-        return np.asarray(self.values >= (1.0 - TOGETHER) * self.values[:, :1])
+        return np.asarray(self.values >= (1.0 - TYPED) * self.values[:, :1])
 
     @property
     def slope(self) -> FloatArray:
@@ -152,11 +145,11 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     """Return frequencies at which the gain is above a level, empty when proven not to exist."""
     # None: undecided after as much work as an eigenvalue problem
     through = float(np.linalg.norm(model.through, 2))
-    if not level > through * (1.0 + CLEAR):
+    if not level > through * (1.0 + TYPED):
         return None
     centre, radius = _intervals_left(model, level - through, peaks)
     left = 100 + model.poles.size**2 // 10
-    step = max(1, CHUNK // max(model.poles.size, model.through.size))
+    step = max(1, CACHED // max(model.poles.size, model.through.size))
     while centre.size:
         later, wide = centre[step:], radius[step:]
         centre, radius = centre[:step], radius[:step]
@@ -232,8 +225,6 @@ def _largest(X: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
 
 
-#: smallest distance, whose inverse cube does not overflow
-NONE = 1e-100
 #: largest number of entries of all residues that are formed
 LARGEST = 5_000_000
 
@@ -290,7 +281,7 @@ class Residues(NamedTuple):
         """
         total = np.zeros(omega.size)
         for apart in self.apart(omega):
-            free = np.maximum(apart - radius, NONE)
+            free = np.maximum(apart - radius, np.cbrt(TINY))
             for _ in range(order + 1):
                 free *= apart
             total += self.sizes @ (1.0 / free)

@@ -9,16 +9,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import CACHED, COLUMNS, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from ..parallel import one_thread
+from ..parallel import PIECE, one_thread
 from .blocks_of_states import diagonal_blocks, uncoupled_run
 from .equations import scaled_schur
 from .modal_map import diagonal_form
 from .statespace import StateSpace
 
-#: number of complex numbers in less than 128 kB
-SMALL = 7000
 #: attribute with the prepared function of a system, which is often swept several times
 _KEPT = "_responder"
 
@@ -49,7 +47,7 @@ def _responder(g: Part, D: FloatArray) -> Responder:
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s, tame = points(g, freq), True
-        step = max(1, min(entries // n, max(SMALL // n, freq.size // parts)))
+        step = max(1, min(entries // n, max(PIECE // n, freq.size // parts)))
         out = np.empty((*D.shape, freq.size), dtype=np.complex128)
         out[:] = D[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -120,7 +118,7 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
         return _modal(g), *sizes
     if 2 * (end - first) < n:
         return dense_solver(g)
-    return _among_others(g, first, end, blocks), CHUNK // (m + 2), PARTS
+    return _among_others(g, first, end, blocks), CACHED // (m + 2), PARTS
 
 
 def _modal(g: Part) -> Solver:
@@ -217,12 +215,8 @@ def _among_others(g: Part, first: int, end: int, blocks: Sequence[int]) -> Solve
     return add
 
 
-#: entries of the largest intermediate array of a back substitution (complex): it stays in cache
-CHUNK = 400_000
 #: number of frequencies together, and least parts of a grid, where poles are known
 MODAL_CHUNK, PARTS = 19_200, 7
-#: rows of a back substitution that are solved together
-ROWS = 32
 
 #: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument, and says whether it is finite for
 #: certain: large arrays are not read again
@@ -264,7 +258,7 @@ def dense_solver(g: Part) -> tuple[Solver, int, int]:
         if any(C.size * B.size for C, B in zip(Cs, Bs, strict=True)):
             gains = _by_poles(A, Bs, Cs)
             if gains is None:
-                gains, sizes = _schur_gains(A, Bs, Cs), (CHUNK // (g.B.shape[1] + 2), 1)
+                gains, sizes = _schur_gains(A, Bs, Cs), (CACHED // (g.B.shape[1] + 2), 1)
             solvers.append((gains, list(zip(seen, fed, strict=True))))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
@@ -319,8 +313,8 @@ def _schur_gains(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _
 
     def gains(s: ComplexArray) -> list[ComplexArray]:
         X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()
-        for end in range(n, 0, -ROWS):  # rows below a block go into it by one matrix product
-            block = slice(max(end - ROWS, 0), end)
+        for end in range(n, 0, -COLUMNS):  # rows below a block go into it by one matrix product
+            block = slice(max(end - COLUMNS, 0), end)
             X[block] += (T[block, end:] @ X[end:].reshape(n - end, m * s.size)).reshape(
                 -1, m, s.size
             )

@@ -22,7 +22,7 @@ from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..store import Value
-from ..tolerances import RANK, SPLIT, divisor
+from ..tolerances import MOST_STEPS, RANK, SPLIT, divisor
 from .equations import (
     OnAxisError,
     accumulated,
@@ -509,8 +509,6 @@ def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
 _SETTLED_ROOT, _STALLED = 1e-9, 3e-4
 #: number of consecutive steps that need not halve the least change, before quadratic convergence
 _STALLS = 6
-#: largest number of Newton steps: from a start with 1e8 times the noise 20 were needed
-STEPS = 60
 #: range of added sensor noise in decades, relative to the motion in a sample and to their own
 #: noise: from rounding to a factor of a million
 DECADES = (-16, 7)
@@ -573,7 +571,7 @@ def _newton_in_roots(
 ) -> RiccatiRoot:
     """Improve a stable gain: compute its error, then the best gain for this error [Hewer1971]_."""
     last, least, stalls = np.zeros(A.shape[0]), np.inf, 0
-    for taken in range(1, STEPS + 1):
+    for taken in range(1, MOST_STEPS + 1):
         closed = A - K @ C
         if np.max(np.abs(la.eigvals(closed)), initial=0.0) >= 1.0:
             raise SolverError("no strictly stable filter was found in square roots either.")
@@ -586,6 +584,6 @@ def _newton_in_roots(
             return RiccatiRoot(L, K, X, change, taken)
         last, least = size, min(least, change)
     raise SolverError(
-        f"the filter did not converge in {STEPS} steps of Newton in square roots: a standard "
+        f"the filter did not converge in {MOST_STEPS} steps of Newton in square roots: a standard "
         f"deviation still changes by {change:.1e} of it."
     )

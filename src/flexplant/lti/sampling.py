@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, ModelError, warn
-from ..tolerances import SAME, TINY, divisor
+from ..tolerances import CLOSE, SAME, TINY, divisor
 from ..words import check_names
 from .blocks_of_states import block_diagonal, block_eigenvalues, diagonal_blocks, uncoupled_run
 from .equations import state_scale
@@ -464,10 +464,6 @@ def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     return np.asarray(even[:, None, None] * np.eye(2) + odd[:, None, None] * N)
 
 
-#: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
-_NODES = 10
-
-
 def accumulated_noise(
     at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
 ) -> FloatArray:
@@ -482,9 +478,9 @@ def accumulated_noise(
     # the error is a Bessel function of order 2 count and argument |A| time, which is negligible
     # beyond
     size = min(rate * time, 2.0 * n)
-    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
+    count, doublings = _TERMS + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
     if count * m >= n:
-        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
+        count, doublings = _TERMS, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
     parts = [
@@ -497,18 +493,16 @@ def accumulated_noise(
     return G
 
 
-#: delay in samples below which it has no effect and is probably given in seconds
-_NO_DELAY = 0.01
 #: longest delay in samples of a loop or a port: each sample is a state of each channel
 _LONGEST = 1000.0
 #: largest damping ratio of a mode; poles with more damping are filters
-_LIGHT = 0.3
+LIGHT = 0.3
 
 
 def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
     """Check a sampling rate [Hz] and a delay [samples]; warn of a probably wrong unit."""
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
-    if 0 < delay < _NO_DELAY:
+    if 0 < delay < CLOSE:  # samples
         warn(
             f"delay={delay:g} is in samples, {delay / rate:.3g} s, and has almost no effect. If "
             f"{delay:g} s is meant, pass delay={delay * rate:.4g} at {rate:g} Hz."
@@ -542,4 +536,4 @@ def _check_length(what: str, samples: float, rate: float) -> None:
 def light_modes(poles: ComplexArray) -> FloatArray:
     """Return the frequencies [Hz] of the lightly damped pairs among continuous poles [rad/s]."""
     size = np.abs(poles)
-    return np.asarray(size[(poles.imag > 0) & (-poles.real < _LIGHT * size)] / (2.0 * np.pi))
+    return np.asarray(size[(poles.imag > 0) & (-poles.real < LIGHT * size)] / (2.0 * np.pi))

@@ -8,18 +8,8 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray
-from ..tolerances import SPLIT, divisor
+from ..tolerances import NULL, SAME, SPLIT, divisor
 from .equations import mean_speed, reciprocal, state_scale
-
-#: distance of a zero from the stability limit, relative to its size, below which it is tested on
-#: the limit
-_ON_AXIS = 1e-6
-
-#: smallest singular value of the scaled system matrix, at which its rank is lost
-_LOST = 1e-9
-
-#: singular values below this, relative to the scaled system matrix, are rounding
-_ROUNDING = 1e-11
 
 
 def invariant_zeros(g: Any) -> ComplexArray:
@@ -41,7 +31,7 @@ def invariant_zeros(g: Any) -> ComplexArray:
     # columns that [C D] does not see: the pencil [A - s I, B] on them is square
     unseen = la.qr(np.hstack([C, D]).T)[0][:, -n:]
     alpha, beta = la.eigvals(np.hstack([A, B]) @ unseen, unseen[:n], homogeneous_eigvals=True)
-    finite = np.abs(beta) > _ROUNDING * np.abs(alpha)
+    finite = np.abs(beta) > NULL * np.abs(alpha)
     return np.asarray(alpha[finite] / beta[finite] * _pole_size(g), dtype=np.complex128)
 
 
@@ -49,7 +39,7 @@ def _full_rank_part(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return a system of the same finite zeros whose D has full row rank."""
-    limit = _ROUNDING * float(np.linalg.norm(np.block([[A, B], [C, D]])))
+    limit = NULL * float(np.linalg.norm(np.block([[A, B], [C, D]])))
     while True:
         turn, rank = _row_space(D, limit)
         C, D = turn.T @ C, turn.T @ D
@@ -93,7 +83,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     zeros = alpha[finite] / beta[finite]
     size = np.maximum(np.abs(zeros), 0.1)  # double zeros at 0 have the size of the root of rounding
     off = np.abs(np.abs(zeros) - 1) if g.dt else np.abs(zeros.real) / size
-    near = zeros[(off < _ON_AXIS) & (zeros.imag >= 0)]
+    near = zeros[(off < SPLIT) & (zeros.imag >= 0)]
     on = near / np.abs(near) if g.dt else 1j * near.imag
     # several zeros at zero frequency have errors of a root of rounding, so that zero is always
     # tested
@@ -105,7 +95,7 @@ def axis_zeros(g: Any) -> ComplexArray:
             continue
         whole = np.block([[A - zero * np.eye(n), B], [C, D]])
         columns = np.linalg.norm(whole, axis=0)
-        if np.linalg.svd(whole / divisor(columns), compute_uv=False)[-1] < _LOST:
+        if np.linalg.svd(whole / divisor(columns), compute_uv=False)[-1] < SAME:
             found.append(complex(zero))
     return np.array(found, dtype=np.complex128) * speed
 

@@ -12,12 +12,11 @@ import scipy.sparse as sp
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError
-from ..lti.frequency_sweep import FLOOR
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
-from ..tolerances import NULL, SAME, SPLIT, TINY, divisor
+from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SPLIT, TINY, TYPED, divisor
 from .modes import Modes
 from .solve import damper_forces
 from .statics import StiffnessFactor, dissection_of, held_factor, static_response
@@ -32,9 +31,6 @@ _UNDAMPED = SAME
 _CHUNK, _ENTRIES = 256, 4_000_000
 #: relative change of a direct solution by its last refinement: wanted, and largest accepted
 _SETTLED, _UNSETTLED = 1e-9, 1e-6
-#: number of corrections of a basis before giving up; each reduces the error to a seventh or less
-#: when the basis holds all modes up to 1.5 times the frequency
-_CORRECTIONS = 5
 #: fraction of the remaining loads (root of their energy) that may remain after a correction; the
 #: error of a Galerkin response is its square. Relative to the loads themselves where the remainder
 #: is rounding
@@ -162,7 +158,7 @@ class DynamicBasis:
         inner, basis, first = self._inertia[:, :n], self, np.zeros(0)
         forces = self.V[:, self.n_rigid :].T @ loads
         energy = np.sum(forces**2 / np.abs(self.squares[self.n_rigid :, None]), axis=0)
-        for _ in range(_CORRECTIONS):
+        for _ in range(MOST_STEPS):
             left = basis._left(freq, loads)
             parts = np.hstack([left.real, left.imag])
             moved = factor.solve(parts)
@@ -340,10 +336,6 @@ def _dense_complex(matrix: Any) -> ComplexArray:
 SILENT = SAME
 #: relative distance from a resonance that is still within its peak
 _BESIDE = SPLIT
-#: largest error relative to the response at a frequency, also at antiresonances
-_THERE = 1e-2
-#: fraction of the peak that is the lower limit of the response at an antiresonance
-_DEEPEST = 1e-7
 #: number of rounds in which direct solutions extend a basis that is not accurate enough
 _ROUNDS = 3
 #: number of grid frequencies that bracket antiresonances, over the band and between two resonances
@@ -365,7 +357,7 @@ class DirectCheck:
 
     def holds(self, tolerance: float) -> bool:
         """Return whether errors are within `tolerance` of the peak, and 1 % of the response."""
-        return self.worst <= tolerance and bool(np.all(self.there <= _THERE))
+        return self.worst <= tolerance and bool(np.all(self.there <= CLOSE))
 
     def __str__(self) -> str:
         if not self.freq.size:
@@ -435,12 +427,12 @@ def _direct_check(
     # `own`: geometric means of the responses of both places to their own forces, to which a
     # channel that is rounding of other directions is compared
     peak, own = np.maximum(np.abs(whole).max(axis=0), np.abs(wanted).max(axis=0)), own.max(axis=0)
-    floor = FLOOR * np.sqrt(np.outer(peak.max(axis=1), peak.max(axis=0)))
+    floor = TYPED * np.sqrt(np.outer(peak.max(axis=1), peak.max(axis=0)))
     floor = np.where(peak <= SILENT * own, own, floor)
     absent, peak = peak <= floor, np.maximum(peak, floor)
     peak[peak == 0] = 1.0
     gap = np.abs(found - wanted)
-    there = np.where(absent, peak, np.maximum(np.abs(wanted), _DEEPEST * peak))
+    there = np.where(absent, peak, np.maximum(np.abs(wanted), MISSED * peak))
     return DirectCheck(at, (gap / peak).max(axis=(1, 2)), (gap / there).max(axis=(1, 2)))
 
 

@@ -10,17 +10,14 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
-from ..tolerances import ROUNDING, SAME, TINY, divisor
+from ..tolerances import NEGLIGIBLE, ROUNDING, SAME, TINY, divisor
 
 #: shapes below this, relative to the largest one of their span, are rounding and count as zero
 _NONE = SAME
-#: modes with a smaller relative distance are compared as one subspace, since any change mixes their
-#: shapes
-CLUSTER = 1e-3
 #: MAC above which two modes count as the same
 PARTNER = 0.5
-#: relative size of a shape below which it counts as unknown: all places lie at nodes of the mode
-_SEEN = 1e-3
+#: relative distance of frequencies within which two modes may be the same one
+NEAR = 0.15
 #: MAC above which two modes of one model cannot be distinguished by their shapes
 ALIKE = 0.9
 #: weight of a frequency ratio of e relative to the MAC; frequency decides where shapes are alike
@@ -88,7 +85,7 @@ def pair_modes(
     size, other_size = np.real(np.diag(gram)), np.real(np.diag(other_gram))
     alike = np.abs(cross) ** 2 / np.outer(size, other_size)
     first = np.arange(min(n_rigid, freq.size))
-    spans = [first] + [n_rigid + run for run in runs(freq[n_rigid:], CLUSTER)]
+    spans = [first] + [n_rigid + run for run in runs(freq[n_rigid:], NEGLIGIBLE)]
     score = alike.copy()
     for members in spans:
         if members.size > 1:
@@ -156,13 +153,13 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     # principal angle). Two repeated modes have 1 where their known shapes are nearly dependent,
     # else 0. A mode that has a node at all places is similar to no other mode
     order = np.argsort(freq, kind="stable")
-    spans = [order[run] for run in runs(freq[order], CLUSTER)]
+    spans = [order[run] for run in runs(freq[order], NEGLIGIBLE)]
     alike = np.eye(freq.size)
     largest = np.linalg.norm(shapes, axis=0).max(initial=0.0)
     bases = []
     for span in spans:
         basis, sizes, _ = np.linalg.svd(shapes[:, span], full_matrices=False)
-        bases.append(basis[:, sizes > _SEEN * largest])
+        bases.append(basis[:, sizes > NEGLIGIBLE * largest])
         # two unit shapes at the angle a have singular values whose squares are 1 +- cos a
         together = sizes[-1] ** 2 * (1 + ALIKE**0.5) < sizes[0] ** 2 * (1 - ALIKE**0.5)
         if span.size > 1 and (together or sizes.size < span.size):

@@ -24,13 +24,13 @@ from ..labels import DofSet, Place
 from ..store import Value, checked
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
-from ..tolerances import SAME
+from ..tolerances import FOUR_DIGITS, MOST_STEPS, RESIDUAL, SAME
 from ..words import instance
 from .matching import pair_modes
 from .normal_forms import pole_pairs
 
 #: largest number of places at which shapes of two meshes are compared
-_PLACES = 300
+PLACES = 300
 #: least ratio of element sizes: from closer sizes the limit cannot be extrapolated
 _RATIO = 1.2
 
@@ -132,15 +132,9 @@ def _at_common_places(coarse: Any, finer: Any) -> tuple[FloatArray, FloatArray]:
     """Return the shapes (p, k) of both at DOFs of the coarse mesh, along x, y and z."""
     dofs = coarse.dofs
     moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
-    chosen = np.array(moves)[:: max(len(moves) // _PLACES, 1)]
+    chosen = np.array(moves)[:: max(len(moves) // PLACES, 1)]
     rows = np.array([finer.dofs.row(dofs.xyz[i], dofs.directions[i]) for i in chosen])
     return np.real(coarse.phi[chosen]), rows @ np.real(finer.phi)
-
-
-#: relative distance from the measured poles at which the search ends, and largest number of steps.
-#: When damping couples modes by a fraction c of the distance between poles, a step multiplies the
-#: error by c
-_REACHED, _STEPS = 1e-10, 50
 
 
 def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]:
@@ -180,9 +174,9 @@ def calibrated_matrices(
     square, rate = np.diag(stiff).copy(), np.diag(damp).copy()
     square[:n_rigid] = 0.0  # exactly zero, without the rounding of K
     square[places], rate[places] = np.abs(poles) ** 2, -2.0 * poles.real
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):  # coupling by a fraction c leaves c times the error
         now = _poles_near(square, rate, damp, poles)
-        if np.all(np.abs(now - poles) <= _REACHED * np.abs(poles)):
+        if np.all(np.abs(now - poles) <= RESIDUAL * np.abs(poles)):
             moved = M @ phi[:, places]
             change_k = (moved * (square - np.diag(stiff))[places]) @ moved.T
             change_d = (moved * (rate - np.diag(damp))[places]) @ moved.T
@@ -207,8 +201,6 @@ def _poles_near(
     return np.asarray(found[np.argmin(np.abs(found[:, None] - wanted), axis=0)])
 
 
-#: relative change of a frequency by the rounding of K above which the text shows it
-_SOFT = 1e-4
 #: relative singular value of complex shapes below which it counts as zero
 _TRUNCATED = SAME
 
@@ -350,7 +342,7 @@ class Modes(Placed, Value):
         more = ", ..." if self.n_vectors > 4 else ""
         extra = f", vectors at {', '.join(self.vector_dofs[:4])}{more}" if self.n_vectors else ""
         checked = ""
-        soft = self.rounding > _SOFT
+        soft = self.rounding > FOUR_DIGITS
         if "counted" in self.certificate:
             # relative to the elastic forces, which are themselves rounding in soft modes
             residual = self.residual[~soft] if soft.size == self.residual.size else self.residual

@@ -15,13 +15,11 @@ from ..errors import ModelError, SolverError, counted
 from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value
 from ..structure.definite import elastic_modes, signed_square
-from ..tolerances import SAME, divisor
+from ..tolerances import CLOSE, FOUR_DIGITS, MISSED, RESIDUAL, SAME, divisor
 from .matching import runs
 
 #: coupling of modes by D, relative to the largest modal damping, below which it counts as zero
 PROPORTIONAL = SAME
-#: largest accepted damping rate of a rigid-body motion, relative to the first elastic frequency
-RIGID_DRAG = 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -224,7 +222,7 @@ class RealForm(NamedTuple):
     @property
     def drags(self) -> bool:
         """Whether D damps rigid-body motion more than the convention lets pass."""
-        return bool(self.drag > RIGID_DRAG * _first_frequency(self.omega))
+        return bool(self.drag > FOUR_DIGITS * _first_frequency(self.omega))
 
     @property
     def drag(self) -> float:
@@ -268,9 +266,9 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     if not rigid.shape[1] or not omega.size:
         return
     drag, first = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max()), _first_frequency(omega)
-    if drag > RIGID_DRAG * first:
+    if drag > FOUR_DIGITS * first:
         raise ModelError(
-            f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
+            f"D damps rigid-body motion at {drag:.3g} 1/s, more than {FOUR_DIGITS:g} of the first "
             f"elastic frequency ({first:.4g} rad/s): dampers to ground, between bodies that no "
             "spring joins, and between places that a rigid rotation moves apart leave no modes at "
             f"0. {PLANT} Else let the damper act along the line between its ends, or close it as a "
@@ -294,14 +292,6 @@ def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, Compl
     return first.astype(np.complex128), second.astype(np.complex128)
 
 
-#: eigenvalues closer than this (relative) have no separate eigenvectors
-_CLUSTER = 1e-7
-#: largest relative residual of modes
-_RESIDUAL = 1e-10
-#: fraction of the damping whose rounding counts in that residual
-_ROUNDED = 1e-4
-#: mixing of shapes by rounding that one Newton step removes
-_MIXED = 1e-2
 #: advice for damping that modes cannot express
 PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
@@ -338,13 +328,13 @@ def _complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> N
     # what x^T (2 lambda + C) x is made: s1 - s2, s2 - s1 and 2 i Im(lambda)
     apart = poles[:u].real - poles[u : 2 * u].real
     scale = np.concatenate([apart, -apart, 2j * poles[2 * u :].imag])
-    for cluster in runs(poles, _CLUSTER):
+    for cluster in runs(poles, MISSED):
         mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
     mix = _polished(poles, mix, C, scale)
     worst = float(_relative_residual(poles, mix, omega, C).max(initial=0.0))
-    if not worst < _RESIDUAL:
+    if not worst < RESIDUAL:
         raise SolverError(
-            f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL:g}): the "
+            f"complex modes leave a relative residual of {worst:.2g} (limit {RESIDUAL:g}): the "
             f"damping is close to critical for two modes at once. {PLANT} Else change D, or lower "
             "it."
         )
@@ -397,7 +387,7 @@ def _relative_residual(
     """Return the relative residual (k,) of modes."""
     rest = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
     # the rounding of stronger damping counts as well
-    rate = np.abs(omega).max(initial=0.0) + _ROUNDED * np.abs(C).max(initial=0.0)
+    rate = np.abs(omega).max(initial=0.0) + FOUR_DIGITS * np.abs(C).max(initial=0.0)
     size = np.linalg.norm(mix, axis=0) * np.abs(poles) * rate
     return np.asarray(np.linalg.norm(rest, axis=0) / size)
 
@@ -431,6 +421,6 @@ def _polished(
     unit = mix / root
     gram = (unit.T @ unit) * np.add.outer(poles, poles) + unit.T @ (C @ unit)
     off = gram - np.eye(poles.size)
-    if not np.abs(off).max() < _MIXED:
+    if not np.abs(off).max() < CLOSE:
         return mix
     return np.asarray((unit - 0.5 * unit @ off) * root)

@@ -30,7 +30,7 @@ from ..sparse.symmetric import (
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROUNDING, TINY, divisor
 from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
@@ -334,8 +334,6 @@ def _coupled_modes(
 _ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
 _RESIDUAL = (1e-8, 1e-12)
-#: fraction of the largest entry of a shape that counts in the rounding of every entry
-_ENTRY = 1e-3
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -389,7 +387,7 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
         rounding[at] = _EPS * np.einsum("ij,ij->j", moved, whole)
         # an entry of a shape has the rounding error of the largest entries, which stiff springs
         # multiply
-        whole += rows * (_ENTRY * moved.max(axis=0))
+        whole += rows * (NEGLIGIBLE * moved.max(axis=0))
         limit[at] = _RESIDUAL[0] * _lengths(mass, weight) * omega[at] ** 2
         limit[at] += _RESIDUAL[1] * _lengths(whole, weight)
         scale = np.where(elastic[at], _lengths(force), np.inf)
@@ -414,10 +412,6 @@ def rigid_residual(model: FEModel) -> float:
     return float(np.max(np.linalg.norm(K @ R, axis=0) / divisor(whole)))
 
 
-#: steps after which no further progress is expected
-_STEPS = 30
-#: fraction of a correction outside of the basis below which it counts as zero
-_NEW = 1e-7
 #: additional undamped modes as a fraction and at least; and factor on the end of a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
@@ -437,7 +431,7 @@ def damped_modes(
     # residuals are as small as those allowed for undamped modes [Sleijpen1996]_
     factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
     V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         form, keep = _ritz(model, V, r, count, top)
         shapes: Any = V @ form.phi[:, keep]
         slow = np.abs(form.overdamped) <= _range(form.poles[keep], top)
@@ -463,7 +457,7 @@ def damped_modes(
                 top,
             )
         step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
-        more = beyond(by_rows(model.M), V, step, dependent=_NEW)
+        more = beyond(by_rows(model.M), V, step, dependent=MISSED)
         if not more.shape[1]:
             break
         V = np.hstack([V, more])
@@ -524,7 +518,7 @@ def _rest(
     size = np.linalg.norm(weight * rest, axis=0)
     # an entry of a shape has the rounding error of the largest entries, as in undamped modes
     moved = np.abs(x)
-    moved = moved + _ENTRY * moved.max(axis=0)
+    moved = moved + NEGLIGIBLE * moved.max(axis=0)
     whole = Absolute(K) @ moved + np.abs(poles) * (Absolute(D) @ moved)
     limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
     # real poles are not returned: their approximate place suffices

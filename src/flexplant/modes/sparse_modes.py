@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray, Matrix
+from ..arrays import COLUMNS, FloatArray, IntArray, Matrix
 from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
 from ..seeds import Rng
-from ..sparse.lowest import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
+from ..sparse.factor import LARGEST_FULL
+from ..sparse.lowest import BLOCK, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid, check_stiffness
 from ..structure.model import FEModel
-from ..tolerances import NULL
+from ..tolerances import MOST_STEPS, NULL, PRECISION, ROOT
 from .statics import (
     CountingFactor,
     StiffnessFactor,
@@ -33,14 +34,10 @@ from .statics import (
 #: number of modes above the last wanted one among which a gap is searched
 _EXTRA = 4
 #: relative distance of omega^2, and distance in roundings, below which values form one group
-_GAP, _GAP_ROUNDINGS = SAME, 4.0
-#: largest number of modes: above it the shapes and the basis fill the memory
-_MOST = 2000
+_GAP, _GAP_ROUNDINGS = ROOT, 4.0
 #: cost of a mode in multiplications, per DOF and per entry of the factor: measured on solids and
 #: plates of 6 615 to 22 326 DOFs, where memory access limits the speed
 _EACH_DOF, _EACH_ENTRY = 5e4, 40.0
-#: number of searches with the found modes locked, before giving up
-_SEARCHES = 8
 #: residual relative to ||K phi|| above which Lanczos continues, unless it is rounding
 _RESIDUAL = NULL
 #: residuals below this many roundings of K phi are not reduced by more steps
@@ -74,18 +71,18 @@ def counted_modes(
         if count < below:
             factor = None  # its shift is far above the last wanted mode
         count = min(count, below)
-        if count > _MOST:
+        if count > LARGEST_FULL:
             raise ModelError(
                 f"below {np.sqrt(top) / (2 * np.pi):.6g} Hz this model of {n} DOFs has {below} "
-                f"elastic modes: more than {_MOST} are not solved for at once. Choose a lower "
-                "frequency, or for the lowest ones with count=."
+                f"elastic modes: more than {LARGEST_FULL} are not solved for at once. Choose a "
+                "lower frequency, or for the lowest ones with count=."
             )
     order = dissection_of(model)
     expect(2 * order.multiplications + count * (_EACH_DOF * n + _EACH_ENTRY * order.n_factor))
     squares, phi = np.zeros(0), np.zeros((n, 0))
     counted, sure, shift = 0, 0, 0.0
     missing = min(count + _EXTRA, n - r)
-    for search in range(_SEARCHES):
+    for search in range(MOST_STEPS):
         factor = factor or new(model, method)
         locked = np.hstack([model.rigid_body, phi])
         try:
@@ -213,7 +210,7 @@ def _search_once(
         values, phi = rayleigh_ritz(stiffness, mass, phi)
         kept = values[: values.size - extra] if values.size == want else values
         # accuracy limit from the rounding of the largest 1 / (omega^2 - sigma)
-        reached = 2 * REACHED * (kept - factor.sigma) / (values[0] - factor.sigma)
+        reached = 2 * PRECISION * (kept - factor.sigma) / (values[0] - factor.sigma)
         left = _excess(stiffness, mass, kept, phi, reached)
         if left < best:
             best, squares, found = left, values, phi
@@ -286,12 +283,6 @@ def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[i
 _FIRST = 10
 #: residual relative to ||K phi|| at which an eigenvalue is accepted: its error is of second order
 _VALUE = 1e-5
-#: residual below which the limit of a shape is computed
-_NEAR = 1e-8
-#: number of shapes improved together: one pass over the factor serves all of them
-_IMPROVED = 24
-#: number of steps before giving up, in addition to one for each mode
-_STEPS = 40
 #: number of steps after which, for fast convergence, modes must lie above this fraction of -sigma
 #: (where sigma is below zero)
 _EARLY, _FAR = 12, 0.1
@@ -327,11 +318,11 @@ class BlockDavidson(BlockLanczos):
         # shapes
         found = np.zeros(count, dtype=bool)
         self._limit, self._left = np.zeros(count), np.full(count, np.inf)
-        for _ in range(_STEPS + count):
+        for _ in range(MOST_STEPS + count):
             squares, mix = la.eigh(self._T)
             if self.steps > _EARLY and squares[:count][-1] < -_FAR * self._sigma:
                 break
-            at = np.flatnonzero(~found[: self._m])[:_IMPROVED]
+            at = np.flatnonzero(~found[: self._m])[:COLUMNS]
             residual, found[at] = self._residuals(squares, mix, at, needed)
             # shapes of equal values have the same accuracy, since they may be mixed
             last = squares[:count][-extra - 1] * (1 + SPREAD)
@@ -343,10 +334,10 @@ class BlockDavidson(BlockLanczos):
                 residual, found = self._residuals(squares, mix, at, needed)
                 if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
                     return self._shapes(mix[:, :count])
-            unfinished = residual[:, ~found[at]][:, :_IMPROVED]
+            unfinished = residual[:, ~found[at]][:, :COLUMNS]
             if not unfinished.shape[1]:
                 continue
-            if self._r + self._m + _IMPROVED > self._capacity:
+            if self._r + self._m + COLUMNS > self._capacity:
                 self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
             self._extend(unfinished)
         raise SolverError(
@@ -384,7 +375,7 @@ class BlockDavidson(BlockLanczos):
         size = np.linalg.norm(force, axis=0)
         force -= np.asarray(self._M @ phi) * squares[at]
         left = np.linalg.norm(force, axis=0) / size
-        near = left < _NEAR
+        near = left < ROOT
         new = np.flatnonzero(near & (self._limit[at] == 0))
         if new.size:
             self._limit[at[new]] = needed(phi[:, new])

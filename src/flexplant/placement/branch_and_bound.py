@@ -15,6 +15,7 @@ from ..arrays import FloatArray, between, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..store import checked
+from ..tolerances import ROUNDING
 from ..words import function
 from ..work import Work
 from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
@@ -22,8 +23,6 @@ from .problem import ADVICE, Problem, Search, SearchResult, layouts_of
 
 #: from this number of trials on a lower bound shows first which of them could be better
 _MANY = 24
-#: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
-_GAIN = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +108,7 @@ class _Run:
             trials = [[*chosen[:slot], u, *chosen[slot + 1 :]] for u in rest] or [chosen]
             found = self._promising([_flat(units) for units in trials], _flat(chosen), values[-1])
             best, value = trials[int(np.argmin(found))], float(found.min())
-            if value < values[-1] - _GAIN * abs(values[-1]) or (
+            if value < values[-1] - ROUNDING * abs(values[-1]) or (
                 np.isinf(values[-1]) and np.isfinite(value)
             ):
                 chosen, idle = best, 0

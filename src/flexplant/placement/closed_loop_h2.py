@@ -19,9 +19,10 @@ from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import checked
+from ..tolerances import TYPED
 from .candidates import Port, side_of
 from .convex import Quadratic, chosen_rows, measured, quadratic
-from .criterion import AGREEMENT, Criterion, Scorer
+from .criterion import Criterion, Scorer
 from .poi_variance import (
     Named,
     PoiVariance,
@@ -74,7 +75,7 @@ class MotionAndEffort(Criterion):
 
 def confirmed(cost: float, found: float) -> float:
     """Return the cost by Riccati equations, confirmed by that of the loop's covariance."""
-    if not abs(found - cost) <= AGREEMENT * abs(cost):
+    if not abs(found - cost) <= TYPED * abs(cost):
         raise CertificateError(
             f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
             "too badly conditioned. Give a larger effort."

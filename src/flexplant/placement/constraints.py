@@ -14,14 +14,11 @@ from scipy.sparse import csr_array
 from ..arrays import FloatArray, number, positive, whole
 from ..errors import LabelError, ModelError, short, some_names
 from ..store import Value, checked
-from ..tolerances import TINY
+from ..tolerances import SAME, TINY
 from ..words import mapping, members, name_list
 from .candidates import Places
 from .convex import Branch, chosen_rows
 from .zones import Disc, Zone
-
-#: what rounding may have added to a sum
-_SLACK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +143,7 @@ class LinearRows:
 
     @property
     def _slack(self) -> FloatArray:
-        return np.asarray(_SLACK * np.abs(self.A).max(axis=1, initial=0.0))
+        return np.asarray(SAME * np.abs(self.A).max(axis=1, initial=0.0))
 
 
 class Constraint(Value):

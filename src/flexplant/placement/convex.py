@@ -20,15 +20,13 @@ from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.lyapunov import square_root
 from ..lti.riccati import control_dare, riccati_root
 from ..store import Value
-from ..tolerances import SETTLED, TINY, divisor
+from ..tolerances import RESIDUAL, SAME, SETTLED, TINY, divisor
 from .criterion import Scorer
 
 #: steps in the weights on one tangent, and the relative gap at which they stop
 _CUTS, _GAP = 40, 1e-3
 #: tangents of a bound at the root, and the parts of a step between them
 _TANGENTS, _HALVES = 20, (1.0, 0.5, 0.25, 0.125, 0.0625)
-#: what rounding may have added to a bound, relative
-_RELATIVE = 1e-9
 
 #: disjoint groups of candidates, and how many of each are chosen
 Groups: TypeAlias = tuple[tuple[IntArray, int], ...]
@@ -317,11 +315,9 @@ class Convex(Scorer, ABC):
 
 def safe(bound: FloatArray) -> FloatArray:
     """Return bounds less what rounding may have added."""
-    return np.asarray(bound - _RELATIVE * np.abs(bound))
+    return np.asarray(bound - SAME * np.abs(bound))
 
 
-#: largest residual of the Riccati equation, relative, that is taken without another solver
-RESIDUAL = 1e-10
 #: variance relative to the largest that counts as zero, and the fraction of a gradient that must
 #: agree
 _NOTHING, _CONFIRMED = 1e-13, 1e-10

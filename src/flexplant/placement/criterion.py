@@ -17,10 +17,6 @@ from ..store import Value, checked
 from ..words import function, with_unit
 from .candidates import Port, Side, sides_of, with_side
 
-#: relative: a fast score and the criterion on the plant itself agree to this, and so do two ways
-#: to the cost of one loop: both are sums of squares of Riccati solutions, known to some 1e-9
-AGREEMENT = 1e-6
-
 
 class Scorer:
     """The scores of choices among fixed candidates; choices are rows of indices, ascending.

@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import CACHED, FloatArray, IntArray
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..store import checked
-from ..tolerances import RANK, TINY, divisor
+from ..tolerances import RANK, ROOT, TINY, divisor
 from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
@@ -22,10 +22,6 @@ from .criterion import Criterion, Scorer, by_size
 MEASURES = ("trace", "log det", "least")
 #: steps to the largest log det, and the gap at which they stop [nats]
 _STEPS, _CLOSE = 300, 1e-3
-#: what rounding may have added to a log det [nats]
-_ROUNDING = 1e-8
-#: number of numbers in sums that are made at once: they stay in the cache
-_AT_ONCE = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +59,7 @@ class SummedMatrices(Scorer):
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return the scores (n,) of choices, those of one size at once."""
         n = self.matrices.shape[1]
-        few = max(1, _AT_ONCE // (n * n))
+        few = max(1, CACHED // (n * n))
 
         def of(rows: IntArray) -> FloatArray:
             parts = [self._measured(rows[i : i + few]) for i in range(0, len(rows), few)]
@@ -163,7 +159,7 @@ class _LogDet(Below):
             steps=_STEPS,
             close=lambda value, most: most - value <= _CLOSE,
         )
-        return -most - _ROUNDING, weights
+        return -most - ROOT, weights
 
 
 def sum_scorer(matrices: FloatArray, measure: str) -> Scorer:

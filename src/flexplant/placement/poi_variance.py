@@ -16,9 +16,10 @@ from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant
 from ..plant.building import direct_effect
-from ..plant.machine_plants import LEVEL, interval
+from ..plant.machine_plants import interval
 from ..plant.partitioned import require_noise
 from ..store import checked
+from ..tolerances import INTERVAL
 from ..words import flag, instance, one_of
 from .candidates import Port, with_side
 from .convex import WorstRow, quadratic
@@ -248,7 +249,7 @@ class PoiVariance(Criterion):
             return np.asarray(np.sum(terms, axis=1) if self.measure == "sum" else terms.max(axis=1))
 
         return interval(
-            machines, lambda: np.sqrt(variances(plant) / variances(other)), LEVEL, ""
+            machines, lambda: np.sqrt(variances(plant) / variances(other)), INTERVAL, ""
         ).sentence
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:

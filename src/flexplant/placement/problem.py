@@ -15,14 +15,15 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import AssumptionError, CertificateError, counted, some_names
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
+from ..seeds import REFUSED
 from ..store import Value
-from ..tolerances import SAME, SETTLED, divisor
+from ..tolerances import SAME, SETTLED, TYPED, divisor
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2, PoiLqr
 from .constraints import LinearRows
 from .convex import Branch, Convex
-from .criterion import AGREEMENT, Criterion, OnPlant, Scorer, as_criterion, by_size, in_words
+from .criterion import Criterion, OnPlant, Scorer, as_criterion, by_size, in_words
 from .poi_variance import PoiVariance
 
 ASSUMPTION = {"y": "detectable", "u": "stabilisable"}
@@ -85,7 +86,7 @@ class Layouts:
             return
         ports = [self.candidates[i] for i in sorted(chosen)]
         direct = float(self.criterion(with_side(self.plant, self.side, ports)))
-        if not abs(direct - value) <= AGREEMENT * max(abs(direct), self.criterion.scale):
+        if not abs(direct - value) <= TYPED * max(abs(direct), self.criterion.scale):
             raise CertificateError(
                 f"the fast score {value:.9g} of the best choice differs from {self.criterion!r} on "
                 f"its plant, {direct:.9g}. No score can be trusted: the problem is too badly "
@@ -281,10 +282,6 @@ class Placement(Value):
         return with_side(plant, self.side, self.ports)
 
 
-#: draws of an admissible choice until one sees every rigid-body mode
-_DRAWS = 20
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The best choice of candidates, as an optimisation problem.
@@ -383,7 +380,7 @@ class Problem:
             return tuple(self.spanning(weights))
         draws = random or np.random.default_rng(0)
         nearest: tuple[int, ...] = ()
-        for draw in range(_DRAWS):
+        for draw in range(REFUSED):
             worth = draws.uniform(0.0, 1.0, self.total)
             worth[self.spanning(worth)] += 2.0
             if random is None and not draw and (relaxed := self.relaxed()) is not None:

@@ -15,7 +15,7 @@ from ..errors import LabelError, ModelError, counted, short
 from ..plant import Sensor, StandardPlant
 from ..plant.port import Quantity
 from ..store import Value
-from ..words import instance
+from ..words import SHOWN, instance
 from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
 from .constraints import Constraint, all_of, constraint_rows, constraints_of
@@ -256,10 +256,6 @@ def _score_layouts(
     )
 
 
-#: devices in the printed table
-_SHOWN = 6
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceWorth(Value):
     """The value of a choice without each of its devices; prints as a table.
@@ -290,12 +286,12 @@ class DeviceWorth(Value):
     def __repr__(self) -> str:
         lines = [f"<DeviceWorth: {in_words(self.value, self.unit)} with all>"]
         order = np.argsort(-self.without, kind="stable").tolist()
-        for i in order[:_SHOWN]:
+        for i in order[:SHOWN]:
             lost = self.without[i]
             what = in_words(lost, self.unit) if np.isfinite(lost) else "the others do not suffice"
             lines.append(f"  without {self.names[i]}: {what}")
-        if len(order) > _SHOWN:
-            lines.append(f"  and {len(order) - _SHOWN} that matter less")
+        if len(order) > SHOWN:
+            lines.append(f"  and {len(order) - SHOWN} that matter less")
         return "\n".join(lines)
 
     def __getitem__(self, name: str) -> float:

@@ -14,8 +14,8 @@ from ..lti.interconnection import among, append, series
 from ..lti.sampling import check_latency, check_rate, held_exactly, light_modes, sample_and_hold
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
-from ..structure.rigid import SPANNED, Structure
-from ..tolerances import ROUNDING, SAME
+from ..structure.rigid import Structure
+from ..tolerances import NEGLIGIBLE, ROUNDING, SAME
 from ..words import instance
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
@@ -124,7 +124,7 @@ def direct_effect(
     along = ground @ one.carried
     total: FloatArray = direct + along
     held = isinstance(model, FEModel) and model.held_inertia is not None
-    total[np.abs(total) <= (SAME if held else SPANNED) * np.abs(along)] = 0.0
+    total[np.abs(total) <= (SAME if held else NEGLIGIBLE) * np.abs(along)] = 0.0
     return total
 
 

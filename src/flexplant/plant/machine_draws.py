@@ -12,21 +12,18 @@ import scipy.linalg as la
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned
+from ..modes.modes import PLACES
+from ..seeds import REFUSED
 from ..sparse.symmetric import dense
-from ..tolerances import TINY
+from ..tolerances import TINY, TYPED
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
-from ..updating.residuals.modal_residuals import ZETA
 from ..updating.trend import MIXED
 from .drawn_modes import DrawnModes, ModeSpace
 from .realisation import MODAL, ModalRealisation
 from .uncertainty.delta import Delta
 from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, changed_pairs
 
-#: largest number of places at which the shapes of two meshes are compared
-_PLACES = 300
-#: after this number of refused draws in a row an error says that no such machine was found
-_REFUSED = 50
 #: angles at which a pair is compared with its measured shapes, a quarter of a degree apart
 _ANGLES = 721
 #: terms of the series of exp(E / 2): relative rounding for norms of E up to 0.3
@@ -136,7 +133,7 @@ class MachineFamily:
         if hasattr(model, "T"):
             dofs, shapes = model.full_dofs, model.T @ phi
         moves = [i for i, d in enumerate(dofs.directions) if d in ("x", "y", "z")]
-        moves = moves[:: max(len(moves) // _PLACES, 1)]
+        moves = moves[:: max(len(moves) // PLACES, 1)]
         places = [(tuple(dofs.xyz[i].tolist()), dofs.directions[i]) for i in moves]
         seen = np.array([self.whole.row(at, d) for at, d in places]) @ self.over
         among, *_ = la.lstsq(shapes[moves], seen)
@@ -153,12 +150,12 @@ class MachineFamily:
 
     def machine(self, rng: np.random.Generator) -> DrawnModes:
         """Return the modes of one machine; draws without mass or stiffness are refused."""
-        for _ in range(_REFUSED):
+        for _ in range(REFUSED):
             found = self._modes(self.machines.draw(rng))
             if found is not None:
                 return found
         raise ModelError(
-            f"{_REFUSED} draws in a row have a mass or stiffness that is not positive: what was "
+            f"{REFUSED} draws in a row have a mass or stiffness that is not positive: what was "
             "measured does not determine the parameters. Measure more modes."
         )
 
@@ -172,7 +169,7 @@ class MachineFamily:
         parent = np.argmax(np.abs(V), axis=0)
         zeta = np.zeros(b)
         if self.machines.damping_changes.size > 1:
-            reference = np.where(self.zeta > ZETA, self.zeta, 1.0)[parent[r:]]
+            reference = np.where(self.zeta > TYPED, self.zeta, 1.0)[parent[r:]]
             mean, size = draw.damping
             log = mean + size * draw.rng.standard_normal(b - r)
             zeta[r:] = np.minimum(reference * np.exp(log), _MOST_DAMPING)

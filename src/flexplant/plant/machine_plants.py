@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import FloatArray, between, whole
 from ..errors import AssumptionError, ModelError
 from ..seeds import MOST_DRAWS, Rng, generator
+from ..tolerances import INTERVAL
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit
 from .drawn_modes import DrawnModes
@@ -19,9 +20,6 @@ from .ports import Ports
 from .uncertainty.delta import MachineParts, with_changes
 from .uncertainty.mode_delta import ModeDelta
 from .uncertainty.parameter_amounts import ParameterDelta
-
-#: share of machines that a printed interval holds
-LEVEL = 0.95
 
 
 class FigureInterval(NamedTuple):
@@ -188,7 +186,7 @@ def _noisy(ports: Ports) -> tuple[Any, ...]:
     return (*ports.w, *ports.u, *ports.y)
 
 
-def interval_of(values: FloatArray, level: float = LEVEL) -> tuple[float, float]:
+def interval_of(values: FloatArray, level: float = INTERVAL) -> tuple[float, float]:
     """Return the prediction interval of a log-normal figure of one more machine, from n drawn.
 
     For the logarithm the interval is ``mean +- t s sqrt(1 + 1 / n)``, Student's t with n - 1

@@ -13,8 +13,8 @@ from ..errors import AssumptionError, ModelError, require_known
 from ..labels import DIRECTIONS
 from ..store import Value
 from ..structure import FEModel
-from ..structure.rigid import SPANNED, turned_about
-from ..tolerances import SAME
+from ..structure.rigid import turned_about
+from ..tolerances import NEGLIGIBLE, SAME
 from .realisation import ModalRealisation, Structure
 
 
@@ -48,7 +48,7 @@ def _inertia_load(realisation: ModalRealisation, direction: str, about: FloatArr
     if isinstance(model, FEModel):
         return -model.ground_inertia(turned_about(direction, about))
     missed = model.missed_motions(about)[axis]
-    if missed > SPANNED:
+    if missed > NEGLIGIBLE:
         raise ModelError(
             f"the shapes of this {type(model).__name__} do not make the rigid-body motion "
             f"{direction!r} (they miss {missed:.2g} of it), so that its inertia against a base "
@@ -78,8 +78,8 @@ def _rigid_body(model: Structure) -> tuple[RigidBody | None, str]:
         for i, axis in enumerate(DIRECTIONS)
         if np.any(everywhere[:, i]) and (axis in model.full_dofs.directions or axis.startswith("r"))
     ]
-    exists = _drop_dependent(everywhere, [i for i in moving if missed[i] < SPANNED])
-    lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= SPANNED}
+    exists = _drop_dependent(everywhere, [i for i in moving if missed[i] < NEGLIGIBLE])
+    lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= NEGLIGIBLE}
     if not exists:
         why = (
             f"DOFs are held against {', '.join(lost)}"

@@ -18,8 +18,7 @@ from ..reduction import ReducedModel
 from ..sparse.symmetric import orthonormalised
 from ..store import Value, checked
 from ..structure import Damper, FEModel, Spring
-from ..structure.rigid import SPANNED
-from ..tolerances import SAME, SPLIT, TYPED, divisor
+from ..tolerances import NEGLIGIBLE, SAME, SPLIT, TYPED, divisor
 from ..words import members
 from .port import checked_place, port_direction
 from .realisation import realise
@@ -201,7 +200,7 @@ def _suspend_modes(modes: Modes, springs: _Springs) -> Modes:
     free = np.vstack([kept, np.zeros((b - r, kept.shape[1]))])
 
     def motions() -> FloatArray:
-        made = modes.missed_motions() < SPANNED
+        made = modes.missed_motions() < NEGLIGIBLE
         part = np.linalg.lstsq(basis, modes.rigid_motions()[:, made], rcond=None)[0]
         return orthonormalised(np.eye(b), part, dependent="drop")
 

@@ -279,18 +279,16 @@ BLUE, ORANGE, GREEN, RED, PURPLE, SKY = (
 BLACK, GREY, LIGHT = "black", "0.55", "0.8"
 
 Style = dict[str, Any]
-#: width of a line [points]
-_WIDTH = 1.4
 
-#: styles of the roles in every picture. Lines below others are wide
+#: styles of the roles in every picture; a line below others is wide, others have the usual width
 STYLES: Mapping[str, Style] = {
     "measured": {"color": BLACK, "linestyle": "-", "linewidth": 0.9, "zorder": 1.8},
     "truth": {"color": GREEN, "linestyle": "-", "linewidth": 4.0, "alpha": 0.35, "zorder": 1.5},
-    "model": {"color": BLUE, "linestyle": "-", "linewidth": _WIDTH},
-    "nominal": {"color": GREY, "linestyle": (0, (5, 1.5)), "linewidth": _WIDTH},
-    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": _WIDTH},
-    "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": _WIDTH},
-    "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": _WIDTH},
+    "model": {"color": BLUE, "linestyle": "-"},
+    "nominal": {"color": GREY, "linestyle": "--"},
+    "reduced": {"color": ORANGE, "linestyle": "-."},
+    "bound": {"color": RED, "linestyle": ":"},
+    "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": 0.9},
 }
 #: other labels for the same roles
 _WORDS = {
@@ -302,18 +300,15 @@ _WORDS = {
 }  # fmt: skip
 #: styles of all other lines, in their order
 CYCLE: Sequence[Style] = (
-    {"color": BLUE, "linestyle": "-", "linewidth": _WIDTH},
-    {"color": ORANGE, "linestyle": "-", "linewidth": _WIDTH},
-    {"color": GREEN, "linestyle": "--", "linewidth": _WIDTH},
-    {"color": RED, "linestyle": "-.", "linewidth": _WIDTH},
-    {"color": PURPLE, "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": _WIDTH},
-    {"color": SKY, "linestyle": ":", "linewidth": _WIDTH},
-)
+    {"color": BLUE, "linestyle": "-"}, {"color": ORANGE, "linestyle": "-"},
+    {"color": GREEN, "linestyle": "--"}, {"color": RED, "linestyle": "-."},
+    {"color": PURPLE, "linestyle": ":"}, {"color": SKY, "linestyle": ":", "linewidth": 2.5},
+)  # fmt: skip
 #: markers of ports in views of a structure
 PORTS: Mapping[str, Style] = {
     "sensors": {"marker": "P", "color": BLACK, "markeredgecolor": "white", "markersize": 11},
     "actuators": {"marker": "^", "color": RED, "markeredgecolor": "white", "markersize": 11},
-    "POI": {"marker": "o", "color": RED, "fillstyle": "none", "markersize": 12},
+    "POI": {"marker": "o", "color": RED, "fillstyle": "none", "markersize": 11},
 }
 #: length of an arrow of a direction, relative to the size of a view from above
 _ARROW = 0.07
@@ -379,7 +374,7 @@ def mark_devices(
                 beside.add(spot)
             if various and arrow:
                 turned = np.array(one.along)[:2] * _ARROW * extent
-                look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"], "linewidth": _WIDTH}
+                look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"]}
                 ax.annotate(
                     "", tuple(point[:2] + turned), tuple(point[:2]), arrowprops=look, zorder=3.9
                 )
@@ -430,7 +425,7 @@ def styles(
         style = dict(STYLES[role] if role else cycle[others % len(cycle)])
         if role is None and shades is not None:
             shade = to_hex(shades[others - taken])
-            style = {"color": shade, "linestyle": "-", "linewidth": _WIDTH}
+            style = {"color": shade, "linestyle": "-"}
         others += role is None
         if colors and label in colors:
             style["color"] = colors[label]
@@ -507,8 +502,12 @@ def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
         ) from error
 
 
+#: largest number of rows, bars or modes that a picture shows one by one
+LISTED = 16
 #: largest number of channels in a readable grid of panels
 _MOST = 36
+#: largest number of channels that a page or a notebook draws without being asked
+CHANNELS = 9
 
 
 def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float) -> Any:

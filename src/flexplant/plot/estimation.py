@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from ..arrays import FloatArray, between, positive, real_array
 from ..errors import ModelError, ShapeError
 from ..estimation import ConsistencyReport, Estimate, LagReport
+from ..estimation.consistency_tests import FEWEST
 from ..estimation.estimator_channels import row_of
 from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
@@ -254,8 +255,6 @@ def _draw_row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
 
 #: windows of the mean NIS over a record, and samples in one at least
 _WINDOWS, _SHORTEST = 60, 20
-#: fewest samples for a picture
-_FEWEST = 100
 
 
 def consistency(
@@ -313,9 +312,9 @@ def consistency(
     between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     white = estimate.whitened.T
     there = np.all(np.isfinite(white), axis=1)
-    if int(there.sum()) < _FEWEST:
+    if int(there.sum()) < FEWEST:
         raise ModelError(
-            f"a picture needs at least {_FEWEST} samples with all innovations, got "
+            f"a picture needs at least {FEWEST} samples with all innovations, got "
             f"{int(there.sum())}. Pass a longer record."
         )
     given, panels = ax is not None, three_axes(ax, 1, 3, figsize=(13.0, 3.8))

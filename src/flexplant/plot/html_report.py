@@ -31,10 +31,11 @@ from ..rooms import versions
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ..store import Value, written
 from ..synthesis import Controller
+from ..tolerances import CHANCE
 from ..updating import Localisation, UpdateResult
-from ..updating.judgement.goodness import CHANCE
 from ..words import with_unit
 from ._axes import (
+    CHANNELS,
     STYLES,
     bottom_only,
     decibel,
@@ -64,8 +65,6 @@ _HEADINGS = {
     "Measurement and update": ("identification", "updating"),
     "Machine": ("structure", "modes", "reduction", "labels"),
 }
-#: largest number of channels of a Bode diagram on a page
-_CHANNELS = 9
 #: largest number of parameters of an update that are drawn separately
 _PARAMETERS = 6
 
@@ -142,7 +141,7 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         return [("The chosen places", lambda: placed(value.on(plant.machine)))]
     if isinstance(value, Controller | StateSpace | Frf):
         system: Any = value.system if isinstance(value, Controller) else value
-        if len(system.inputs) * len(system.outputs) <= _CHANNELS:
+        if len(system.inputs) * len(system.outputs) <= CHANNELS:
             return [(f"Bode diagram of {name}", partial(bode, system))]
         caption = f"Singular values of {name}, the area down to the smallest"
         return [(caption, partial(singular_values, system))]

@@ -134,7 +134,3 @@ def identified(
         ax.axvline(pole, color=LIGHT, linestyle=":", linewidth=0.8, zorder=1.0)
     ax.set_xlim(float(freq[0]), float(freq[-1]))
     return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit), given=given)
-
-
-#: largest number of lines of the table of poles next to the diagram
-_LISTED = 16

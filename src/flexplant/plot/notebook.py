@@ -22,6 +22,7 @@ from ..reduction import ReducedModel
 from ..simulation import Response
 from ..structure import FEModel
 from ..updating import UpdateResult
+from ._axes import CHANNELS
 from .bode_diagrams import bode
 from .errors import budget
 from .html_page import moving_frame
@@ -33,12 +34,10 @@ from .updating import parameters
 
 #: dots per inch of pictures
 _DPI = 80
-#: largest number of pairs of channels in one picture
-_PAIRS = 9
 
 
 def _pairs(value: Frf | StateSpace) -> Any:
-    if len(value.inputs) * len(value.outputs) > _PAIRS:
+    if len(value.inputs) * len(value.outputs) > CHANNELS:
         raise FlexplantError("too many pairs for one picture")
     return bode(value)
 

@@ -19,11 +19,13 @@ from ..placement.candidates import candidate_places
 from ..placement.mode_shapes import shapes_of
 from ..placement.zones import Zone
 from ..plant import Ports, PositionMap, StandardPlant
+from ..tolerances import NEGLIGIBLE
 from ..words import in_unit, instance
 from ._axes import (
     BLUE,
     CYCLE,
     LIGHT,
+    LISTED,
     RED,
     STYLES,
     Device,
@@ -226,7 +228,7 @@ def placed(
     }
     height = dofs.xyz[rows, 2]
     middle = 0.5 * float(height.min() + height.max())
-    low = height < middle - _LAYER * float(np.ptp(dofs.xyz[rows], axis=0).max())
+    low = height < middle - NEGLIGIBLE * float(np.ptp(dofs.xyz[rows], axis=0).max())
     below = {k: [one for one in v if _is_below(one, middle, dofs.xyz)] for k, v in kinds.items()}
     if ax is not None or not low.any() or not any(below.values()):
         ax = axes(ax, figsize=(6.4, 5.4))
@@ -246,10 +248,6 @@ def placed(
     return upper
 
 
-#: distance below the middle, relative to the largest dimension, at which nodes form another layer
-_LAYER = 1e-3
-
-
 def _point_devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[Device]:
     """Return the devices of ports, each of its points one."""
     pairs = zip(ports, points, strict=False)
@@ -257,7 +255,7 @@ def _point_devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[D
 
 
 def _is_below(one: Device, middle: float, xyz: FloatArray) -> bool:
-    return bool(one.place[2] < middle - _LAYER * float(np.ptp(xyz, axis=0).max()))
+    return bool(one.place[2] < middle - NEGLIGIBLE * float(np.ptp(xyz, axis=0).max()))
 
 
 def _view(
@@ -301,12 +299,6 @@ def _patch(zone: Zone, factor: float, **style: Any) -> Patch:
         return Circle((x, y), zone.radius / factor, **style)
     x, y, right, top = (side / factor for side in (*zone.lower, *zone.upper))
     return Box((x, y), right - x, top - y, **style)
-
-
-#: least participation of a mode that is drawn
-_FAINT = 1e-3
-#: most modes that a panel names one by one
-_NAMED = 24
 
 
 def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
@@ -355,7 +347,7 @@ def _curve_panels(found: PositionMap, kind: str) -> list[Axes]:
     factor, unit = in_unit(float(np.abs(values).max()), kind)
     x = values / factor
     decoupled = bool(np.any(np.isfinite(found.decoupling)))
-    modes = min(int(np.count_nonzero(found.ever)), _NAMED)
+    modes = min(int(np.count_nonzero(found.ever)), LISTED)
     heights = [1.6] * decoupled + [max(1.2, 0.2 * modes)] * (modes > 0)
     heights += [1.6] * len(found.figures)
     figure, drawn = plt.subplots(
@@ -377,8 +369,8 @@ def _curve_panels(found: PositionMap, kind: str) -> list[Axes]:
         least = np.where(found.ever, found.visible.min(axis=0), np.inf)
         kept = np.sort(np.argsort(least, kind="stable")[:modes])
         shown = ax.pcolormesh(
-            x, np.arange(modes), np.maximum(found.visible[:, kept].T, _FAINT), cmap="viridis",
-            norm=LogNorm(_FAINT, 1.0), shading="nearest",
+            x, np.arange(modes), np.maximum(found.visible[:, kept].T, NEGLIGIBLE), cmap="viridis",
+            norm=LogNorm(NEGLIGIBLE, 1.0), shading="nearest",
         )  # fmt: skip
         ax.set_yticks(np.arange(modes), [found.modes[i] for i in kept], fontsize=7)
         figure.colorbar(shown, ax=ax, label="share in the loop [-]")

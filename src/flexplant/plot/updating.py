@@ -24,6 +24,7 @@ from ._axes import (
     CYCLE,
     GREY,
     LIGHT,
+    LISTED,
     POINTS,
     RED,
     STYLES,
@@ -162,10 +163,6 @@ def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
     return np.asarray(row @ dofs.xyz[:, :2] / row.sum())
 
 
-#: number of parameters that are drawn separately; the repr shows the others
-SHOWN = 12
-
-
 def update(
     fit: UpdateResult,
     before: Any,
@@ -227,7 +224,7 @@ def update(
     if shown:
         rows.append(["response", "response"])
     heights = [3.2] * len(rows)
-    heights[names.index("parameters") // 2] += 0.45 * max(min(len(fit.parameters), SHOWN) - 4, 0)
+    heights[names.index("parameters") // 2] += 0.45 * max(min(len(fit.parameters), LISTED) - 4, 0)
     figure, drawn = plt.subplot_mosaic(
         rows, figsize=(11.5, sum(heights)), height_ratios=heights, layout="constrained"
     )
@@ -291,7 +288,7 @@ def _mac(ax: Axes, seen: Correlation, name: str) -> None:
 
 def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
     """Draw each parameter in a row with its own axis: estimate, interval, prior, start."""
-    count = min(len(fit.parameters), SHOWN)
+    count = min(len(fit.parameters), LISTED)
     half = np.zeros(len(fit.values))
     if fit.std is not None:
         half = fit.interval(level)[:, 1] - fit.values

@@ -20,7 +20,7 @@ from ..arrays import (
 )
 from ..errors import ModelError, aligned, counted, short
 from ..labels import Place
-from ..lti.frequency_sweep import climbed_grid
+from ..lti.frequency_sweep import POINTS, ROUNDS, climbed_grid
 from ..modes.dynamic_basis import (
     SILENT,
     DirectCheck,
@@ -34,11 +34,9 @@ from ..modes.solve import modes_reaching
 from ..modes.statics import held_factor, labels_of, places, static_response
 from ..store import Value
 from ..structure import FEModel
-from ..tolerances import SAME, divisor
+from ..tolerances import FOUR_DIGITS, SAME, divisor
 from .ranking import ErrorBound
 
-#: number of refinements of the frequencies at which the error is largest
-_ROUNDS = 3
 #: a `ReducedModel`, whose module imports this one
 Reduced: TypeAlias = Any
 
@@ -92,7 +90,7 @@ def quality_of(
     if freq is None and B.shape[1] and C.shape[0]:
         # between two close resonances of the models the error may be larger than at either
         grid, _ = climbed_grid(
-            lambda at: (np.abs(responses.at(at) - less(at)) / sizes).max(axis=(1, 2)), grid, _ROUNDS
+            lambda at: (np.abs(responses.at(at) - less(at)) / sizes).max(axis=(1, 2)), grid, ROUNDS
         )
     whole_response, found = responses.at(grid), less(grid)
     gap, size = np.abs(found - whole_response), np.abs(whole_response)
@@ -218,12 +216,8 @@ def _mode_comparison(
     }
 
 
-#: number of points over the band, in addition to resonances and antiresonances
-_GRID = 200
 #: number of direct solutions that check the responses of a small and of a large structure
 _CHECKS, _SMALL = (6, 3), 2000
-#: difference relative to the peak above which direct solutions extend the basis
-_TOLERANCE = 1e-4
 
 
 #: function that returns the responses (f, p, q) at frequencies [Hz]
@@ -258,7 +252,7 @@ class FullResponses:
         if self.basis is not None and self.B.shape[1]:
             checks = _CHECKS[len(self.full.dofs) > _SMALL]
             self.basis, _, self.check = checked_response(
-                self.basis, freq, self.C, self.B, checks=checks, tolerance=_TOLERANCE
+                self.basis, freq, self.C, self.B, checks=checks, tolerance=FOUR_DIGITS
             )
 
     def drive_points(self, freq: FloatArray) -> FloatArray:
@@ -299,7 +293,7 @@ def check_frequencies(
     resonances = np.concatenate([own for _, own in both])
     resonances = resonances[(resonances >= low) & (resonances <= high)]
     deep = np.concatenate([antiresonances(find, own, low, high) for find, own in both])
-    return np.concatenate([np.geomspace(start, high, _GRID), resonances, deep]), resonances, deep
+    return np.concatenate([np.geomspace(start, high, POINTS), resonances, deep]), resonances, deep
 
 
 def _modal_response(

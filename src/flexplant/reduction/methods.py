@@ -23,15 +23,11 @@ from ..sparse.symmetric import dense, unit_diagonal
 from ..store import Value, checked
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import RANK, TINY, TYPED
+from ..tolerances import MISSED, NEGLIGIBLE, RANK, TINY, TYPED
 from ..words import instance, name_list
 from .criteria import PivotedQr
 from .ranking import ErrorBound
 from .reduced import ReducedModel
-
-#: fraction of a rigid-body motion that a basis may miss, and largest relative residual of a
-#: solution
-_LEFT = 1e-7
 
 
 class Solver:
@@ -64,7 +60,7 @@ class Solver:
         found = found + self._once(loads - np.asarray(self._matrix @ found))
         left = np.linalg.norm(loads - np.asarray(self._matrix @ found))
         # a mechanism that the factorisation did not detect, because of rounding, carries no load
-        if not left <= _LEFT * np.linalg.norm(loads):
+        if not left <= MISSED * np.linalg.norm(loads):
             raise ModelError(self._singular)
         return found
 
@@ -173,7 +169,7 @@ def projected_model(
     load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
     rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
     missed = float(np.abs(T @ rigid - full).max(initial=0.0))
-    if not missed <= _LEFT * np.abs(full).max(initial=0.0):
+    if not missed <= MISSED * np.abs(full).max(initial=0.0):
         raise ModelError(
             f"{method} does not hold the rigid-body motions of the structure (misses "
             f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "
@@ -203,8 +199,6 @@ def projected_model(
     )
 
 
-#: fraction of the largest pivot above which a row of phi determines another mode
-_TELLS = 1e-3
 _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
 
 
@@ -340,7 +334,7 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
     k = basis.shape[1]
     _, upper, order = la.qr(basis[dofs.indices(labels)].T, mode="economic", pivoting=True)
     size = np.abs(np.diag(upper))
-    kept = [labels[i] for i in order[: int(np.count_nonzero(size > _TELLS * size[0]))]]
+    kept = [labels[i] for i in order[: int(np.count_nonzero(size > NEGLIGIBLE * size[0]))]]
     pool = [label for label in dofs.labels if label not in set(labels)]
     straight = [label for label in pool if ":r" not in label]
     for candidates in (straight, pool):

@@ -21,14 +21,12 @@ from ..sparse.symmetric import orthonormalised
 from ..store import Value, checked
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
-from ..structure.rigid import SPANNED, relative_miss, rigid_motions
+from ..structure.rigid import relative_miss, rigid_motions
+from ..tolerances import NEGLIGIBLE, RANK
 from ..words import name_list
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 
-#: fraction of the largest eigenvalue of K*: K* counts as indefinite when an eigenvalue is below
-#: minus this
-_DEFINITE = 1e-14
 #: prefix of the names of coordinates with the static compliance of truncated modes
 STATIC = "static "
 
@@ -211,7 +209,7 @@ class ReducedModel(Value):
     def n_unstable(self) -> int:
         """Number of rigid-body motions that springs of negative stiffness make unstable."""
         stiff = la.eigvalsh(self.K)
-        if not self.n_dof or stiff[0] > -_DEFINITE * stiff[-1]:
+        if not self.n_dof or stiff[0] > -RANK * stiff[-1]:
             return 0
         motions = self.body_motions
         if self.rigid_body.shape[1] == motions.shape[1]:
@@ -223,7 +221,7 @@ class ReducedModel(Value):
         """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
         if self.joint_motions is not None:
             return orthonormalised(self.M, self.joint_motions, dependent="drop")
-        made = self.missed_motions() < SPANNED
+        made = self.missed_motions() < NEGLIGIBLE
         return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
 
     @property

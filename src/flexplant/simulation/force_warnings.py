@@ -13,6 +13,7 @@ from ..loop import ClosedLoop
 from ..plant import StandardPlant, driven_axes
 from ..plant.axes import complex_gain, opposing_part, resting_frequency
 from ..plant.rest_expansion import at_rest, followed_at_rest, solved
+from ..tolerances import NEGLIGIBLE
 from ..words import several
 from .motion import SetPointProfile
 from .nonlinear_elements import Saturation
@@ -20,8 +21,6 @@ from .response import Response
 
 #: number of derivatives of a move whose forces count: position (springs), velocity, acceleration
 _TERMS = 3
-#: fraction of a range up to which an excess is ignored, since ranges are not known better
-_MET = 1e-3
 
 
 def warn_beyond_ranges(
@@ -42,7 +41,7 @@ def warn_beyond_ranges(
         least = -limit.limit if limit.least is None else limit.least
         low, high = float(needed.min(initial=0.0)), float(needed.max(initial=0.0))
         who = f"the move of {', '.join(moves)} needs"
-        if low < least * (1.0 + _MET) or high > limit.limit * (1.0 + _MET):
+        if low < least * (1.0 + NEGLIGIBLE) or high > limit.limit * (1.0 + NEGLIGIBLE):
             advice = (
                 "Lower the acceleration of the move (its stroke, where springs are pushed), or "
                 "choose a stronger actuator"
@@ -54,7 +53,7 @@ def warn_beyond_ranges(
                 f"{limit.limit:.4g} {unit}. {advice}."
             )
         fastest = float(np.max(np.abs(np.diff(needed) / np.diff(time)), initial=0.0))
-        if limit.rate is not None and fastest > limit.rate * (1.0 + _MET):
+        if limit.rate is not None and fastest > limit.rate * (1.0 + NEGLIGIBLE):
             advice = (
                 "Lower the jerk of the move (its velocity, where springs are pushed), or choose a "
                 "faster amplifier"

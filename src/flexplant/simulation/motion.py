@@ -12,11 +12,8 @@ import numpy.typing as npt
 from ..arrays import FloatArray, positive, real_array
 from ..errors import ModelError, counted
 from ..store import Value
-from ..tolerances import RANK
+from ..tolerances import RANK, TYPED
 from ..words import instance
-
-#: [samples] distance from the grid below which a time counts as on the grid
-ON_GRID = 1e-6
 
 
 class Motion(NamedTuple):
@@ -118,7 +115,7 @@ class SetPointProfile(Value):
         x = real_array(t, "t") / self.tick
         if self.gridded:
             near = np.round(x)
-            x = np.where(np.abs(x - near) < ON_GRID, near, x)
+            x = np.where(np.abs(x - near) < TYPED, near, x)
         found = self._at(x)
         found[1:, (x < 0.0) | (x >= self.edges[-1])] = 0.0
         found[0] = np.where(
@@ -481,7 +478,7 @@ class _Grid:
     def whole(self, time: Any, name: str) -> float:
         """Return a time [s], rounded up to whole samples."""
         length = positive(time, name, zero=True)
-        return float(np.ceil(length / self.tick - ON_GRID)) * self.tick if self else length
+        return float(np.ceil(length / self.tick - TYPED)) * self.tick if self else length
 
     def durations(self, distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
         """Return the durations [s] of each level of a motion."""

@@ -22,10 +22,10 @@ from ..loop.budget import WhiteNoise, continuous_factor, white_noise
 from ..lti.sampling import pair_expm
 from ..plant import Actuator, Poi, StandardPlant
 from ..plant.scheduling import Position
-from ..tolerances import SAME
+from ..tolerances import ROOT, SAME
 from .motion import SetPointProfile
 from .nonlinear_elements import Acting
-from .runs import ABREAST, NO_NOISE, STRETCH
+from .runs import ABREAST, STRETCH
 
 #: number of nodes of Gauss's rule in a sample, in addition to one for each radian of the fastest
 #: mode
@@ -375,7 +375,7 @@ class _Rule:
         parts = np.einsum("q,qj,qbcd->qbcjd", np.sqrt(weight), share, flow)
         full = parts.reshape(weight.size, -1)
         U, s, V = np.linalg.svd(full, full_matrices=False)
-        kept = int(np.count_nonzero(s > NO_NOISE * s.max(initial=0.0)))
+        kept = int(np.count_nonzero(s > ROOT * s.max(initial=0.0)))
         found = (s[:kept, None] * V[:kept]).reshape(kept, len(self.pairs), 2, 6)
         ordered = found.transpose(1, 2, 0, 3).reshape(len(self.pairs), 2 * kept, 6)
         return U[:, :kept], np.ascontiguousarray(ordered)

@@ -12,16 +12,11 @@ from ..lti.response_solvers import responder
 from ..plant import driven_axes
 from ..plant.axes import resting_frequency
 from ..plant.partitioned import require_sampled
-from ..tolerances import divisor
+from ..tolerances import MISSED, NEGLIGIBLE, divisor
 from ..words import instance
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
 from .motion import SetPointProfile
 from .sampled_runs import simulate
-
-#: largest gradient of the minimised function relative to that without forces; 2e-13 is typical
-AGREEMENT = 1e-7
-#: fraction of the largest force that may lie outside of the run
-_OUTSIDE = 1e-3
 
 
 def inverse_forces(
@@ -134,8 +129,8 @@ def inverse_forces(
         )
     force = np.fft.irfft(U, size, axis=0) @ (T @ scale).T
     outside = float(np.max(np.abs(force[steps:])))
-    if outside > _OUTSIDE * float(np.max(np.abs(force))):
-        late = np.flatnonzero(np.max(np.abs(force), axis=1) > _OUTSIDE * np.abs(force).max())
+    if outside > NEGLIGIBLE * float(np.max(np.abs(force))):
+        late = np.flatnonzero(np.max(np.abs(force), axis=1) > NEGLIGIBLE * np.abs(force).max())
         ahead = (size - late[late > size // 2].min(initial=size)) * plant.dt
         warn(
             f"forces up to {outside:.3g} N fall outside the run and are cut off: the inverse acts "
@@ -153,7 +148,7 @@ def _check_minimum(
     back = H.conj().T
     off = float(np.linalg.norm(back @ (target - H @ U) - damping * U))
     alone = float(np.linalg.norm(back @ target))
-    if not off <= AGREEMENT * alone:
+    if not off <= MISSED * alone:
         raise CertificateError(
             f"forces do not minimise the error at {freq:.4g} Hz: from the plant's matrices the "
             f"gradient is {off / divisor(alone):.2g} of its value without forces."

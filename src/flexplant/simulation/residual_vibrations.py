@@ -13,14 +13,10 @@ from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
+from ..tolerances import SAME
 from ..words import instance, with_unit
 from .motion import SetPointProfile
 from .sampled_runs import known_inputs, named_references, simulate
-
-#: eigenvalues of a sampled loop below this are delays: what they hold is gone after some samples
-_GONE = 1e-9
-#: poles with a smaller part of their size in phase do not vibrate
-_TURNING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,7 +146,7 @@ def residual_vibration(
     predicted = np.abs((steps @ amounts).real).max()
     run = simulate(own, reference=given, duration=(time.size + 0.25) * machine.dt, noise=False)
     simulated = np.abs(run[seen][last + 1 : last + 1 + after] - rest).max()
-    turning = modes.logs.imag > _TURNING * np.abs(modes.logs)
+    turning = modes.logs.imag > SAME * np.abs(modes.logs)
     size = 2.0 * np.abs(amounts[turning])
     order = np.argsort(-size)
     poles = modes.logs[turning][order] / machine.dt
@@ -167,9 +163,9 @@ class _Modes:
         self.system = loop.system.select([channel], loop.machine.w)
         values, right = la.eig(self.system.A)
         same, left = la.eig(self.system.A.T)
-        self.values = values[np.abs(values) > _GONE]
-        self.right = right[:, np.abs(values) > _GONE]
-        rows = left[:, np.abs(same) > _GONE].T
+        self.values = values[np.abs(values) > SAME]
+        self.right = right[:, np.abs(values) > SAME]
+        rows = left[:, np.abs(same) > SAME].T
         # rows of one space, in any order: duals of the columns
         self.rows = np.linalg.solve(rows @ self.right, rows)
         self.logs = np.log(self.values)
@@ -177,7 +173,7 @@ class _Modes:
     def shown(self, duration: float) -> float:
         """Return the time [s] of ten periods of the slowest vibration, within bounds."""
         dt = self.system.dt
-        turning = np.abs(self.logs.imag[np.abs(self.logs.imag) > _TURNING * np.abs(self.logs)])
+        turning = np.abs(self.logs.imag[np.abs(self.logs.imag) > SAME * np.abs(self.logs)])
         slowest = 20.0 * np.pi / float(turning.min()) if turning.size else 0.0
         return dt * max(min(slowest, duration / dt), 100.0)
 

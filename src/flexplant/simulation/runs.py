@@ -12,10 +12,11 @@ from ..arrays import FloatArray, IntArray
 from ..loop import ClosedLoop
 from ..loop.blocks import applied_law
 from ..loop.budget import WhiteNoise
-from ..lti.discretisation import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
+from ..lti.discretisation import CALL, ONE_VECTOR, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
+from ..parallel import PIECE
 from ..plant import StandardPlant
-from ..tolerances import divisor
+from ..tolerances import ROOT, divisor
 from .nonlinear_elements import Acting, Answering
 
 
@@ -201,9 +202,6 @@ def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, Floa
     return diagonal, coupling, partner, rest
 
 
-#: fraction of the largest noise of a state below which it is rounding: its square is that of a
-#: covariance
-NO_NOISE = 1e-8
 #: number of states above which this is not searched, since it would take longer than a run
 _MANY = 256
 #: number of samples drawn and mixed together, which fit the cache
@@ -229,7 +227,7 @@ class Drawn:
             size = np.linalg.norm(noise.factor, axis=1)
             unit = noise.factor / divisor(size)[:, None]
             U, s, V = np.linalg.svd(unit, full_matrices=False)
-            kept = int(np.count_nonzero(s > NO_NOISE * s.max(initial=0.0)))
+            kept = int(np.count_nonzero(s > ROOT * s.max(initial=0.0)))
             self.factor = size[:, None] * U[:, :kept] * s[:kept]
             self.mix = np.ascontiguousarray(V[:kept].T)
         self.buffer = np.empty((_CHUNK, self.mix.shape[0] + self.columns.size))

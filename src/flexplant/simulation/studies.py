@@ -30,7 +30,7 @@ from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
 from ..seeds import seed_sequence
 from ..store import Value
-from ..words import instance, mapping
+from ..words import SHOWN, instance, mapping
 from ..work import Checkpoint
 from .response import Response
 
@@ -180,8 +180,6 @@ def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-#: number of reasons in the repr
-_SHOWN = 3
 #: value of a missing number, truth or text, and its name
 _MISSING: dict[type, Any] = {float: np.nan, bool: False, str: ""}
 _CALLED = {float: "number", bool: "truth", str: "text"}
@@ -236,9 +234,9 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
                 said.append(f"{name}  {np.count_nonzero(column[done])} of {done.sum()}")
         numbers = aligned(("", "5 %", "median", "95 %"), rows) if rows else []
         lines += [f"  {line}" for line in (*numbers, *said)]
-        lines += [f"  machine {i}: {reason}" for i, reason in reasons[:_SHOWN]]
-        if len(reasons) > _SHOWN:
-            lines.append(f"  and {len(reasons) - _SHOWN} more that failed")
+        lines += [f"  machine {i}: {reason}" for i, reason in reasons[:SHOWN]]
+        if len(reasons) > SHOWN:
+            lines.append(f"  and {len(reasons) - SHOWN} more that failed")
         return "\n".join(lines)
 
 

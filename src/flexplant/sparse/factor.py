@@ -22,8 +22,6 @@ from .symmetric import by_rows, dense, diagonal, unit_diagonal
 DENSE_LIMIT = 1500
 #: largest number of rows of a full matrix, limited by memory
 LARGEST_FULL = 6000
-#: number of DOFs above which a Lanczos bound is cheaper than a factorisation
-_BOUND_LIMIT = 10_000
 #: number of Lanczos steps for that bound, and the probability that it is wrong
 _BOUND_STEPS, _BOUND_CHANCE = 180, 1e-9
 
@@ -99,7 +97,7 @@ def is_positive_definite(
     n = scaled.shape[0]
     if sp.issparse(scaled) and n > DENSE_LIMIT:
         shifted = sp.csc_array(scaled + tolerance * sp.eye_array(n)) if tolerance else scaled
-        if n > _BOUND_LIMIT and lowest_eigenvalue_bound(shifted) > 0:
+        if n > LARGEST_FULL and lowest_eigenvalue_bound(shifted) > 0:
             return True
         try:
             MultifrontalFactor(shifted, dissect(shifted, nodes, xyz), keep=False)

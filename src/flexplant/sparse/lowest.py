@@ -11,15 +11,24 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from ..arrays import FloatArray, IntArray, Matrix
+from ..arrays import COLUMNS, FloatArray, IntArray, Matrix
 from ..errors import SolverError, attempted, counted
-from ..parallel import one_thread, tick
+from ..parallel import PIECE, one_thread, tick
 from ..seeds import Rng
-from ..tolerances import NULL, ROUNDING, SPLIT
+from ..tolerances import (
+    FOUR_DIGITS,
+    MOST_STEPS,
+    NEGLIGIBLE,
+    NULL,
+    PRECISION,
+    RANK,
+    ROOT,
+    ROUNDING,
+    SPLIT,
+)
 from .factor import DENSE_LIMIT, MultifrontalFactor, eliminated, negative_pivots, symmetric_lu
 from .ordering import Dissection, dissect
 from .symmetric import (
-    PRECISION,
     ZERO,
     beyond,
     by_rows,
@@ -33,8 +42,6 @@ from .symmetric import (
 
 #: number of vectors solved together
 BLOCK = 12
-#: residual of a Ritz pair of the inverse, relative to its value, below which it counts as found
-FOUND = 1e-8
 #: residual below which the value is exact to rounding, since its error is the square of the
 #: residual
 VALUE = SPLIT
@@ -42,26 +49,10 @@ VALUE = SPLIT
 STEPS = "modes, steps of Lanczos"
 #: number of steps between two restarts with a large block
 _STEPS, _FEW_STEPS = 12, 6
-_RESTARTS = 60  # above this, M and K are reported as badly conditioned
-#: relative length of a direction below which its block is orthonormalised again
-_LOST = 1e-3
-#: relative part that one orthogonalisation may remove without a second one
-_SMALL = 1e-4
 #: relative change of M W that the final Rayleigh-Ritz step on the modes corrects
 _STALE = NULL
 #: relative error of a Ritz pair below which its shape needs no separate tolerance
 _SURE = ROUNDING
-#: size of values relative to the largest one times FOUND, below which they are not found together
-#: with it
-_ROUNDING = 1e-14
-#: residual relative to the largest value that counts as rounding: no step reduces it
-REACHED = 1e-15
-#: relative distance below which values belong to one repeated mode
-SAME = 1e-8
-#: number of shapes solved together, since each solution reads the whole factor
-_SOLVED = 32
-#: number of entries of a vector processed together
-_PIECE = 8192
 
 
 class BlockLanczos:
@@ -111,7 +102,7 @@ class BlockLanczos:
     def lowest(
         self,
         count: int,
-        tolerance: float = FOUND,
+        tolerance: float = ROOT,
         *,
         extra: int = 0,
         needed: Callable[[FloatArray], FloatArray] | None = None,
@@ -125,7 +116,7 @@ class BlockLanczos:
         n = self._V.shape[1]
         count = min(count, n - self._r)
         check_at = self.steps
-        for _ in range(_RESTARTS * _STEPS):
+        for _ in range(MOST_STEPS * _STEPS):
             if self._m + self._r >= n or not self._next.shape[1]:
                 theta, mix, _ = self._pairs()
                 return theta[:count], self._shapes(mix[:, :count])
@@ -135,12 +126,12 @@ class BlockLanczos:
                 continue
             theta, mix, error = self._pairs()
             # smallest value that this search can find, by the rounding of the largest one
-            sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
+            sure = int(np.count_nonzero(theta * ROOT >= RANK * theta[0]))
             limited = sure < min(count, theta.size)
             wanted = sure if limited else count
             # shapes of equal values have the same accuracy, since they may be mixed
             last = theta[min(count, theta.size) - extra - 1] if theta.size > extra else 0.0
-            shapes = int(np.count_nonzero(theta[:count] >= (1 - SAME) * last))
+            shapes = int(np.count_nonzero(theta[:count] >= (1 - ROOT) * last))
             required = np.full(count, tolerance)
             required[shapes:] = max(tolerance, VALUE)
             strict = np.minimum(required, tolerance) if limited else required
@@ -249,7 +240,7 @@ class BlockLanczos:
                 # where almost nothing is removed, M W does not change
                 if taken > _STALE * before:
                     loaded = self._M @ W
-                if taken <= _SMALL * before:
+                if taken <= FOUR_DIGITS * before:
                     break
             poor = False
             # twice, since the accuracy of the first pass is limited by the condition of the block
@@ -263,7 +254,7 @@ class BlockLanczos:
                 root = np.sqrt(size[keep])
                 W, loaded = (mixed(X, turn[:, keep] / root) for X in (W, loaded))
                 over = (turn[:, keep] * root).T @ over
-                poor = poor or bool(size[0] < _LOST**2 * size[-1])
+                poor = poor or bool(size[0] < NEGLIGIBLE**2 * size[-1])
             if not poor:
                 break
             loaded = self._M @ W
@@ -276,7 +267,7 @@ def iterated(
     """Move shapes on by one inverse iteration next to the locked ones, in place."""
     # this removes the remainders of high modes, which make up most of the residual
     deflated = np.asarray(M @ locked)
-    for at in column_groups(phi.shape[1], _SOLVED):
+    for at in column_groups(phi.shape[1], COLUMNS):
         force = np.asarray(M @ phi[:, at])
         force -= deflated @ (locked.T @ force)
         moved = solve(force)
@@ -286,34 +277,32 @@ def iterated(
 
 def _unconverged(theta: FloatArray, error: FloatArray, required: FloatArray) -> IntArray:
     """Return which Ritz pairs have not reached their tolerance."""
-    limit = np.maximum(required[: theta.size] * theta, REACHED * theta[0])
+    limit = np.maximum(required[: theta.size] * theta, PRECISION * theta[0])
     return np.flatnonzero(error[: theta.size] > limit)
 
 
 def _most_copies(theta: FloatArray) -> int:
     """Return the size of the largest group of equal values among descending ones."""
-    ends = np.flatnonzero(theta[:-1] - theta[1:] > SAME * theta[:-1])
+    ends = np.flatnonzero(theta[:-1] - theta[1:] > ROOT * theta[:-1])
     return int(np.diff(np.concatenate([[-1], ends, [theta.size - 1]])).max(initial=0))
 
 
 def along_basis(basis: FloatArray, loaded: FloatArray) -> FloatArray:
     """Return `basis @ loaded`, rows of the basis in pieces that fit the cache."""
     found = np.zeros((basis.shape[0], loaded.shape[1]))
-    for begin in range(0, loaded.shape[0], _PIECE):
-        piece = slice(begin, begin + _PIECE)
+    for begin in range(0, loaded.shape[0], PIECE):
+        piece = slice(begin, begin + PIECE)
         found += basis[:, piece] @ loaded[piece]
     return found
 
 
 def _subtract(W: FloatArray, basis: FloatArray, part: FloatArray) -> None:
     """Take `basis.T @ part` from W, in place."""
-    for begin in range(0, W.shape[0], _PIECE):
-        piece = slice(begin, begin + _PIECE)
+    for begin in range(0, W.shape[0], PIECE):
+        piece = slice(begin, begin + PIECE)
         W[piece] -= (part.T @ basis[:, piece]).T
 
 
-#: largest rounding error of the energies that accompany a count
-_ENERGY = 1e-4
 #: largest relative spectral radius of the error of a factor whose inertia is accepted
 _RADIUS = 0.5
 #: number of random vectors that estimate it, and the fraction of its largest effect that all may
@@ -348,7 +337,7 @@ def multifrontal_inertia(
             energy += np.sum(y * moved, axis=0)
             b[front.rows] -= below @ moved
             negative += pivots.negative
-    if not np.all(np.abs(energy - wanted) <= _ENERGY * size):
+    if not np.all(np.abs(energy - wanted) <= FOUR_DIGITS * size):
         raise SolverError(
             f"a count of eigenvalues by L D L^T is not accurate (energies differ by "
             f"{np.max(np.abs(energy - wanted) / size):.1g}): the shift is too close to an "

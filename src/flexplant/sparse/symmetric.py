@@ -11,20 +11,16 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray, IntArray, Matrix
 from ..errors import ModelError
-from ..tolerances import SAME, SPLIT, divisor
+from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT, divisor
 
 #: fraction of non-zero entries below which stored zeros are removed before products
 _FULL = 0.8
 #: ratio of eigenvalues below which one solution finds all with a relative error of 1e-9
 SPREAD = SPLIT
-#: fraction of the largest eigenvalue below which a group of soft modes ends, at the widest gap
-_END = 1e-3
 #: number of rows processed together
 _ROWS = 65536
 #: least number of shapes multiplied together: all shapes of a large model would fill the memory
 _COLUMNS = 16
-#: relative error of an entry in double precision
-PRECISION = float(np.finfo(np.float64).eps)
 #: number of units in the last place below which an eigenvalue counts as zero
 ZERO = 30 * PRECISION
 
@@ -129,7 +125,7 @@ def soft_group(squares: FloatArray) -> int:
     # lower values have an error of the rounding of the largest one, so that gaps among them mean
     # nothing
     sure = np.maximum(squares, 0.1 * SPREAD * top)
-    ratio = np.where(sure[:-1] <= _END * top, sure[1:] / sure[:-1], 0.0)
+    ratio = np.where(sure[:-1] <= NEGLIGIBLE * top, sure[1:] / sure[:-1], 0.0)
     return int(np.argmax(ratio)) + 1
 
 

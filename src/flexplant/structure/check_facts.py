@@ -12,12 +12,12 @@ from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, SolverError
 from ..sparse.factor import is_positive_definite
 from ..sparse.lowest import Lowest, lowest_modes
-from ..sparse.symmetric import PRECISION, ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
-from ..tolerances import SAME, divisor
+from ..sparse.symmetric import ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
+from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel
-from .rigid import ASIDE, FREE, RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
+from .rigid import RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
@@ -164,7 +164,7 @@ def _resisted(model: FEModel) -> dict[int, float]:
     given, free = model.joint_motions, model.rigid_body
     left = given - free @ (free.T @ model.inertia(given))
     size = np.einsum("ij,ij->j", given, model.inertia(given))
-    beyond = np.einsum("ij,ij->j", left, model.inertia(left)) > ASIDE**2 * size
+    beyond = np.einsum("ij,ij->j", left, model.inertia(left)) > NEGLIGIBLE**2 * size
     energy = np.einsum("ij,ij->j", given, np.asarray(model.K @ given))
     hertz = np.sqrt(np.maximum(energy, 0.0) / divisor(size)) / (2.0 * np.pi)
     return {i + 1: float(hertz[i]) for i in np.flatnonzero(beyond).tolist()}
@@ -212,7 +212,7 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     force = np.asarray(K @ motions)
     scale = np.linalg.norm(sizes, axis=0)
     relative = np.linalg.norm(force, axis=0) / divisor(scale)
-    motions = motions[:, (scale > 0) & (relative < FREE)]
+    motions = motions[:, (scale > 0) & (relative < RESIDUAL)]
     motions = motions @ unheld(
         by_rows(K), motions, max(PRECISION, written), farness(given.dofs.xyz)
     )

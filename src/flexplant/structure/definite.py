@@ -243,9 +243,6 @@ def refuse_unstable(model: Any, what: str) -> None:
         )
 
 
-#: fraction of the largest eigenvalue above which eigenvalues have a relative error of 1e-9 when M
-#: is transformed to the identity
-_DIRECT = 1e-6
 #: shift of the inverse problem in units of the rounding of K, so that K + s M is well-conditioned
 _SHIFT = 1e3
 #: number of steps of inverse iteration, and change of the eigenvalues at which it ends
@@ -293,7 +290,7 @@ def elastic_modes(
     squares, vectors = la.eigh(
         stiffness, subset_by_index=(0, kept - 1) if few else None, driver="evr" if few else "evd"
     )
-    if squares.size > 1 and squares[0] < _DIRECT * basis.largest:
+    if squares.size > 1 and squares[0] < TYPED * basis.largest:
         if few:  # all of them, so that the space of the soft ones is accurate
             squares, vectors = la.eigh(stiffness, driver="evd")
         squares, phi = _improved(M, K, rigid, squares, basis.shapes(vectors))

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import CACHED, FloatArray, IntArray
 
-# the plate's twelve-term polynomial: x^p y^q in coordinates from 0 to 1 over the element
-_P = np.array([0, 1, 0, 2, 1, 0, 3, 2, 1, 0, 3, 1])
-_Q = np.array([0, 0, 1, 0, 1, 2, 0, 1, 2, 3, 1, 3])
-#: corners of a plate element, x fastest
-PLATE_CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-#: corners of a brick, x fastest
-BRICK_CORNERS = np.array([corner[::-1] for corner in product((0, 1), repeat=3)])
+# the plate's twelve terms x^p y^q, in coordinates from 0 to 1 over the element: the full cubic, and
+# x^3 y, x y^3
+_TERMS = [(n - q, q) for n in range(4) for q in range(n + 1)] + [(3, 1), (1, 3)]
+_P, _Q = np.transpose(_TERMS)
+#: corners of a plate element and of a brick, x fastest
+PLATE_CORNERS = np.fliplr(list(np.ndindex(2, 2)))
+BRICK_CORNERS = np.fliplr(list(np.ndindex(2, 2, 2)))
 
 
 def beam_stiffness(length: float) -> FloatArray:
@@ -167,10 +167,6 @@ def _mirror_upper(upper: FloatArray) -> FloatArray:
     return np.asarray(upper + np.triu(upper, 1).T, dtype=np.float64)
 
 
-#: number of entries processed together, so that they fit the cache
-_CHUNK = 100_000
-
-
 @dataclass(frozen=True, eq=False)
 class Grid:
     """A line, rectangle or box of elements; some elements may be missing.
@@ -282,7 +278,7 @@ class Grid:
         weight_of, flat = np.hstack(weights), table.reshape(len(terms) * n_corners, -1)
         indices, pointer = self._pattern
         data = np.empty(indices.size)
-        done, step = 0, max(1, _CHUNK // flat.shape[1])
+        done, step = 0, max(1, CACHED // flat.shape[1])
         for start in range(0, self.nodes.size, step):
             some = slice(start, start + step)
             values = _symmetric_sum(weight_of[some], flat).reshape(-1, f, n_seen, f)
@@ -320,7 +316,7 @@ def _repeated_blocks(values: Any, lengths: IntArray, times: int) -> Any:
     # runs of equal blocks are copied together, since a grid has few kinds of nodes
     for length in np.unique(lengths).tolist():
         chosen = np.flatnonzero(lengths == length)
-        step = max(1, 20 * _CHUNK // (length * times))
+        step = max(1, 20 * CACHED // (length * times))
         for k in range(0, chosen.size, step):
             some = chosen[k : k + step]
             inside = np.arange(length)

@@ -235,9 +235,6 @@ def _rounding_warning(found: Facts, digits: int) -> str | None:
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
 
-#: ratio of a diagonal entry to all entries it couples to, above which it counts as a penalty
-_PENALTY = 1e6
-
 
 def widest_dofs(found: Facts, motion: FloatArray) -> tuple[str, ...]:
     """Return the DOFs that move most in a motion (n,), the first first."""
@@ -518,7 +515,7 @@ def _scale_lines(found: Facts) -> Iterator[Line]:
         )
     coupled = coupling > 0
     typical = float(np.median(entries[coupled])) if coupled.any() else 0.0
-    penalty = np.flatnonzero(coupled & (entries > _PENALTY * np.maximum(coupling, typical)))
+    penalty = np.flatnonzero(coupled & (entries > (1.0 / TYPED) * np.maximum(coupling, typical)))
     if penalty.size:
         yield (
             "note",

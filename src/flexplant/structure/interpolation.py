@@ -20,12 +20,6 @@ from .model import FEModel
 #: number of nodes up to which one smooth interpolant is used; for more, the nearest nodes are used
 _GLOBAL = 600
 _NEIGHBOURS = 80
-#: rotation of the material = half the curl: (sign, displacement, derivative along axis)
-_CURL = {
-    "rx": ((1.0, "z", 1), (-1.0, "y", 2)),
-    "ry": ((1.0, "x", 2), (-1.0, "z", 0)),
-    "rz": ((1.0, "y", 0), (-1.0, "x", 1)),
-}
 
 Interpolated = TypeVar("Interpolated", bound=Value)
 
@@ -129,10 +123,16 @@ class ScatteredShape(Interpolation):
         require_known("motion", [direction], DIRECTIONS)
         if direction in self.directions:
             return self._field(direction).values(places)
+        # the rotation of the material is half the curl: rx of dz/dy and -dy/dz, and so on
+        turn = DIRECTIONS.index(direction) % 3
+        second, third = (turn + 1) % 3, (turn + 2) % 3
         terms = [
             (sign, self._field(moved), axis)
-            for sign, moved, axis in _CURL.get(direction, ())
-            if moved in self.directions and self._field(moved).spans(axis)
+            for sign, moved, axis in (
+                (1.0, DIRECTIONS[third], second),
+                (-1.0, DIRECTIONS[second], third),
+            )
+            if direction[0] == "r" and moved in self.directions and self._field(moved).spans(axis)
         ]
         if not terms:
             raise LabelError(

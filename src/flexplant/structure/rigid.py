@@ -17,7 +17,6 @@ from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import DENSE_LIMIT
 from ..sparse.lowest import definite_solver
 from ..sparse.symmetric import (
-    PRECISION,
     ZERO,
     Absolute,
     by_rows,
@@ -26,7 +25,7 @@ from ..sparse.symmetric import (
     orthonormalised,
     unit_diagonal,
 )
-from ..tolerances import NULL, ROUNDING, TYPED, divisor
+from ..tolerances import CLOSE, NEGLIGIBLE, NULL, PRECISION, RESIDUAL, ROUNDING, TYPED, divisor
 
 #: multiple of the usual rounding of a row above which a force belongs to a spring
 _OUTLIER = 30.0
@@ -112,10 +111,6 @@ def _uncancelled_forces(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     return np.asarray((size_of_K @ np.ones((motions.shape[0], 1))) * most)
 
 
-#: largest number of motions of all bodies together; more full columns would fill the memory
-_MOST_MOTIONS = 2000
-
-
 def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
     """Return the number (n,) of the piece each DOF belongs to, 0 being the largest."""
     # pieces are joined by no entry of K or M, the DOFs of one node counting as joined in steps,
@@ -147,7 +142,7 @@ def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
     sizes = np.bincount(piece)
     held = (sizes[piece] == 1) & (stiffness > 0)
     own = np.bincount(piece, weights=there & ~held) > 0
-    if np.count_nonzero(own) < 1 or np.minimum(sizes[own], 6).sum() > _MOST_MOTIONS:
+    if np.count_nonzero(own) < 1 or np.minimum(sizes[own], 6).sum() > DENSE_LIMIT:
         return [np.arange(piece.size)]
     kept = np.flatnonzero(~held)
     owner = np.where(own[piece[kept]], piece[kept], np.argmax(own))
@@ -163,16 +158,10 @@ def _join_parts(label: IntArray, one: Any, other: Any) -> IntArray:
     return np.asarray(csgraph.connected_components(graph.tocsr(), directed=False)[1][label])
 
 
-#: ||K r|| relative to || |K| |r| || below which a motion r costs no energy
-FREE = 1e-10
-#: the same for motions held only because coordinates have few digits: these are examined further
-_NEARLY = 1e-2
 #: largest force of such a motion at any DOF, relative to the largest force of its terms
 _EVERYWHERE = 3e-4
 #: number of steps of inverse iteration from geometric motions to the null vectors of K
 _STEPS = 4
-#: fraction of a motion that may be lost in these steps
-ASIDE = 1e-3
 
 
 def rigid_motions(dofs: DofSet, about: Any = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -306,7 +295,7 @@ def free_motions(
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     scale = divisor(scale)
     force = np.asarray(K @ motions) / scale
-    tolerance = max(FREE, ENERGY * rounding)
+    tolerance = max(RESIDUAL, ENERGY * rounding)
     free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
         return _not_held(M, K, motions, far, rounding)
@@ -319,7 +308,7 @@ def free_motions(
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
     basis = _not_held(M, K, basis, far, rounding)
-    near = right[(values >= tolerance) & (values < _NEARLY)].T
+    near = right[(values >= tolerance) & (values < CLOSE)].T
     if not near.shape[1]:
         return basis
     nearly = motions @ (near / scale[:, None])
@@ -386,7 +375,7 @@ def _null_vectors(
     for candidates in (motions, nearly):
         seen = null.T @ np.asarray(M @ candidates)
         size = np.sqrt(np.einsum("ij,ij->j", candidates, np.asarray(M @ candidates)))
-        kept = np.linalg.norm(seen, axis=0) > (1 - ASIDE) * size
+        kept = np.linalg.norm(seen, axis=0) > (1 - NEGLIGIBLE) * size
         several = np.hstack([*([basis] if candidates is nearly else []), null @ seen[:, kept]])
         whole = orthonormalised(M, several, dependent="drop")
         if whole.shape[1] >= null.shape[1]:
@@ -435,12 +424,6 @@ def rigid_mass(M: Any, dofs: DofSet) -> RigidMass:
         inertia[~moves] = np.nan
         inertia[:, ~moves] = np.nan
     return RigidMass(mass, center, inertia)
-
-
-#: relative error up to which the shapes of a model contain a rigid-body motion. The lowest modes on
-#: springs have an error of the ratio of spring stiffness to that of truncated modes, 1e-5 for a
-#: suspension at 10 Hz below elastic modes at 1 kHz; held structures have 0.1 and more
-SPANNED = 1e-3
 
 
 class Structure(Protocol):

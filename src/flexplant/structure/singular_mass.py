@@ -10,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import COLUMNS, FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import LARGEST_FULL, is_positive_definite, symmetric_lu
 from ..sparse.symmetric import dense, diagonal, unit_diagonal
@@ -152,12 +152,6 @@ def inertial(
     return Inertial(K, M, D, rows, notes)
 
 
-#: number of columns of K_ss^-1 K_sm processed together, so that they fit the cache
-_COLUMNS = 256
-#: largest number of DOFs next to massless ones, limited by the memory of the block that they fill
-_TOO_MANY = 10_000
-
-
 def empty_rows(matrix: Any) -> Any:
     """Return which rows (n,) are zero: those of M belong to DOFs without any mass."""
     return _row_sums(matrix) == 0
@@ -209,16 +203,16 @@ def condensed(
             "they are does not follow from the others. Hold them: without([...])."
         )
     touched = np.flatnonzero(np.diff(K_sm.indptr))
-    if touched.size > _TOO_MANY:
+    if touched.size > LARGEST_FULL:
         raise ModelError(
             f"condensing {counted(s.size, 'massless DOF')} would fill a block of {touched.size} "
-            f"DOFs (limit {_TOO_MANY}). Export a consistent mass matrix, or one with rotary "
+            f"DOFs (limit {LARGEST_FULL}). Export a consistent mass matrix, or one with rotary "
             "inertia."
         )
     sides: Any = sp.diags_array(scale) @ K_sm[:, touched]
     block = np.zeros((touched.size, touched.size))
-    for first in range(0, touched.size, _COLUMNS):
-        part = slice(first, first + _COLUMNS)
+    for first in range(0, touched.size, COLUMNS):
+        part = slice(first, first + COLUMNS)
         block[:, part] = sides.T @ lu.solve(sides[:, part].toarray())
     block = 0.5 * (block + block.T)
     spread: Any = sp.coo_array(block)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray
+from .element_matrices import PLATE_CORNERS
 
 # The shear of an edge is constant and the slope of the section along it quadratic: between ends
 # that turn by t1, t2 and move by z1, z2 over a length L,
@@ -19,8 +20,6 @@ from ..arrays import FloatArray
 
 #: number of points in each direction, which integrates products of two cubics exactly
 _POINTS = 4
-#: pairs of corners of the edges along x and along y, and the DOF and sign of their slope
-_EDGES = ((((0, 1), (2, 3)), 2, -1.0), (((0, 2), (1, 3)), 1, 1.0))
 
 
 def edge_share(softness: Any, length: float) -> Any:
@@ -94,7 +93,10 @@ def plate_parts(s: Any, t: Any, a: float, b: float) -> PlateParts:
     z, twist = (np.zeros((3, count, 12)) for _ in range(2))
     z[0] = spread(corner, 0)
     slopes, bends, shears = [], [], []
-    for axis, (edges, column, sign) in enumerate(_EDGES):
+    for axis in range(2):
+        # the two edges along an axis, by their corners; the DOF of their slope and its sign
+        edges = [(i, i + 1 + axis) for i in np.flatnonzero(PLATE_CORNERS[:, axis] == 0).tolist()]
+        column, sign = 2 - axis, 2.0 * axis - 1.0
         x, length, other, blend = place[axis], lengths[axis], 1 - axis, across[axis]
         excess, turn = _edge_rows(edges, column, sign, length)
         bubble = 6.0 * x * (1.0 - x)

@@ -10,14 +10,12 @@ import scipy.sparse as sp
 from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
 from ..sparse.lowest import lowest_modes, multifrontal_inertia
-from ..tolerances import TINY
+from ..tolerances import ROOT, TINY
 
 #: number of additional frequencies among which a gap for the count is searched
 _EXTRA = 4
 #: largest number of frequencies, since inverse iteration stores all shapes
 MOST = 60
-#: largest residual of a shape relative to its largest forces
-_RESIDUAL = 1e-8
 
 
 def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> FloatArray:
@@ -36,7 +34,7 @@ def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> Float
     values[: found.n_zero] = 0.0
     force, size = K @ shapes - (M @ shapes) * values, abs(K) @ np.abs(shapes)
     off = np.linalg.norm(force, axis=0) / (np.linalg.norm(size, axis=0) + TINY)
-    if off.max(initial=0.0) > max(_RESIDUAL, rounding):
+    if off.max(initial=0.0) > max(ROOT, rounding):
         raise SolverError(
             f"a shape leaves {off.max():.1g} of its forces: the frequencies are not accurate. "
             "Scale the matrices, or give the DOFs and solve_modes."

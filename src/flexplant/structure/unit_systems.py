@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy import constants
 
 from ..arrays import FloatArray, positive
 from ..errors import ModelError, short
@@ -19,26 +20,26 @@ from .rigid import RigidMass
 #: size of each unit in metres, kilograms, seconds
 LENGTHS: Mapping[str, float] = {
     "m": 1.0,
-    "dm": 0.1,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "um": 1e-6,
-    "in": 0.0254,
-    "ft": 0.3048,
+    "dm": constants.deci,
+    "cm": constants.centi,
+    "mm": constants.milli,
+    "um": constants.micro,
+    "in": constants.inch,
+    "ft": constants.foot,
 }
 #: [kg], [m/s^2]: by definition
-POUND, GRAVITY = 0.45359237, 9.80665
+POUND, GRAVITY = constants.pound, constants.g
 MASSES: Mapping[str, float] = {
     "kg": 1.0,
-    "t": 1e3,
-    "g": 1e-3,
-    "mg": 1e-6,
+    "t": constants.metric_ton,
+    "g": constants.gram,
+    "mg": constants.micro,
     "lb": POUND,
     # lbf s^2/ft and lbf s^2/in: what makes pound-force consistent with feet and inches
-    "slug": POUND * GRAVITY / 0.3048,
-    "slinch": POUND * GRAVITY / 0.0254,
+    "slug": constants.slug,
+    "slinch": constants.slinch,
 }
-TIMES: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+TIMES: Mapping[str, float] = {"s": 1.0, "ms": constants.milli, "us": constants.micro}
 
 
 @dataclass(frozen=True)

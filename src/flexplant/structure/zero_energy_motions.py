@@ -14,9 +14,9 @@ from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import LARGEST_FULL
 from ..sparse.lowest import Lowest, lowest_modes
-from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal, orthonormalised
-from ..tolerances import SAME, divisor
-from .rigid import ASIDE, bodies, farness, force_free, free_motions, rigid_motions
+from ..sparse.symmetric import ZERO, dense, diagonal, orthonormalised
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, PRECISION, SAME, divisor
+from .rigid import bodies, farness, force_free, free_motions, rigid_motions
 
 #: motion of a DOF of a mechanism, relative to the largest one, above which it is listed
 _MOVES = 0.05
@@ -59,7 +59,7 @@ def zero_energy(
     possible = motions if joint_motions is None else np.hstack([motions, joint_motions])
     every, basis = _of_bodies(K, M, possible, several, rounding, dofs.xyz)
     left = motions - basis @ (basis.T @ motions)
-    free = present & (np.linalg.norm(left, axis=0) < ASIDE * np.linalg.norm(motions, axis=0))
+    free = present & (np.linalg.norm(left, axis=0) < NEGLIGIBLE * np.linalg.norm(motions, axis=0))
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -191,8 +191,6 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
     return float(np.mean(factors))
 
 
-#: relative error of the first elastic eigenvalue above which a warning is given
-_WORTH = 1e-4
 #: relative errors of entries of K: reported above the first, rounding below the second
 _FINE, _COARSE = 3e-12, 1e-4
 #: least number of loaded rows for a median of their forces
@@ -247,7 +245,7 @@ def endangered(K: Any, M: Any, digits: int) -> str | None:
 
 def verdict(error: float | None, digits: int) -> str | None:
     """Return a text on an error of the first elastic eigenvalue, None when it is harmless."""
-    if error is None or error <= _WORTH:
+    if error is None or error <= FOUR_DIGITS:
         return None
     percent = f"up to {100 * error:.2g} %" if error < 1 else "wholly"
     return (

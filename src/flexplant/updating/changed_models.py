@@ -12,11 +12,11 @@ from ..arrays import FloatArray, Matrix
 from ..errors import ModelError, ShapeError, attempted, warn
 from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
-from ..modes.normal_forms import RIGID_DRAG
 from ..reduction import ReducedModel
 from ..sparse.symmetric import beyond, matrix_sum, orthonormalised
 from ..structure.definite import why_indefinite
 from ..structure.model import FEModel
+from ..tolerances import FOUR_DIGITS
 from .family import Family, Point, pair
 from .parameters import Parameter, PointParameter
 from .residuals.residual import Residual
@@ -94,7 +94,7 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     rigid = held.rigid_body
     drag = float(np.abs(np.linalg.eigvalsh(rigid.T @ np.asarray(D @ rigid))).max())
     first = solve_modes(held, count=rigid.shape[1] + 1).omega[-1]
-    if drag > RIGID_DRAG * float(first):
+    if drag > FOUR_DIGITS * float(first):
         return None
     # the rigid-body part of D + d M is 0 in theory, so that twice d is above rounding
     shifted = matrix_sum(D, 2.0 * drag * held.M)
@@ -152,8 +152,6 @@ def _impossible(
 WIDER = 4
 #: number of DOFs above which an FEModel is updated in such a basis, and above which it is too large
 LARGE, TOO_LARGE = 300, 20_000
-#: largest number of bases of a large FEModel until its estimate is constant
-MOST_ROUNDS = 10
 
 
 def is_large(model: Any) -> bool:

@@ -13,11 +13,12 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, counted, some_names
 from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
+from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import DEVIATIONS, INTERVAL, SAME, TYPED, divisor
 from ..words import instance
 from .family import Point
-from .residuals.modal_residuals import USUAL, ZETA, Eigenvalues, growth
+from .residuals.modal_residuals import USUAL, Eigenvalues, growth
 from .residuals.residual import Bound, Kind
 from .search import Objective, SearchEnd
 from .search.objective import SearchPlan
@@ -29,8 +30,6 @@ USUAL_DOF = 2.0
 #: largest number of rounds of weights and parameters, and relative change of the deviations at
 #: which they end
 _ROUNDS, _SETTLED = 20, 0.01
-#: largest number of rows with a joint covariance, which is factored
-_MOST_ROWS = 1000
 #: search range of the deviations, in units of the usual ones
 _LEAST, _MOST = 1e-3, 1e4
 
@@ -153,7 +152,7 @@ def weigh_discrepancy(
     rows = objective.rows(objective.at(end.p))
     kinds = [bound.kinds() for bound, _ in rows]
     count = rows[-1][1].stop
-    if not objective.noise_known or not all(kinds) or count > _MOST_ROWS:
+    if not objective.noise_known or not all(kinds) or count > DENSE_LIMIT:
         return end, ()
     own, defect = list(objective.bounds), objective.defect
     noise, spread = np.eye(count), []
@@ -196,14 +195,8 @@ def weigh_discrepancy(
 #: least relative errors of measured frequencies and damping: the drift of a machine exceeds the
 #: noise, and its damping depends on amplitude and temperature
 _DRIFT = (1e-3, 0.02)
-#: number of standard deviations that count for a measured pole
-_DEVIATIONS = 2.0
 #: factor on the error between two meshes: without it 55 to 100 % of modes were covered
 _MESH = 1.5
-#: probability outside of an interval, both sides together
-_OUTSIDE = 0.05
-#: relative deviation of measured poles with unknown noise: rounding only
-_EXACT = 1e-9
 #: standard deviation of the logarithm of a damping ratio without information
 _SILENT = 1e2
 #: prior uncertainty of a parameter: relative change of the pole that it changes most
@@ -296,11 +289,11 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     both = np.r_[places, m + places]
     S = _relative_changes(found.poles, found.S)
     # zero damping of a model or a measurement has no information
-    damped = np.minimum(_damping(poles), _damping(own)) > ZETA
+    damped = np.minimum(_damping(poles), _damping(own)) > TYPED
     said = np.r_[np.full(damped.size, True), damped]
     ratio = _damping(poles) / divisor(_damping(own))
     gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(damped, ratio, 1.0))]
-    known = np.eye(said.size) * _EXACT**2
+    known = np.eye(said.size) * SAME**2
     if measured.covariance is not None:
         G = _relative_changes(poles, np.hstack([np.eye(poles.size), 1j * np.eye(poles.size)]))
         known += G @ measured.covariance @ G.T
@@ -319,8 +312,8 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
         covariance[silent, silent] = np.diag(known)[~said]
     from scipy.special import stdtrit
 
-    width = np.repeat(stdtrit(dof, 1 - 0.5 * _OUTSIDE), m)
-    width[both] = _DEVIATIONS
+    width = np.repeat(stdtrit(dof, 0.5 * (1 + INTERVAL)), m)
+    width[both] = DEVIATIONS
     # in logarithms, so that the upper side is wider
     share = np.expm1(np.abs(mean) + width * np.sqrt(np.diag(covariance)))
     if mesh is not None:
@@ -386,5 +379,5 @@ def _relative_changes(poles: ComplexArray, changes: ComplexArray) -> FloatArray:
     """Return relative changes (2m, q) of frequencies and of damping ratios by those of poles."""
     part = np.real(changes / poles[:, None])
     # an undamped pole has no relative damping, so that it is left out
-    damped = np.where(_damping(poles) > ZETA, poles.real, np.inf)
+    damped = np.where(_damping(poles) > TYPED, poles.real, np.inf)
     return np.vstack([part, changes.real / damped[:, None] - part])

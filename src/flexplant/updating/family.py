@@ -13,16 +13,13 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import CACHED, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import RANK, SAME, TINY
+from ..tolerances import FOUR_DIGITS, RANK, ROOT, SAME, TINY
 from .parameters import Parameter
-
-#: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
-REPEATED = 1e-8
 
 
 @dataclass(frozen=True)
@@ -299,7 +296,7 @@ def repeated_groups(poles: ComplexArray) -> list[list[int]]:
     """Return the groups of exactly repeated modes: equal frequency and damping."""
     if not poles.size:
         return []
-    near = np.abs(poles[:, None] - poles) <= REPEATED * np.abs(poles)[:, None]
+    near = np.abs(poles[:, None] - poles) <= ROOT * np.abs(poles)[:, None]
     first = np.argmax(near, axis=1)
     found = (np.flatnonzero(first == i) for i in np.unique(first))
     return [group.tolist() for group in found if group.size > 1]
@@ -369,8 +366,6 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
 
 #: largest rank that is searched, and relative size below which an entry is rounding
 FEW, ROUNDING = 4, 1e-11
-#: relative remainder of a matrix up to which one outer product replaces it
-EXACT = 1e-14
 
 
 def factors(
@@ -402,17 +397,13 @@ def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
     for A, own in zip(stack, found, strict=True):
         if not A.any():
             continue
-        one = factors(A, most=1, rounding=EXACT)
+        one = factors(A, most=1, rounding=RANK)
         if one is None:
             own[:] = V.T @ A @ V
         else:
             c = one[0][1] @ V
             own[:] = one[0][0] * np.outer(c, c)
     return found
-
-
-#: number of entries of bordered systems that are solved together
-TOGETHER = 1_000_000
 
 
 class Point:
@@ -509,7 +500,7 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
     turn = -1j if real else 1.0
     kind = np.float64 if real else np.complex128
     dX, dL = np.zeros((count, s, k, q), complex), np.zeros((count, s, s, q), complex)
-    together = max(1, TOGETHER // (k + s) ** 2)
+    together = max(1, CACHED // (k + s) ** 2)
     for first in range(0, count * s, together):
         own = np.arange(first, min(first + together, count * s))
         lam, members = poles[own], (own // s * s)[:, None] + np.arange(s)
@@ -530,8 +521,6 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
 
 #: relative distance below which modes form a cluster: their shapes mix at the smallest change
 CLUSTER = 0.02
-#: MAC below which two shapes of a cluster are independent
-FOREIGN = 1e-4
 
 
 def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
@@ -554,7 +543,7 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
 def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
     s, new = old.size, np.sort(new)
-    near = shapes[np.ix_(old, new)] > FOREIGN
+    near = shapes[np.ix_(old, new)] > FOUR_DIGITS
     if near.all() or np.array_equal(near, np.eye(s)):
         return new  # the usual case at every point of a search; a graph costs ten times as much
     linked = np.zeros((2 * s, 2 * s), dtype=bool)

@@ -13,17 +13,16 @@ from ..arrays import FloatArray, whole
 from ..errors import ModelError, counted
 from ..identification import MeasuredModes
 from ..modes import Modes
+from ..seeds import REFUSED
 from ..store import Value
+from ..tolerances import TYPED
 from ..words import instance
 from .parameters import AddedMass, Parameter, PointParameter
-from .residuals.modal_residuals import ZETA
 from .trend import Trend, trend_of
 
 #: number of draws for an interval by a log-normal distribution: the deviation of the logarithm is
 #: then known to 11 %
 COUNT = 40
-#: number of consecutive refused draws after which the posterior counts as empty
-_REFUSED = 200
 
 
 class Draw(NamedTuple):
@@ -107,18 +106,18 @@ class Machines(Value):
         """Logarithms of measured damping ratios over those of the model (of damped modes)."""
         poles = self.measured.poles
         found = -poles.real / np.abs(poles)
-        return np.log(found[found > ZETA] / self._own_damping[found > ZETA])
+        return np.log(found[found > TYPED] / self._own_damping[found > TYPED])
 
     @cached_property
     def _own_damping(self) -> FloatArray:
         """Damping ratios of the model's measured modes; 1 where it has none."""
         modes: Modes = self.fit.modes()
         zeta = np.array([modes.zeta[number - 1] for number in self.measured.modes or ()])
-        return np.where(zeta > ZETA, zeta, 1.0)
+        return np.where(zeta > TYPED, zeta, 1.0)
 
     def draw(self, rng: np.random.Generator) -> Draw:
         """Return one machine that agrees with the measurement, without negative masses."""
-        for _ in range(_REFUSED):
+        for _ in range(REFUSED):
             s, moved, b = self.trend.posterior(rng)
             dp = np.zeros(self.fit.values.size)
             dp[list(self.trend.moves)] = moved
@@ -130,7 +129,7 @@ class Machines(Value):
             if all(masses):
                 return Draw(s, dp, b, rng.random(), self._damping(rng), self._poles(rng), rng)
         raise ModelError(
-            f"{_REFUSED} consecutive draws have a negative added mass: nothing was added there, "
+            f"{REFUSED} consecutive draws have a negative added mass: nothing was added there, "
             "or the model has another error. Leave the parameter out."
         )
 

@@ -16,17 +16,13 @@ from ..arrays import FloatArray, Matrix, element_mask, positive, real_array, who
 from ..errors import LabelError, ModelError, ShapeError, short
 from ..modes import solve_modes
 from ..reduction import ReducedModel
-from ..sparse.factor import DENSE_LIMIT
+from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL
 from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
 from ..tolerances import SAME
 from ..words import function, mapping
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
-
-#: the damping matrix of one mode is full; beyond this many DOFs it would not fit the memory
-DENSE_DAMPING_LIMIT = 5000
-
 
 #: the matrices that parameters name
 PARTS = ("dM", "dD", "dK")
@@ -269,10 +265,10 @@ class ModeDamping(Parameter):
                 f"no elastic mode {self.mode}: the model has {r} rigid-body modes, which are "
                 f"undamped, and elastic ones to {k}."
             )
-        if k > DENSE_DAMPING_LIMIT:
+        if k > LARGEST_FULL:
             raise ModelError(
                 f"{self.name} would fill the damping matrix of {k} DOFs (limit "
-                f"{DENSE_DAMPING_LIMIT}). Apply it to a reduced model."
+                f"{LARGEST_FULL}). Apply it to a reduced model."
             )
         if sp.issparse(model.K) and k > DENSE_LIMIT:
             modes = solve_modes(model, count=self.mode, damping=ModalDamping(0.0))

@@ -19,7 +19,7 @@ from ..errors import (
     counted,
 )
 from ..seeds import Rng, generator
-from ..tolerances import TINY, divisor
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, TINY, TYPED, divisor
 from .changed_models import changed_model
 from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
@@ -36,8 +36,6 @@ Reached: TypeAlias = SearchEnd | FlexplantError
 
 #: relative variance of each entry of a response in the first fit, in addition to its noise
 EVEN = 0.1
-#: relative tolerance of an approximate fit
-ENOUGH = 1e-3
 
 
 def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchEnd:
@@ -56,7 +54,7 @@ def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchE
         family=objective.family,
     )
     objective.path = []
-    near = SearchPlan(TrustRegion(), search.most, max(search.tolerance, ENOUGH))
+    near = SearchPlan(TrustRegion(), search.most, max(search.tolerance, NEGLIGIBLE))
     before = None
     with attempted("poles first, before shapes and responses"):
         points = near.begun(stage, begin).trail.p
@@ -95,9 +93,6 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
 
 #: remaining fraction of the measured power above which a minimum does not explain the measurement
 POOR_FIT = 0.1
-#: relative distance of a pole from the measured one, beyond noise, above which a wrong pairing is
-#: possible
-FAR = 1e-3
 #: number of additional starts that are always tried, for models up to a number of DOFs and for
 #: larger ones; near a second minimum about half of them end in the other one
 ALWAYS, ALWAYS_LARGE, SMALL = 4, 2, 100
@@ -109,14 +104,6 @@ GLANCE, WORTH = 10, 10.0
 #: number of starts in the best minimum after which no other is tried: a minimum that a third of all
 #: starts reach is then missed in 4 % of cases
 AGREED = 8
-#: relative difference of costs that counts as zero, from the tolerance of a search
-SAME_COST = 1e-6
-#: relative residual of exact data at the end of a search
-EXACT = 1e-8
-#: tolerance of a first search; the best one is refined to the given tolerance
-NEARLY = 1e-6
-#: relative change of the fitted values below which two ends are one, if the noise is not known
-SAME_END = 1e-4
 
 
 class _GradedEnd(NamedTuple):
@@ -147,7 +134,7 @@ class _Tried:
         """Search from a start; `led`: through easier problems first."""
         best, search = self.best, self.search
         if self.ends:
-            search = search._replace(tolerance=max(search.tolerance, NEARLY))
+            search = search._replace(tolerance=max(search.tolerance, TYPED))
         ended = best is not None and best.end.converged
         glance = search._replace(most=GLANCE) if ended and search.most is None else search
         end = _reached(_led if led else SearchPlan.begun, glance, self.objective, begin)
@@ -160,7 +147,7 @@ class _Tried:
         if isinstance(end, SearchEnd):
             if not self.found:
                 size = self.objective.size(self.objective.at(end.p))
-                self.rounding = (EXACT * float(np.linalg.norm(size))) ** 2
+                self.rounding = (ROOT * float(np.linalg.norm(size))) ** 2
             self.found.append(_graded_end(self.objective, end, named=named))
 
     @property
@@ -171,7 +158,7 @@ class _Tried:
         pool = [one for one in pool if one.likely] or pool
         best: _GradedEnd | None = None
         for one in pool:
-            if best is None or one.end.cost < (1 - SAME_COST) * best.end.cost - self.rounding:
+            if best is None or one.end.cost < (1 - TYPED) * best.end.cost - self.rounding:
                 best = one
         return best
 
@@ -181,7 +168,7 @@ class _Tried:
         best = self.best
         if best is None or not best.end.converged:
             return False
-        near = (1 + SAME_COST) * best.end.cost + self.rounding
+        near = (1 + TYPED) * best.end.cost + self.rounding
         return sum(one.end.converged and one.end.cost <= near for one in self.found) >= AGREED
 
     @property
@@ -299,7 +286,7 @@ def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
     if poles is None or not alone or point.p.size < 2:
         return False
     found = point.eigen.poles[point.columns(poles.numbers)]
-    far = np.max(np.abs(found - poles.target) / np.abs(poles.target)) >= FAR
+    far = np.max(np.abs(found - poles.target) / np.abs(poles.target)) >= NEGLIGIBLE
     return bool(far) or not end.converged
 
 
@@ -373,7 +360,7 @@ def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd
     """
     change = np.abs(objective.slopes(point) @ (a.p - b.p))
     noise = objective.noise_known and float(np.linalg.norm(change)) < a.p.size**0.5
-    return noise or bool(np.max(change / objective.size(point)) < SAME_END)
+    return noise or bool(np.max(change / objective.size(point)) < FOUR_DIGITS)
 
 
 def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> FloatArray:
@@ -392,7 +379,7 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
         found.append((chi2 or 0.0) - least)
     objective.follow(best.trail.p)
     above = np.array(found, dtype=np.float64)
-    return np.asarray(np.where(np.abs(above) < SAME_COST * least, 0.0, above), dtype=np.float64)
+    return np.asarray(np.where(np.abs(above) < TYPED * least, 0.0, above), dtype=np.float64)
 
 
 def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, ModelError, counted, short
 from ..store import Value
-from ..tolerances import divisor
+from ..tolerances import MISSED, SAME, divisor
 from ..words import several
 from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter, checked_parameters, checked_values
@@ -167,12 +167,6 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     return [int(number) - first for number in modes]
 
 
-#: fraction of its possible effect below which the effect of a parameter is rounding
-UNSEEN = 1e-9
-#: singular value of S, with columns of length one, below which a step leaves it out
-SINGULAR = 1e-7
-
-
 class PoleRows:
     """All measured eigenvalues of an objective, weighted as its residuals weigh them."""
 
@@ -232,9 +226,9 @@ def _best_split(
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
         turned, eigen = along(way)
         # rounding in the row of a vector that stays would give a step without bounds
-        felt = np.where(np.abs(turned) > UNSEEN * scale, turned, 0.0)
+        felt = np.where(np.abs(turned) > SAME * scale, turned, 0.0)
         white = data.whitened(felt) / scale
-        step = np.linalg.lstsq(white, data.whitened(gap), rcond=SINGULAR)[0] / scale
+        step = np.linalg.lstsq(white, data.whitened(gap), rcond=MISSED)[0] / scale
         if np.any(step):
             turned, eigen = along(step)
         left = float(np.sum(data.whitened(gap - turned @ step) ** 2))

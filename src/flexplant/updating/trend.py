@@ -14,16 +14,12 @@ from ..arrays import FloatArray
 from ..errors import ModelError
 from ..identification import MeasuredModes
 from ..store import Value
-from ..tolerances import ROUNDING, TINY
+from ..tolerances import CHANCE, INTERVAL, ROUNDING, TINY
 from .sensitivities import eigenvalue_sensitivities
 
-#: probability of a false alarm for a correct model
-LEVEL = 0.003
 #: gap of two modes, in deviations of a frequency, below which scatter mixes their shapes by more
 #: than a tenth: sqrt(2) over the gap
 MIXED = 14.0
-#: probability of an interval of a frequency in the comparison of pairs
-_HELD = 0.95
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +121,7 @@ class Trend(Value):
     @property
     def is_significant(self) -> bool:
         """Whether the slope is significant (probability by chance below 0.3 %)."""
-        return self.p_value < LEVEL
+        return self.p_value < CHANCE
 
     @property
     def unshaped_pairs(self) -> tuple[tuple[int, int], ...]:
@@ -136,7 +132,7 @@ class Trend(Value):
             return ()
         order = np.argsort(self.model_freq)
         gaps = np.diff(np.log(self.model_freq[order]))
-        wide = float(stdtrit(self.dof, 0.5 * (1 + _HELD))) * np.sqrt(2.0) * self.deviation
+        wide = float(stdtrit(self.dof, 0.5 * (1 + INTERVAL))) * np.sqrt(2.0) * self.deviation
         numbers = [self.modes[i] for i in order]
         return tuple((numbers[i], numbers[i + 1]) for i in np.flatnonzero(gaps < wide).tolist())
 
@@ -173,7 +169,7 @@ class Trend(Value):
         others = np.maximum(left @ left - left * alone, TINY) / (dof - 1)
         chance = 2.0 * m * stdtr(dof - 1, -np.abs(alone) * np.sqrt(free / others))
         worst = int(np.argmin(chance))
-        return (self.modes[worst], float(alone[worst])) if chance[worst] < LEVEL else None
+        return (self.modes[worst], float(alone[worst])) if chance[worst] < CHANCE else None
 
     @property
     def missing(self) -> str:

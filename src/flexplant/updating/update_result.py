@@ -13,27 +13,21 @@ from ..arrays import ComplexArray, FloatArray, between, positive, whole
 from ..errors import ModelError, attempted, counted, require_known, short
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
-from ..modes.matching import in_span
+from ..modes.matching import ALIKE, in_span
 from ..seeds import MOST_DRAWS, Rng, generator
+from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
+from ..tolerances import INTERVAL
 from ..words import with_deviation
 from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
+from .family import CLUSTER
 from .judgement.goodness import chance, is_bad
 from .machines import COUNT, Machines
 from .parameters import AddedMass, Parameter
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
 from .trend import Trend, trend_of
-
-#: probability of the interval of two printed deviations
-SHARE = 0.95
-#: MAC below which two shapes are usually said to be of different modes
-_ALIKE = 0.9
-#: relative distance of frequencies of modes that mix in any machine
-_FAMILY = 0.02
-#: largest number of DOFs of a full model whose modes are solved for printing
-_DENSE = 1500
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -287,13 +281,13 @@ class UpdateResult(Value):
     def _trend_lines(self) -> list[str]:
         """Text on the trend of the fitted frequencies, and pairs that may be swapped."""
         model = self.model
-        if self.fitted_poles is None or not (hasattr(model, "T") or model.n_dof <= _DENSE):
+        if self.fitted_poles is None or not (hasattr(model, "T") or model.n_dof <= DENSE_LIMIT):
             return []
         found = None
         with attempted("the trend of the residual", ModelError):
             found = self.trend()
         lines = [] if found is None or found.dof < 1 or not found.missing else [found.missing]
-        unlike = {mode: mac for mode, mac in self.likeness().items() if mac < _ALIKE}
+        unlike = {mode: mac for mode, mac in self.likeness().items() if mac < ALIKE}
         lines += [
             f"mode {mode} has another shape than measured (MAC {mac:.2f}): what is promised of it "
             "does not hold"
@@ -327,7 +321,7 @@ class UpdateResult(Value):
         rows = np.array([modes.at(tuple(at), direction) for at, direction in points])
         found = {}
         for k, mode in enumerate(numbers):
-            near = np.abs(modes.omega / modes.omega[mode - 1] - 1.0) <= _FAMILY
+            near = np.abs(modes.omega / modes.omega[mode - 1] - 1.0) <= CLUSTER
             found[mode] = float(in_span(rows[:, near & own], given.shapes[:, [k]])[0])
         return found
 
@@ -383,7 +377,7 @@ class UpdateResult(Value):
         std, rejected = self.std, is_bad(self.p_value)
         if std is None or (rejected and not self.discrepancy):
             return [None] * len(self.parameters)
-        return list((self._wider_std(SHARE) if rejected else std).tolist())
+        return list((self._wider_std(INTERVAL) if rejected else std).tolist())
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
         """Return draws (count, q), normal with `values` and `covariance` (Laplace's posterior).

@@ -13,9 +13,9 @@ from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress, expect
 from ..seeds import Rng, generator
 from ..structure.model import FEModel
-from ..tolerances import TINY
+from ..tolerances import CLOSE, MOST_STEPS, TINY, TYPED
 from ..words import flag, instance
-from .changed_models import MOST_ROUNDS, FullBasis, changed_model, is_large
+from .changed_models import FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst
 from .parameters import Parameter, checked_parameters, checked_values
@@ -26,8 +26,6 @@ from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .update_result import History, UpdateResult
 
-#: distance to a bound, relative to that between bounds, below which a parameter is at its bound
-AT_BOUND = 1e-6
 #: number of standard deviations by which the last round of defect correction may change the
 #: estimate
 UNSETTLED = 0.5
@@ -176,7 +174,7 @@ def update(
     if full is not None:
         basis = FullBasis(full, listed, given, model)
     elif is_large(model):
-        basis, rounds = FullBasis(model, listed, given), MOST_ROUNDS
+        basis, rounds = FullBasis(model, listed, given), MOST_STEPS
         used = basis.at(checked_values(start, listed, "start"))
     objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
@@ -251,7 +249,7 @@ def _result(
     point = objective.at(best.p)
     low, high, p = objective.lower, objective.upper, best.p
     unit = unit_changes(objective, objective.slopes(point, prior=False))
-    near = AT_BOUND * np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(p), unit))
+    near = TYPED * np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(p), unit))
     names = np.array([q.name for q in objective.parameters], dtype=object)
     at_bound = tuple(names[(p - low <= near) | (high - p <= near)].tolist())
     fitted = np.array([q.name not in at_bound for q in objective.parameters])
@@ -339,8 +337,6 @@ def _complaint(fit: UpdateResult, named: str) -> str:
 
 #: what makes an update shorter
 _ADVICE = "A smaller reduced model, fewer lines or channels of responses, or starts=1 take less."
-#: standard deviations by which a round moves the estimate that need no further round
-STILL = 1e-2
 
 
 def corrected(
@@ -373,7 +369,7 @@ def corrected(
         drawn = search.method.penalised
         end = search.begun(objective, first) if drawn else search.resumed(objective, end)
         estimates.append(end.p)
-        if normalised_step(objective, end.p, estimates[-2]) < STILL:
+        if normalised_step(objective, end.p, estimates[-2]) < CLOSE:
             break
         expect(seconds=perf_counter() - begin, more=True)  # another round takes as long
     return end, estimates

@@ -27,13 +27,9 @@ from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from ..synthesis.laws.law import Axes, Law
 
-#: standard deviations of a line that the band around it shows
-DEVIATIONS = 2.0
 #: change from a peak to its neighbour, relative to the peak, above which fewer than four lines lie
 #: within the half-power width of a mode
 _STEP = 0.5
-#: logarithmic part of the frequencies at which a model is drawn
-_POINTS = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +63,7 @@ class BenchMachine:
         """Where it is drawn [Hz]: its lines, or through the resonances of a model."""
         if self.is_measured:
             return np.asarray(self.axes.plant.freq)
-        grid = resonance_grid(self.axes.plant.poles(), self.axes.plant.dt, points=_POINTS)
+        grid = resonance_grid(self.axes.plant.poles(), self.axes.plant.dt)
         return np.asarray(grid[grid > 1e-5 * grid[-1]])  # what a picture shows
 
     @cached_property

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..synthesis import Notch, ShapedAxis
-from ..tolerances import TINY
+from ..tolerances import DEVIATIONS, TINY
 from .controls import name_of, with_element
-from .evaluation import DEVIATIONS, AxisLoop
+from .evaluation import AxisLoop
 from .verdict import LoopLimits
 
 #: colours that differ in brightness too: the loop, its second curve, the worst machine,

@@ -13,13 +13,13 @@ from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
-from ...tolerances import ROUNDING, SAME
+from ...tolerances import DEVIATIONS, ROUNDING, SAME
 from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
-from .kind import DEVIATIONS, Known, Uncertainty
+from .kind import Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, modal_realisation, require_elastic
 from .parameter_amounts import ParameterDelta
 

@@ -10,12 +10,10 @@ import numpy as np
 from ...arrays import FloatArray
 from ...lti.statespace import StateSpace
 from ...store import Value
+from ...tolerances import DEVIATIONS
 from ..partitioned import Partition
 from .delta import Delta
 from .delta_blocks import Block
-
-#: standard deviations at which a Delta is 1, where nothing else is said
-DEVIATIONS = 2.0
 
 
 class Known(NamedTuple):

@@ -10,13 +10,13 @@ import numpy as np
 
 from ...arrays import FloatArray, positive, real_array
 from ...errors import ModelError
-from ...tolerances import SAME, TINY
+from ...tolerances import DEVIATIONS, SAME, TINY
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from ..remade import rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts
-from .kind import DEVIATIONS, Known, Uncertainty
+from .kind import Known, Uncertainty
 from .mode_delta import modal_realisation, require_elastic
 
 

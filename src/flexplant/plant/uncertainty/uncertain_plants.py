@@ -16,6 +16,7 @@ from ...identification import MeasuredModes
 from ...lti.interconnection import append, lft
 from ...lti.statespace import StateSpace
 from ...store import Value
+from ...tolerances import DEVIATIONS
 from ...updating import Machines, ModalUncertainty, UpdateResult
 from ...words import mapping
 from ..building import P
@@ -24,7 +25,7 @@ from .channels import Opened, missed
 from .delta import Delta, with_changes
 from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
-from .kind import DEVIATIONS, Known, Uncertainty
+from .kind import Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta
 from .neglected import Neglected
 from .neglected_dynamics import NeglectedModes, with_neglected

@@ -14,6 +14,7 @@ from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
 from ...store import Value
 from ...structure.model import FEModel
+from ...tolerances import CLOSE
 from ..changed_models import FullBasis
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
@@ -193,8 +194,6 @@ def _singles(
     return values, score, criterion
 
 
-#: largest fraction of the residual by which rivals explain less than the best
-NEAR = 0.01
 #: difference of BIC that is very strong evidence ([KassRaftery1995]_: 10)
 CERTAIN = 10.0
 #: number of names in a line of a repr, and of lines in a table
@@ -311,7 +310,7 @@ class Localisation(Value):
         of the residual, which a model error could cause or hide: for example mirror images on a
         symmetric structure.
         """
-        least = float(np.max(self.score)) - NEAR
+        least = float(np.max(self.score)) - CLOSE
         return tuple(name for name in self.ranking[1:] if self[name] >= least)
 
     @property
@@ -351,9 +350,8 @@ class Localisation(Value):
             text += f"\n  AMBIGUOUS, {sets}{len(self.alike)} alike: {names}"
         rivals = [name for name in self.rivals if name not in self.alike]
         if rivals and self.chosen:
-            text += (
-                f"\n  differs by less than {NEAR:.0%} of the data from: {some_names(rivals, SHOWN)}"
-            )
+            named = some_names(rivals, SHOWN)
+            text += f"\n  differs by less than {CLOSE:.0%} of the data from: {named}"
         if self.chosen and np.isfinite(self.next_bic):
             said = "NOT CERTAIN, next" if self.margin < CERTAIN else "next"
             other = ", ".join(self.next_best) or "no change"

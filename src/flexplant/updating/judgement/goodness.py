@@ -12,19 +12,10 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ...arrays import FloatArray
-from ...tolerances import TINY, divisor
+from ...tolerances import CHANCE, NEGLIGIBLE, ROUNDING, SAME, TINY, TYPED, divisor
+from ...words import SHOWN
 from ..family import Point
 from ..search import Objective
-
-#: p-value below which noise does not explain the misfit
-CHANCE = 1e-4
-#: number of residuals that are named
-NAMED = 3
-#: singular values of the scaled sensitivities below this fraction of the largest count as zero
-SINGULAR = 1e-9
-#: singular value of a combination of parameters, relative to the largest, below which it is not
-#: determined
-LOST = 1e-6
 
 
 def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[float | None, int]:
@@ -68,7 +59,7 @@ def _orthonormal(J: FloatArray) -> FloatArray:
     if not J.size:
         return J
     U, s, _ = np.linalg.svd(J / divisor(np.linalg.norm(J, axis=0)), full_matrices=False)
-    return np.asarray(U[:, s > LOST * s[0]])
+    return np.asarray(U[:, s > TYPED * s[0]])
 
 
 def _whitened(noise: Any, rows: FloatArray) -> FloatArray:
@@ -108,10 +99,10 @@ def worst(objective: Objective, point: Point) -> str:
             continue
         part, noise = r[rows], bound.noise
         size = np.abs(part) if noise is None else np.abs(part) / np.sqrt(noise.diagonal())
-        for row in np.argsort(-size, kind="stable")[: 2 * NAMED].tolist():
+        for row in np.argsort(-size, kind="stable")[: 2 * SHOWN].tolist():
             name = bound.row_name(row)
             found[name] = max(found.get(name, 0.0), float(size[row]))
-    order = sorted(found, key=lambda name: -found[name])[:NAMED]
+    order = sorted(found, key=lambda name: -found[name])[:SHOWN]
     return ", ".join(f"{name} ({found[name]:.3g} standard deviations)" for name in order)
 
 
@@ -124,7 +115,7 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     length = np.linalg.norm(J, axis=0)
     safe = divisor(length)
     U, s, Vt = np.linalg.svd(J / safe, full_matrices=False)
-    inverse = np.where(s > SINGULAR * s[0], 1 / np.maximum(s, TINY), 0.0)
+    inverse = np.where(s > SAME * s[0], 1 / np.maximum(s, TINY), 0.0)
     half = (Vt.T * inverse) / safe[:, None]
     unit = half @ half.T
     # U^T N U, with N the covariance of known rows (a unit matrix of priors) and of the others
@@ -149,17 +140,8 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     size = divisor(std)
     correlation = unit / np.outer(size, size)
     np.fill_diagonal(correlation, 1.0)
-    regular = s.size == q and bool(s[-1] > SINGULAR * s[0])
+    regular = s.size == q and bool(s[-1] > SAME * s[0])
     return (found if regular else None), correlation
-
-
-#: relative change of the data, relative to the largest change of an eigenvalue by the parameter,
-#: below which it is rounding
-ROUNDING = 1e-12
-
-
-#: fraction of a combination below which a parameter is not printed
-MINOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +161,7 @@ class Resolution:
     @property
     def clear(self) -> npt.NDArray[np.bool_]:
         """Which combinations (q,) are determined."""
-        return np.asarray(self.values > LOST * self.values[0])
+        return np.asarray(self.values > TYPED * self.values[0])
 
     def combinations(self, names: Sequence[str]) -> list[str]:
         """Return a text for each determined combination, with as few parameters as possible."""
@@ -189,7 +171,7 @@ class Resolution:
         rank = len(rows)
         pivots = la.qr(self.axes[self.clear], mode="r", pivoting=True)[1][:rank]
         reduced = np.linalg.solve(rows[:, pivots], rows)
-        felt = np.abs(reduced) / self.length > MINOR / self.length[pivots][:, None]
+        felt = np.abs(reduced) / self.length > NEGLIGIBLE / self.length[pivots][:, None]
         return [
             " ".join(
                 [

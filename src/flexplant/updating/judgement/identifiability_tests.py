@@ -11,19 +11,15 @@ import numpy as np
 from ...arrays import FloatArray
 from ...errors import counted
 from ...store import Value
-from ...tolerances import TINY
+from ...tolerances import NEGLIGIBLE, TINY, TYPED
+from ...words import SHOWN
 from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
-from .goodness import LOST, resolution
+from .goodness import resolution
 
 #: correlation above which a pair is listed
 CORRELATED = 0.99
-#: change of an eigenvalue by a combination, relative to that by its parts, below which it does not
-#: determine the combination
-CANCELS = 1e-3
-#: number of modes that are named as missing
-NAMED = 3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +61,7 @@ class IdentifiabilityReport(Value):
     @property
     def rank(self) -> int:
         """Number of combinations of parameters that can be determined."""
-        return int(np.sum(self.singular_values > LOST * self.singular_values[0]))
+        return int(np.sum(self.singular_values > TYPED * self.singular_values[0]))
 
     def __repr__(self) -> str:
         lines = [
@@ -186,13 +182,13 @@ def _missing_modes(
     parts = np.abs(S) @ np.abs(lost.T)
     # terms that cancel except for rounding, or truncation of the model, determine nothing
     felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
-    clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
+    clear = np.where(felt & (along > NEGLIGIBLE * parts), along, 0.0)
     found = {}
     for name in poor:
         # contributes
         own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
         share = np.max(clear[:, own], axis=1, initial=0.0)
-        order = np.argsort(-share, kind="stable")[:NAMED]
+        order = np.argsort(-share, kind="stable")[:SHOWN]
         largest = share.max(initial=0.0)
         # modes that contribute only rounding
         found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)

@@ -11,8 +11,8 @@ import scipy.linalg as la
 
 from ...arrays import FloatArray
 from ...errors import ModelError, SolverError
-from ...modes.matching import mac_matrix
-from ...tolerances import TINY, divisor
+from ...modes.matching import ALIKE, mac_matrix
+from ...tolerances import CLOSE, MOST_STEPS, NEGLIGIBLE, TINY, TYPED, divisor
 from ..family import ROUNDING, Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
@@ -22,17 +22,10 @@ from .goodness import chance, is_bad, noise_misfit, worst
 BEAM = 3
 #: number of candidates that extend a subset, and number of pairs that are tried together
 JOIN = 6
-#: number of rounds of exchanging members
-ROUNDS = 4
 #: relative tolerance of the compared fits, and of the chosen one
 COMPARED, CHOSEN = 1e-4, 1e-9
 #: number of parts of the way to a guess at which modes are followed, if their shapes change much
-WAY = (0.0, 0.25, 0.5, 0.75)
-#: least MAC of every mode with its start at which no step between is needed
-SAME = 0.8
-#: fraction of the residuals, or of those without a change, up to which few coordinates may be in
-#: error
-FAITHFUL, NEGLIGIBLE = 1e-2, 1e-6
+WAY = np.arange(4) / 4
 #: ratio of the effect of a candidate to its first-order effect, where noise may explain the
 #: residual
 REACH = 4.0
@@ -240,7 +233,7 @@ class Subsets:
         """Return the best subset that differs from this one in one member at a time."""
         if len(subset) < 2:
             return subset
-        for _ in range(ROUNDS):
+        for _ in range(MOST_STEPS):
             others = {
                 tuple(sorted((*rest, i)))
                 for out in subset
@@ -307,7 +300,7 @@ class Subsets:
             point = lifted_point(exact.family, B, made, exact.numbers)
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
-            close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
+            close = off <= max(CLOSE**2 * float(r @ r), TYPED**2 * self.error_without)
             left = self._left(exact, found.p, point, subset)
             # an impossible model fits better than a possible one: of interest only if it is the
             # best
@@ -349,7 +342,7 @@ class Subsets:
             objective.family.weighted(point.eigen.X)[:, own]
             for point, own in zip((begin, end), columns, strict=True)
         )
-        if np.all(np.diag(mac_matrix(X, Y)) >= SAME):
+        if np.all(np.diag(mac_matrix(X, Y)) >= ALIKE):
             return [first]
         return [first + part * (guess - first) for part in WAY]
 
@@ -403,8 +396,6 @@ BEYOND = 1.5
 #: number of frequencies at which the other modes follow a load, and fraction of coordinates that
 #: saves time
 SHIFTS, WORTHWHILE = 3, 0.7
-#: fraction of the stiffness of the softest mode by which rounding may make K negative
-NEARLY = 1e-3
 
 
 def load_vectors(family: Family, parameter: int) -> FloatArray | None:
@@ -460,7 +451,7 @@ def is_physical(family: Family, p: FloatArray) -> bool:
     except la.LinAlgError:
         return False
     softest = 0.0 if K is family.K else float(la.eigvalsh(K, subset_by_index=(0, 0))[0])
-    return softest > -NEARLY * float(elastic)
+    return softest > -NEGLIGIBLE * float(elastic)
 
 
 def lifted_point(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:

@@ -16,6 +16,7 @@ from ...modes import matching
 from ...seeds import Rng, generator
 from ...sparse.symmetric import dense
 from ...store import Value
+from ...words import SHOWN
 from ..family import Point
 from ..parameters import Parameter, checked_parameters
 from ..residuals.frf_residual import FrfResidual
@@ -26,9 +27,6 @@ from ..search.objective import UpdateMethod, compared_modes
 from ..update_result import UpdateResult
 from ..updates import update
 from .goodness import chance, is_bad
-
-#: number of groups of modes in a repr
-SHOWN = 4
 
 
 def mac(X: Any, Y: Any) -> FloatArray:

@@ -32,8 +32,6 @@ from .residual import Bound, Kind, Residual, channel_places, place_rows, split_p
 #: relative standard deviations of frequency and damping of a good model: twice these, 0.5 % and 30
 #: %, are typical errors of an updated model where nothing was measured
 USUAL = (2.5e-3, 0.15)
-#: least 1 - zeta^2 of an oscillating pole
-ZETA = 1e-6
 
 
 def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
@@ -186,7 +184,7 @@ class BoundEigenvalues(Bound):
         pole = self.target
         zeta = -pole.real / np.abs(pole)
         # d lambda / d ln zeta
-        damped = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(np.maximum(1 - zeta**2, ZETA)))
+        damped = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(np.maximum(1 - zeta**2, TYPED)))
         return [
             Kind(name, self.whitened(np.column_stack([np.diag(column), column])), usual)
             for name, column, usual in (

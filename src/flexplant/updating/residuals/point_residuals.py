@@ -21,13 +21,10 @@ from ...arrays import (
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import assigned
-from ...tolerances import SPLIT, TINY
+from ...tolerances import NEGLIGIBLE, SPLIT, TINY
 from ..family import Family, Point
 from ..parameters import named_place
 from .residual import Bound, Residual, place_rows, split_parts
-
-#: multiple of the largest frequency above which generalised eigenvalues count as infinite
-INFINITE = 1e3
 
 
 class _PointResidual(Residual):
@@ -167,7 +164,7 @@ class _BoundZeros(Bound):
         E[k : 2 * k, k : 2 * k] = M * w0**2 / size
         solve: Any = la.eig
         (alpha, beta), left, right = solve(A, E, left=True, homogeneous_eigvals=True)
-        largest = INFINITE * np.sqrt(size / np.abs(M).max())
+        largest = (1.0 / NEGLIGIBLE) * np.sqrt(size / np.abs(M).max())
         finite = np.flatnonzero(np.abs(beta) * largest > np.abs(alpha) * w0)
         s = np.asarray(alpha[finite] / beta[finite] * w0, dtype=np.complex128)
         upper = s.imag > SPLIT * w0

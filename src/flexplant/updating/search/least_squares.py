@@ -13,10 +13,9 @@ import scipy.linalg as la
 from ...arrays import FloatArray, between, positive, whole
 from ...errors import ModelError, SolverError, counted
 from ...store import checked
-from ...tolerances import divisor
+from ...tolerances import CLOSE, MISSED, NULL, SAME, divisor
 from ...words import one_of
 from ..family import Point
-from ..sensitivities import SINGULAR, UNSEEN
 from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
@@ -33,7 +32,6 @@ STUCK = (
     "no step lowers the error as its slopes predict, probably since other modes are paired "
     "nearby (use another start=)"
 )
-PREDICTED = 1e-2
 
 
 #: reason of a search with a limit
@@ -184,7 +182,7 @@ def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
     J = answer.jac[:, answer.active_mask == 0]
     Q = la.qr(J / divisor(np.linalg.norm(J, axis=0)), mode="economic")[0]
     change = Q @ (Q.T @ answer.fun)
-    if np.sum(change**2) <= PREDICTED * np.sum(answer.fun**2):
+    if np.sum(change**2) <= CLOSE * np.sum(answer.fun**2):
         return False
     return bool(np.max(np.abs(change[: size.size]) / size) > tolerance)
 
@@ -214,8 +212,6 @@ def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
     return rho
 
 
-#: relative rounding of an eigenvalue; the error may rise by this amount
-ROUNDING = 1e-11
 EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 
 
@@ -313,7 +309,7 @@ def _gauss_newton_step(
     # the reason may hold only at this point
     first = np.array_equal(point.p, objective.default_start)
     there = "" if first else f"with {objective.family.text(point.p)}, "
-    unseen = length <= UNSEEN * reach * float(np.max(objective.size(point)))
+    unseen = length <= SAME * reach * float(np.max(objective.size(point)))
     if unseen.any():
         missed = [name for name, none in zip(names, unseen, strict=True) if none]
         why = (
@@ -330,7 +326,7 @@ def _gauss_newton_step(
             f"values do not depend on it {why}"
         )
     U, s, Vt = np.linalg.svd(J / length, full_matrices=False)
-    keep = s > max(truncate, SINGULAR) * s[0]
+    keep = s > max(truncate, MISSED) * s[0]
     if not truncate and not (keep.all() and s.size == len(names)):
         mixed = np.abs(np.linalg.svd(J / length)[2][-1])
         together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
@@ -355,8 +351,8 @@ def _advanced(
     halvings: int,
 ) -> tuple[float, FloatArray] | None:
     """Return the fraction of a step and the residuals there, None if no fraction lowers (12)."""
-    rounding = ROUNDING * float(np.linalg.norm(size))
-    limit = float(np.linalg.norm(r)) * (1 + ROUNDING) + rounding
+    rounding = NULL * float(np.linalg.norm(size))
+    limit = float(np.linalg.norm(r)) * (1 + NULL) + rounding
     fraction, trouble = 1.0, ""
     for _ in range(halvings):
         try:
