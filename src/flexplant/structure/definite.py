@@ -370,7 +370,10 @@ def _improved(
     rounding = float(rounding_of(K, np.hstack([rigid, soft])).max())
     shift = _SHIFT * (rounding or float(np.finfo(np.float64).eps * squares[end]))
     shift = max(shift, -2.0 * float(values[0]))
-    scaled, scale = unit_diagonal(K + shift * M)
+    inertia = M @ rigid
+    # rigid-body motions are lifted among the soft modes: K holds them only up to its rounding
+    lifted = K + shift * M + max(shift, float(values[-1])) * (inertia @ inertia.T)
+    scaled, scale = unit_diagonal(lifted)
     try:
         factor = la.cho_factor(dense(scaled), lower=True)
     except la.LinAlgError:
@@ -378,7 +381,6 @@ def _improved(
             f"an elastic mode has a negative stiffness (K + s M is indefinite, s = {shift:.2g} "
             "1/s^2): the structure is unstable. Look for a sign in K."
         ) from None
-    inertia = M @ rigid
     for _ in range(_STEPS):
         before = values
         moved = scale[:, None] * la.cho_solve(factor, scale[:, None] * (M @ soft))
