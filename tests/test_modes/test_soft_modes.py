@@ -11,7 +11,7 @@ import oracles_modes as oracle
 from flexplant import DofSet, check
 from flexplant.errors import ModelError
 from flexplant.modes import solve, solve_modes, statics
-from flexplant.structure import FEModel, Spring, beam, kirchhoff_plate
+from flexplant.structure import FEModel, Spring, beam, definite, kirchhoff_plate
 
 ALUMINIUM = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
 EXTENDED = pytest.mark.skipif(
@@ -268,3 +268,18 @@ def test_the_one_mechanism_has_the_same_dofs_in_both():
     (moved,) = check(model).mechanisms
     with pytest.raises(ModelError, match=f"The first moves {', '.join(moved[:4])}\\."):
         solve_modes(model)
+
+
+def test_rounding_of_a_free_body_is_no_negative_stiffness():
+    """In modal coordinates, K of a fit leaves rounding of its stiff modes in a motion at 0 Hz."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        squares = np.r_[0.0, 40.0, 90.0, 10 ** rng.uniform(9, 11, 3)]
+        error = np.finfo(float).eps * squares.max() * rng.standard_normal((6, 6))
+        error[1:, 1:] = 0.0
+        error[0, 0] = -abs(error[0, 0])
+        omega, shapes = definite.elastic_modes(
+            np.eye(6), np.diag(squares) + (error + error.T) / 2, np.eye(6)[:, :1]
+        )
+        np.testing.assert_allclose(omega**2, np.sort(squares)[1:], rtol=1e-6)
+        assert np.abs(shapes[0]).max() < 1e-9

@@ -112,3 +112,19 @@ def test_a_loop_that_is_unstable_on_the_measured_response_warns():
         JUDGED.measured(response().replace(outputs=("a", "b", "c", "d")))
     # another rate, another position: the machine is the same
     assert JUDGED.measured(response()).at((0.1, 0.1, 0.0)).measurement is not None
+
+
+@pytest.mark.slow
+def test_a_response_from_20_hz_up_that_holds_a_delay_judges_a_slow_filter_with_integrators():
+    whole = response()
+    keep = whole.freq >= 20.0
+    given = fx.Frf(whole.freq[keep], whole.data[..., keep], whole.inputs, whole.outputs)
+    late = given.replace(data=given.data * np.exp(-2j * np.pi * given.freq * 0.7 / 10e3))
+    observer = fx.design_kalman(JUDGED)
+    servo = fx.design_servo(JUDGED, bandwidth=40.0, observer=observer)
+    for plant in (JUDGED.measured(given), JUDGED.measured(late, delay=0.7)):
+        found = fx.close_loop(plant, observer, servo)
+        margin = found.completed.modulus_margin
+        assert found.on_measurement.margin == pytest.approx(margin, rel=0.02)
+    with pytest.raises(fx.errors.ModelError, match="delay counts samples"):
+        JUDGED.continuous.measured(given, delay=0.7)

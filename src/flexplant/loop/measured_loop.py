@@ -233,8 +233,9 @@ _END = 0.25 * np.pi
 #: largest difference of the slope of |det(I - L)| at the lowest lines from the number of
 #: integrators
 _SLOPE = 0.75
-#: range below the lowest line, relative to it, to which a measured plant is extrapolated
-_BELOW = 1e-3
+#: range below the lowest line or the slowest pole of the controller, whichever is lower, to which a
+#: measured plant is extrapolated; number of lines per decade there
+_BELOW, _DENSE = 1e-3, 50
 
 
 class NyquistCount(NamedTuple):
@@ -255,14 +256,16 @@ def nyquist_count(
     rigid: int,
     at_zero: int,
     unstable: int,
+    slowest: float,
 ) -> NyquistCount:
     """Return the unstable poles of ``u = K P u``, counted on the lines and between them.
 
     From 0+ to the highest frequency the argument of ``F = det(I - K P)`` changes by
     ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
-    loop. Below the lines F continues as ``c / (i w)^n0``, c real; above them it ends positive.
+    loop. Below the lines and the controller's `slowest` pole [Hz] F continues as ``c / (i w)^n0``,
+    c real; above the lines it ends positive.
     """
-    freq, L = _continued(lines, plant, controller, rigid)
+    freq, L = _continued(lines, plant, controller, rigid, slowest)
     F = np.linalg.det(np.eye(L.shape[-1]) - L)
     if not np.all(np.abs(F) > 0.0):
         return NyquistCount(None, "a line lies on the critical point")
@@ -331,6 +334,7 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
     plant = parts.plant(grid)
     rigid = free_motions(grid, plant) if rigid is None else rigid
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
+    slowest = float(np.abs(distance[~zero]).min(initial=np.inf)) / (2 * np.pi * (parts.dt or 1.0))
     slope = low_slope(grid, plant)
     if abs(slope - (2 if rigid else 0)) > 1.0:
         return NyquistCount(
@@ -341,17 +345,18 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         )
     return nyquist_count(
         grid, plant, parts.controller, parts.hidden,
-        rigid=rigid, at_zero=at_zero, unstable=unstable + own,
+        rigid=rigid, at_zero=at_zero, unstable=unstable + own, slowest=slowest,
     )  # fmt: skip
 
 
 def _continued(
-    freq: FloatArray, plant: ComplexArray, controller: Responder, rigid: int
+    freq: FloatArray, plant: ComplexArray, controller: Responder, rigid: int, slowest: float
 ) -> tuple[FloatArray, ComplexArray]:
     """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines."""
     # below the lines: the largest directions, those of the rigid-body modes, fall with f^2, the
     # others are constant; the imaginary part (delay) falls with another factor f
-    low = np.geomspace(_BELOW, 1.0, 150)[:-1]
+    reach = _BELOW * min(1.0, slowest / float(freq[0]))
+    low = np.geomspace(reach, 1.0, round(-_DENSE * np.log10(reach)))[:-1]
     first = plant[:, :, 0]
     left, sizes, right = np.linalg.svd(first.real)
     to, fro = left[:, :rigid], right[:rigid]

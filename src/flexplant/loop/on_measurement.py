@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ..store import Value
 from .measured_loop import broken_count, in_axes, measured_between
 
@@ -68,6 +70,8 @@ def judged(loop: Any) -> OnMeasurement | None:
         return None
     frf = known.frf.select(outputs=loop.fed_back, inputs=loop.driven)
     if plant.dt:
+        turn = np.exp(2j * np.pi * frf.freq * known.delay * plant.dt)  # its own delay leaves
+        frf = frf.replace(data=frf.data * turn)
         frf = in_axes(frf, rate=1.0 / plant.dt, delay=plant.delay, hold=known.hold)
     law = loop.controller.select(loop.driven, loop.fed_back)
     parts = measured_between(frf, law, {})

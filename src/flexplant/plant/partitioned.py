@@ -341,6 +341,8 @@ class MeasuredResponse(Value):
         From actuators to sensors.
     hold : bool
         False where it was measured from sample to sample.
+    delay : float [samples]
+        Delay that the response contains.
 
     Examples
     --------
@@ -353,6 +355,7 @@ class MeasuredResponse(Value):
 
     frf: Frf
     hold: bool = True
+    delay: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)

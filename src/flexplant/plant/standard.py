@@ -9,7 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from ..errors import LabelError, require_known
+from ..arrays import positive
+from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
 from ..lti.frequency import Frf
 from ..lti.statespace import System, as_statespace
@@ -247,7 +248,7 @@ class StandardPlant(Partition):
             found = found.replace(measurement=self.measurement)
         return found if self.uncertainty is None else self.uncertainty.on(found).nominal
 
-    def measured(self, frf: Frf, *, hold: bool = True) -> StandardPlant:
+    def measured(self, frf: Frf, *, hold: bool = True, delay: float = 0.0) -> StandardPlant:
         """Return the plant with the measured response of its machine, on which loops are judged.
 
         Parameters
@@ -257,16 +258,24 @@ class StandardPlant(Partition):
         hold : bool
             False for a response that was measured from sample to sample: it has the zero-order
             hold in it.
+        delay : float [samples]
+            Delay that the response contains, for example that of the controller which measured it.
+            Loops are judged with the delay of the plant in its place.
 
         Raises
         ------
         LabelError
             When a channel of the response is not an actuator or sensor of the plant.
+        ModelError
+            When the delay is negative or not finite, or the plant with a delay is not sampled.
         """
         instance(frf, Frf, "frf", "Pass the measured one, estimate_frf(...) say.")
         require_known("actuator", frf.inputs, self.u)
         require_known("sensor", frf.outputs, self.y)
-        return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold")))
+        late = positive(delay, "delay", zero=True)
+        if late and not self.dt:
+            raise ModelError("delay counts samples: sample the plant first, discretized(rate).")
+        return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold"), late))
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position changes: decoupling, modes seen and reached, the user's figures.
