@@ -31,7 +31,7 @@ from .causes import (
 )
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import poi_channels, read_alike, row_of
+from .estimator_channels import poi_channels, row_of
 from .innovations import (
     ExcessPeak,
     InnovationLines,
@@ -433,7 +433,7 @@ def _evaluation_plant(observer: KalmanEstimator) -> AnyPlant | None:
     """Return the evaluation plant, read like the observer's, or None."""
     plant = observer.plant
     found = plant.machine.evaluation_plant if observer.left_out is None else observer.left_out.whole
-    return None if found is None else read_alike(plant, found)
+    return None if found is None else plant.around(found.machine)
 
 
 def _verdicts(

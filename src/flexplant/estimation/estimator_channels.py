@@ -43,12 +43,6 @@ def checked_plant(given: AnyPlant | System) -> AnyPlant:
     return plant
 
 
-def read_alike(plant: AnyPlant, other: AnyPlant) -> AnyPlant:
-    """Return another plant read through the block of the first, if it has one."""
-    found: AnyPlant = plant.around(other.machine)
-    return found
-
-
 def sensors(plant: AnyPlant) -> tuple[str, ...]:
     """Return the names in y that are measurements; references are in w as well."""
     return tuple(name for name in plant.y if name not in plant.w)
@@ -61,7 +55,7 @@ def poi_channels(plant: AnyPlant) -> tuple[str, ...]:
 
 def same_pois(plant: AnyPlant, on: AnyPlant | System) -> AnyPlant:
     """Return another plant that has the sensors, POIs and sampling time of the first."""
-    other = read_alike(plant, plant_of(on).machine)
+    other: AnyPlant = plant.around(plant_of(on).machine)
     if not np.isclose(other.dt, plant.dt, rtol=SAME, atol=0.0):
         raise ModelError(
             "the error of an estimator needs a plant of its sampling time, "

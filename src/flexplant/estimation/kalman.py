@@ -20,7 +20,7 @@ from ..plant.partitioned import require_noise, require_sampled
 from ..tolerances import RESIDUAL
 from .error import error_variances
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, estimates, poi_channels, read_alike, sensors
+from .estimator_channels import checked_plant, estimates, poi_channels, sensors
 from .filter_models import LEFT_OUT, FilterModel, filter_model, weigh
 from .left_out_modes import LeftOut, left_out
 from .machine_noise import unsure_noise
@@ -126,7 +126,7 @@ def _upper_ends(observer: KalmanEstimator) -> float:
 def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
     """Return the filter of a plant and of truncated modes, with its errors on the larger plant."""
     observer = _observer(plant, found)
-    complete = error_variances(read_alike(plant, found.whole), observer.system)
+    complete = error_variances(plant.around(found.whole.machine), observer.system)
     certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}
     if complete.difference > certificate["difference"]:
         certificate |= Certificate((_difference_check(complete.difference, ROUNDED),))

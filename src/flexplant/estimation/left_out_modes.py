@@ -24,7 +24,7 @@ from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..store import Value
 from ..tolerances import TINY, divisor
-from .estimator_channels import read_alike, sensors
+from .estimator_channels import sensors
 
 #: weight of a different shape relative to a different frequency when modes are paired
 _SHAPE = 0.02
@@ -129,7 +129,7 @@ def left_out(plant: AnyPlant, whole: AnyPlant) -> LeftOut | None:
         read @ covariance[nz:, nz:] @ read.T,
         covariance[:nz, :nz],
         covariance[:nz, nz:] @ read.T,
-        read_alike(plant, quiet),
+        plant.around(quiet),
         whole,
     )
 

@@ -20,7 +20,7 @@ from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, read_alike, sensors
+from .estimator_channels import checked_plant, sensors
 from .innovations import seen_from_states, squared
 from .kalman import design_kalman
 
@@ -158,7 +158,7 @@ def _whole_plant(plant: AnyPlant) -> AnyPlant:
         return plant
     if found.model is not None:
         found = found.with_ports(plant.assembled.ports)
-    return read_alike(plant, found)
+    return plant.around(found.machine)
 
 
 def _advice(observer: KalmanEstimator, estimate: Estimate, alone: bool) -> str:

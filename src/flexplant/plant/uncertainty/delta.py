@@ -128,7 +128,8 @@ class Delta(Value):
 
     #: the kind of quantity that changes, for tables
     kind: ClassVar[str] = ""
-    #: Deltas of a lower stage are applied first
+    #: Deltas of a lower stage are applied first: 0 matrices, 1 poles, 2 shapes and places, 3 gains,
+    #: 4 the delay
     stage: ClassVar[int] = 1
     #: whether it changes the matrices or shapes of the plant's own model, not of a larger one
     of_own_model: ClassVar[bool] = False

@@ -22,6 +22,7 @@ from ...words import mapping
 from ..building import P
 from ..partitioned import Partition
 from .channels import Opened, missed
+from .delay import DelayDelta
 from .delta import Delta, with_changes
 from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
@@ -138,7 +139,7 @@ class UncertainPlant(Value, Generic[P]):
         deltas = [self._acting(delta) for delta in self.deltas]
         found = _opened(base, deltas)
         # parameters solve other modes, whose states are not the plant's: gains are compared alone
-        own = [one for one in deltas if one.stage and one.kind != "delay"]
+        own = [one for one in deltas if not isinstance(one, ParameterDelta | DelayDelta)]
         if own:
             _require_exact(base, found if not self.of_matrices else _opened(base, own), own)
         return found
