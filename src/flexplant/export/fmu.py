@@ -11,6 +11,7 @@ import sys
 import tempfile
 import uuid
 import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -309,11 +310,11 @@ def _function(line: str, prefix: str) -> str:
     return f"EXPORT {head};\n{head}\n{{\n{unused}    {lines}\n}}\n"
 
 
-#: exponents of kg, m, s, A, rad in units with a name
+#: base units of FMI, and those with a name of their own in terms of others
+_BASE = ("kg", "m", "s", "A", "rad")
 _NAMED = {
-    "kg": (1, 0, 0, 0, 0), "m": (0, 1, 0, 0, 0), "s": (0, 0, 1, 0, 0), "A": (0, 0, 0, 1, 0),
-    "rad": (0, 0, 0, 0, 1), "N": (1, 1, -2, 0, 0), "V": (1, 2, -3, -1, 0), "Hz": (0, 0, -1, 0, 0),
-    "W": (1, 2, -3, 0, 0), "J": (1, 2, -2, 0, 0), "Pa": (1, -1, -2, 0, 0), "T": (1, 0, -2, -1, 0),
+    "N": "kg m s^-2", "Pa": "N m^-2", "J": "N m", "W": "J s^-1", "V": "W A^-1", "Hz": "s^-1",
+    "T": "V s m^-2",
 }  # fmt: skip
 _FACTOR = re.compile(r"([A-Za-z]+)(?:\^(-?\d+))?")
 #: folder of the binary of a system by version of FMI, and suffix of a shared library
@@ -533,17 +534,26 @@ def _description(
 
 def _unit_definition(unit: str) -> str:
     """Return the definition of a unit, with its exponents of base units where these are known."""
-    total = [0] * 5
-    for side, part in zip((1, -1), unit.split("/"), strict=False):
-        for factor in part.split():
-            match = _FACTOR.fullmatch(factor)
-            if match is None or match[1] not in _NAMED or unit.count("/") > 1:
-                return f"    <Unit name={_quoted(unit)}/>"
-            power = side * int(match[2] or 1)
-            total = [a + power * b for a, b in zip(total, _NAMED[match[1]], strict=True)]
-    named = zip(("kg", "m", "s", "A", "rad"), total, strict=True)
-    base = " ".join(f'{key}="{power}"' for key, power in named if power)
+    over, _, under = unit.partition("/")
+    powers, below = _exponents(over), _exponents(under)
+    if powers is None or below is None:
+        return f"    <Unit name={_quoted(unit)}/>"
+    powers.subtract(below)
+    base = " ".join(f'{key}="{powers[key]}"' for key in _BASE if powers[key])
     return f"    <Unit name={_quoted(unit)}><BaseUnit {base}/></Unit>"
+
+
+def _exponents(product: str) -> Counter[str] | None:
+    """Return the exponents of the base units in a product of units, None where one is unknown."""
+    found: Counter[str] = Counter()
+    for factor in product.split():
+        match = _FACTOR.fullmatch(factor)
+        if match is None or match[1] not in (*_BASE, *_NAMED):
+            return None
+        name, power = match[1], int(match[2] or 1)
+        for key, own in (_exponents(_NAMED.get(name, "")) or {name: 1}).items():
+            found[key] += power * own
+    return found
 
 
 def _build(name: str, sources: Sequence[str]) -> str:
