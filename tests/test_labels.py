@@ -269,3 +269,8 @@ def test_rotations_of_a_solid_are_those_of_its_points(count):
     with pytest.raises(LabelError, match="no DOF") as found:
         dofs.index("999999:rx")
     assert "interpolated" not in str(found.value)
+
+
+def test_coordinates_may_be_unknown():
+    dofs = DofSet([1, 1, 2], ["x", "y", "x"])
+    assert dofs.labels == ("1:x", "1:y", "2:x") and not dofs.xyz.any()

@@ -48,8 +48,9 @@ class DofSet(Value):
         Node number of each DOF.
     directions : sequence of n str
         Each one of x, y, z [m], rx, ry, rz [rad]; rx = dz/dy and ry = -dz/dx on a plate.
-    xyz : (n, 3) array [m]
-        Coordinates of each DOF's node.
+    xyz : (n, 3) array [m], optional
+        Coordinates of each DOF's node. None: not known, stored as zeros; places are then given by
+        labels, and rotations as a rigid body are not known.
     interpolation : Interpolation, optional
         Element shape functions, or those of `interpolated`; without them only points at nodes are
         known.
@@ -74,7 +75,7 @@ class DofSet(Value):
 
     nodes: IntArray
     directions: tuple[str, ...]
-    xyz: FloatArray
+    xyz: FloatArray = None  # type: ignore[assignment]
     interpolation: Interpolation | None = None
     components: tuple[str, ...] = ()
     component_of: IntArray | None = None
@@ -85,7 +86,7 @@ class DofSet(Value):
             self,
             nodes: npt.ArrayLike,
             directions: Iterable[str],
-            xyz: npt.ArrayLike,
+            xyz: npt.ArrayLike | None = None,
             interpolation: Interpolation | None = None,
             components: Iterable[str] = (),
             component_of: npt.ArrayLike | None = None,
@@ -106,9 +107,9 @@ class DofSet(Value):
                 f"unknown directions {unknown[:6]}: a DOF moves along {', '.join(DIRECTIONS)}. "
                 "Translate the names of the foreign program first."
             )
-        self._set(
-            nodes=nodes, directions=directions, xyz=real_array(self.xyz, "xyz", (nodes.size, 3))
-        )
+        given: Any = self.xyz
+        xyz = np.zeros((nodes.size, 3)) if given is None else given
+        self._set(nodes=nodes, directions=directions, xyz=real_array(xyz, "xyz", (nodes.size, 3)))
         instance(
             self.interpolation,
             Interpolation | None,

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant import load
 from flexplant.errors import InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
@@ -220,3 +221,26 @@ def test_constraints_are_values_and_refuse_what_they_are_not(machine, tmp_path):
     for bad in ("none", [3], Disc((0, 0), 1), 3.0):
         with pytest.raises(ModelError, match="constraint"):
             place_sensors(plant, sensors, 4, constraints=bad)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_relative_poi_shares_its_frame_with_sensors_whichever_sign_it_has(sign):
+    chain = fx.chain(
+        masses=[5.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 3e5, 2e5], ground=[1e5, 0, 0, 0]
+    )
+    modes = fx.solve_modes(chain, count=4, damping=fx.ModalDamping(0.01))
+
+    def place(at):
+        ports = fx.Ports(
+            w=[fx.Disturbance("d", at="1:x", asd=1.0)],
+            u=[fx.Actuator("u", at="2:x")],
+            z=[fx.Poi("tip", at={"4:x": sign, "1:x": -sign})],
+            y=[fx.Sensor("y", at={"2:x": sign, "1:x": -sign}, asd=1e-9)],
+        )
+        plant = fx.assemble_plant(modes, ports).discretized(1000.0)
+        return place_sensors(plant, [fx.Sensor("c", at=at, asd=1e-9)], 1, progress=False).chosen
+
+    assert place("1:x") == place({"3:x": sign, "1:x": -sign}) == ("c",)
+    for on_tip in ({"4:x": sign, "1:x": -sign}, {"4:x": sign, "3:x": -sign}):
+        with pytest.raises(InfeasibleError, match="OffPoi"):
+            place(on_tip)

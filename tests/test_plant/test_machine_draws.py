@@ -1,5 +1,6 @@
 """Draws of whole machines: against matrices that are changed by hand, and their own statistics."""
 
+import re
 import warnings
 
 import numpy as np
@@ -11,7 +12,7 @@ import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.estimation.machine_noise import _difference, _driven_modes
 from flexplant.plant.machine_draws import MachineFamily, _exponential
-from flexplant.plant.machine_plants import interval_of
+from flexplant.plant.machine_plants import interval_of, interval_text
 from flexplant.plant.realisation import realise
 from flexplant.updating.machines import Draw
 
@@ -262,6 +263,7 @@ def test_an_observer_says_where_its_error_lies(plant):
     low, high, sentence = observer.interval("die:z", 0.95)
     assert low < observer.rms("die:z") < high
     assert "on 95 % of such machines" in sentence
+    assert interval_text(58.66e-9, 58.99e-9, "m") == "58.6 to 59 nm"
     narrow = observer.interval("die", 0.5)
     assert low < narrow.low < narrow.high < high
     each = [observer.rms("die", on=machine) for machine in plant.machines.plants]
@@ -300,7 +302,7 @@ def test_a_loop_says_where_its_figures_lie(plant):
     observer = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     loop = fx.close_loop(plant, observer, servo)
-    margin = loop.interval("modulus margin")
+    margin = loop.interval("modulus_margin")  # a space or an underscore
     assert 0 < margin.low < margin.high < 1
     each = [loop.around(one).modulus_margin for one in plant.machines.plants]
     assert margin.low < np.median(each) < margin.high
@@ -375,7 +377,10 @@ def test_placements_compare_places_machine_by_machine(plant):
     scores = fx.score_sensors(plant, [["y1", "near"], ["y1", "y2"]], candidates=[near])
     best, next_one = (fx.design_kalman(scores.on(plant, rank=i)) for i in (0, 1))
     low, high, _ = best.compared(next_one, "die")
-    assert f"{low:.3g} to {high:.3g} on 95 % of such machines" in repr(scores)
+    said = re.search(r"([\d.]+) to ([\d.]+) on 95 % of such machines", repr(scores))
+    # rounded outwards to three digits
+    assert [float(end) for end in said.groups()] == pytest.approx([low, high], rel=0.01)
+    assert float(said[1]) <= low < high <= float(said[2])
     found = fx.place_sensors(plant, [plant.assembled.ports.y[0], near], 2)
     own = fx.design_kalman(plant)
     low, high, _ = fx.design_kalman(found.on(plant)).compared(own, "die")

@@ -78,6 +78,8 @@ def test_bad_input_is_refused():
     """What is needed is said."""
     with pytest.raises(ModelError, match="move must be"):
         residual_vibration(loop(), 1.0)
+    with pytest.raises(LabelError, match="no reference 'mirror:ref'"):
+        residual_vibration(loop(), MOVE, reference="mirror:ref")
     with pytest.raises(LabelError, match="die:y"):
         residual_vibration(loop(), MOVE, channel="die:y")
     with pytest.raises(ModelError, match="wait"):

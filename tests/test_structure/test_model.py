@@ -131,7 +131,7 @@ def test_fewer_dofs_than_motions():
         ({"D": -np.eye(3)}, ModelError, "feed energy"),
         ({"K": 1j * K3}, ModelError, "complex"),
         ({"M": [["a"] * 3] * 3}, ModelError, "numbers"),
-        ({"dofs": None}, ModelError, "DofSet"),
+        ({"dofs": "1:x"}, ModelError, "DofSet"),
     ],
 )
 def test_the_door(changes, error, says):
@@ -270,3 +270,11 @@ def test_factorisation_refuses_zero_pivots():
 def test_orthonormalised_refuses_dependent_vectors():
     with pytest.raises(ModelError, match="vector 2"):
         orthonormalised(np.eye(3), np.ones((3, 2)))
+
+
+def test_a_model_without_dofs_numbers_its_rows():
+    K = np.array([[5.0, -5.0], [-5.0, 5.0]])
+    model = FEModel(np.diag([1.0, 2.0]), K)
+    assert model.dofs.labels == ("1:x", "2:x") and model.rigid_body.shape == (2, 1)
+    with pytest.raises(ShapeError, match="K must be square"):
+        FEModel(np.eye(2), K[:1])

@@ -98,7 +98,8 @@ def loop_interval(
     if isinstance(figure, str):
         unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
     given = "" if callable(figure) or figure in FIGURES else known.densities
-    found = interval(known, partial(loops.values, figure), level, unit, given)
+    own = _figure(loop, figure) if isinstance(figure, str) and loop.is_stable else None
+    found = interval(known, partial(loops.values, figure), level, unit, given, own)
     if figure != RADIUS or found.low is None or found.high is None:
         return found
     low, high = 1.0 - found.high, 1.0 - found.low

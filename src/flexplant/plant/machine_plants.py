@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from ..errors import AssumptionError, ModelError
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..tolerances import INTERVAL
 from ..updating.machines import COUNT, Machines
-from ..words import in_unit
+from ..words import in_unit, with_unit
 from .drawn_modes import DrawnModes
 from .machine_draws import MachineFamily, StatedFamily
 from .ports import Ports
@@ -209,10 +210,12 @@ def interval(
     level: float,
     unit: str,
     given: str = "",
+    own: float | None = None,
 ) -> FigureInterval:
     """Return the interval of a figure over machines, or what is missing for one.
 
-    `given` is what the interval takes as it was given, in words.
+    `given` is what the interval takes as it was given, in words; `own` is the figure of the design
+    model, which the sentence states where it lies outside.
     """
     if machines is None:
         return FigureInterval(
@@ -227,14 +230,20 @@ def interval(
         low, high = interval_of(figures(), level)
     except AssumptionError as error:  # a machine on which the figure has no value
         return FigureInterval(None, None, f"no interval: {error}")
+    outside = own is not None and not low <= own <= high
+    but = f" ({with_unit(own or 0.0, unit or None)} on the design model)" if outside else ""
     return FigureInterval(
         low,
         high,
-        f"{interval_text(low, high, unit)} on {100 * level:.3g} % of such machines{given}",
+        f"{interval_text(low, high, unit)} on {100 * level:.3g} % of such machines{given}{but}",
     )
 
 
 def interval_text(low: float, high: float, unit: str) -> str:
-    """Return two numbers in one unit."""
+    """Return two numbers in one unit, rounded outwards to the three digits of other figures."""
     factor, name = in_unit(high, unit or None)
-    return f"{low / factor:.3g} to {high / factor:.3g} {name}".rstrip()
+    ends = [
+        Context(prec=3, rounding=mode).create_decimal(f"{end / factor:.9g}")
+        for end, mode in ((low, ROUND_FLOOR), (high, ROUND_CEILING))
+    ]
+    return f"{float(ends[0]):.3g} to {float(ends[1]):.3g} {name}".rstrip()

@@ -26,6 +26,7 @@ from .definite import (
     digits_of,
     has_negative_springs,
     slow,
+    square,
     symmetric_matrix,
     unstable_stiffness,
     without_inertia,
@@ -50,8 +51,9 @@ class FEModel(Placed, Value):
         ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees what only its rounding holds.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
-    dofs : DofSet
-        DOFs of the n rows, with coordinates.
+    dofs : DofSet, optional
+        DOFs of the n rows, with coordinates. None: row i is the displacement of node i along x,
+        "1:x" to "n:x", at a place that is not known.
     name : str, optional
     held_inertia : (n, 6) array, optional
         Loads ``M_fs r_s`` by which held DOFs s act through their mass coupling when the ground
@@ -86,12 +88,14 @@ class FEModel(Placed, Value):
     >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])
     >>> FEModel([[1, 0], [0, 2]], [[5, -5], [-5, 5]], dofs=dofs, name="two masses")
     <FEModel 'two masses': 2 DOFs, dense, 1 rigid-body motion, D not given>
+    >>> FEModel([[1, 0], [0, 2]], [[5, -5], [-5, 5]]).dofs.labels
+    ('1:x', '2:x')
     """
 
     M: Matrix
     K: Matrix
     D: Matrix | None = None
-    dofs: DofSet = field(kw_only=True)
+    dofs: DofSet = field(default=None, kw_only=True)  # type: ignore[assignment]
     name: str | None = field(default=None, kw_only=True)
     held_inertia: FloatArray | None = field(default=None, kw_only=True)
     joint_motions: FloatArray | None = field(default=None, kw_only=True)
@@ -105,7 +109,7 @@ class FEModel(Placed, Value):
             K: MatrixLike,
             D: MatrixLike | None = None,
             *,
-            dofs: DofSet,
+            dofs: DofSet | None = None,
             name: str | None = None,
             held_inertia: npt.ArrayLike | None = None,
             joint_motions: npt.ArrayLike | None = None,
@@ -113,6 +117,10 @@ class FEModel(Placed, Value):
         ) -> None: ...
 
     def __post_init__(self) -> None:
+        given: Any = self.dofs
+        if given is None:
+            rows = square(self.K, "K").shape[0]
+            self._set(dofs=DofSet(range(1, rows + 1), ["x"] * rows))
         n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
         if not n:
             raise ModelError("the DofSet is empty, it needs at least one DOF. Check the table.")
