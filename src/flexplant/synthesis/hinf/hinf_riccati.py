@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...arrays import FloatArray, positive
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError
+from ...lti.frequency_sweep import largest_gains
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
@@ -262,7 +263,7 @@ def resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     if poles.real.max() >= 0:
         return np.inf
     freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
-    gains = np.linalg.norm(responses(loop, freq).transpose(2, 0, 1), 2, axis=(1, 2))
+    gains = largest_gains(responses(loop, freq))
     return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
 
 
