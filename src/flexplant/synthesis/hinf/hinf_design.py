@@ -36,7 +36,7 @@ from ..controller import (
 )
 from ..preparation import Prepared, posed, prepared, require_reach
 from ..scaling import departure_from_normal
-from .hinf_riccati import Riccati
+from .hinf_riccati import Riccati, quick_answer
 from .lower_bound import pointwise_bound, raised_bound
 from .moved_design import over_positions
 from .singular import require_shown
@@ -170,9 +170,7 @@ def design_hinf(
     known = plant.uncertainty if uncertain is None else uncertain
     if uncertain is not None or (known is not None and known.frequencies):
         instance(known, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
-        found = tolerant(
-            plant, evened(plant, known, method, progress, damped_below), known, method, progress
-        )
+        found = tolerant(plant, evened(plant, known, method, damped_below), known, method, progress)
     else:
         found = _design_one(plant, method, progress)
     return with_left_out(found, plant)
@@ -217,7 +215,6 @@ def evened(
     plant: AnyPlant,
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
-    progress: bool | None = None,
     damped_below: float = 0.0,
 ) -> Evened:
     """Return channels for the modes, their scales evened out in closed loop."""
@@ -225,15 +222,15 @@ def evened(
     # only the scales depend on it: if it fails, the design itself reports why
     with attempted("evening out the scales of modes"):
         opened = with_mode_channels(plant, channels)
-        loop, found = solved(opened, method or Riccati(progress=progress))
+        loop, found = solved(opened, method)
         channels, first = rebalanced(channels, opened, loop), found.gamma
     return Evened(channels, first)
 
 
-def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
-    """Return the controller that a method finds, not verified, and the method's own results."""
+def solved(plant: AnyPlant, method: SynthesisMethod | None) -> tuple[StateSpace, SolvedController]:
+    """Return a controller, not verified, and the results of a method or of a quick search."""
     problem = prepared(plant.system, plant.u, plant.y)
-    found = method.solve(problem)
+    found = quick_answer(problem) if method is None else method.solve(problem)
     return problem.restored(found.A, found.B, found.C, found.D), found
 
 

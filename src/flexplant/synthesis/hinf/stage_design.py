@@ -248,7 +248,7 @@ class _StageTask:
         """Return a controller, from the other methods where the first finds none."""
         known = self.uncertain
         weighted = self.through.weighted(self.weights(bandwidth))
-        given = evened(weighted, known, progress=False, damped_below=below)
+        given = evened(weighted, known, damped_below=below)
         with attempted(
             f"one Riccati method for {bandwidth:.4g} Hz",
             (SolverError, InfeasibleError, CertificateError),
