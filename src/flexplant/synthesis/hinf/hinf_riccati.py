@@ -32,9 +32,6 @@ from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks,
 _REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
-#: relative difference of |p| and Im p below which a resonance has the same gain at both: it is half
-#: the square of the damping, and a peak is as wide as the damping
-_ONE_POINT = 1e-4
 #: most steps of the bisection
 _BISECTION = 60
 #: sensitivity at infinite frequency below which a central controller is taken for one of infinite
@@ -265,9 +262,7 @@ def resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     poles = loop.poles()
     if poles.real.max() >= 0:
         return np.inf
-    size, swing = np.abs(poles), np.abs(poles.imag)  # one point where a pole is lightly damped
-    apart = swing[swing < (1.0 - _ONE_POINT) * size]
-    freq = np.unique(np.concatenate([[0.0], size, apart])) / (2.0 * np.pi)
+    freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
     gains = largest_gains(responses(loop, freq))
     return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
 
