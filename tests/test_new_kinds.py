@@ -277,5 +277,5 @@ def test_an_uncertain_place_opens_as_a_delta_and_is_drawn_as_machines():
     places = [one.ports.sensor("y").at["2:x"] for one in known.machines.drawn(3, rng=0)]
     assert len(set(places)) == 3
     assert np.abs(places).max() < 0.6
-    with pytest.raises(ModelError, match=r"'y:place'.*'y' is no affine.*Slip an `opened`"):
+    with pytest.raises(ModelError, match=r"'y:place'.*'y' is not affine.*Slip its `opened`"):
         made.uncertain(Slips(2), fx.plant.Frequencies(0.01))

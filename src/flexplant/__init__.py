@@ -179,6 +179,7 @@ faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_p
 | ``synthesis.shape_loop`` | `design_ncf` of a plant with weights; `tune_loops` |
 | ``updating.Tikhonov``, ``updating.Lasso`` | priors of parameters; `localise` |
 | ``placement.KineticEnergy``, ``AutoMac``, indices | `placement.ModeInformation`, `PoiVariance` |
+| ``estimation.check_gain`` | gone: `KalmanEstimator.certificate` |
 | ``placement.Mirrored``, ``placement.Penalised`` | a `placement.Constraint` of yours |
 | ``plot.PolePicker``, ``plot.animate_mode`` | `plot.stabilisation`, `plot.mode_shape` |
 | ``sparse.Pardiso`` | gone: the library's own factor was faster on solids; `sparse.Cholmod` |

@@ -37,7 +37,6 @@ from .consistency_tests import consistency as consistency
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_models import FilterModel as FilterModel
-from .kalman import check_gain as check_gain
 from .kalman import design_kalman as design_kalman
 from .lag_report import Filter as Filter
 from .lag_report import FixedLag as FixedLag

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, real_array
+from ..arrays import FloatArray
 from ..certificates import Certificate, Verified, stability_check
 from ..errors import CertificateError, ModelError, SolverError
 from ..lti.lyapunov import difference_of, dual_variances, solve_stein
@@ -15,7 +15,7 @@ from ..lti.riccati import filter_dare, riccati_root
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import AnyPlant, StandardPlant
+from ..plant import AnyPlant
 from ..plant.partitioned import require_noise, require_sampled
 from ..tolerances import RESIDUAL
 from .error import error_variances
@@ -225,7 +225,7 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
     L_z = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    radius, difference = _error_of(model, gain, K, covariance)
+    radius, difference = checked_error(model, gain, K, covariance)
     return FilterDesign(gain, K, L_z, covariance, variances, radius, solution.residual, difference)
 
 
@@ -255,56 +255,21 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
     )
 
 
-def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:
-    """Return the difference of the POI variances of a gain from those of a covariance.
-
-    The error's covariance follows from the gain alone:
-    ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Sampled.
-    gain : (n, ny) array
-        L.
-    covariance : (n, n) array
-        Claimed covariance, after the measurement.
-
-    Returns
-    -------
-    float
-        Largest relative difference over the POI channels.
-
-    Raises
-    ------
-    CertificateError
-        When the error is not stable or the difference exceeds 1e-6.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> fx.estimation.check_gain(plant, observer.gain, observer.covariance) < 1e-6
-    True
-    """
-    plant = StandardPlant.of(plant)
-    n, p = plant.system.n_states, len(sensors(plant))
-    gain = real_array(gain, "gain", (n, p))
-    covariance = real_array(covariance, "covariance", (n, n))
-    model = filter_model(plant)
-    return _error_of(model, gain, model.A @ gain, covariance)[1]
-
-
-def _error_of(
-    model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
+def checked_error(
+    model: FilterModel, L: FloatArray, K: FloatArray, covariance: FloatArray
 ) -> tuple[float, float]:
-    """Return spectral radius and difference of a gain L and its predictor gain K, if both hold."""
-    radius = _stable_radius(model, predictor)
+    """Return spectral radius and difference of the gains of a filter, if the covariance is theirs.
+
+    The error's covariance follows from the gains alone, by a Stein equation:
+    ``P = F P F' + (G - K H)(G - K H)'``, F = A - K C2.
+    """
+    radius, rows = _stable_radius(model, K), model.C1 @ L
+    left = model.C1 - rows @ model.C2
     try:
-        truth = _own_variances(model, predictor, model.C1 @ gain)
+        P = solve_stein(model.A - K @ model.C2, model.driven(K))
     except SolverError as error:
         raise CertificateError(f"the estimation error could not be checked: {error}") from error
+    truth = np.sum((left @ P) * left, axis=1) + np.sum((rows @ model.H) ** 2, axis=1)
     claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     return radius, _agreement(claim, truth)
 
@@ -330,10 +295,3 @@ def _agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT)
             f"(allowed {allowed:.0e}). The prediction cannot be trusted."
         )
     return difference
-
-
-def _own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
-    """Return the variances (nz,) of the error of a filter on its own model."""
-    m, left = model, model.C1 - L_z @ model.C2
-    X = solve_stein(m.A - K @ m.C2, m.driven(K))
-    return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))

@@ -370,10 +370,10 @@ def _require_exact(base: Partition, opened: Opened, deltas: Sequence[Delta]) -> 
         )
     read_off = type(cause).opened.__func__ is Delta.opened.__func__  # type: ignore[attr-defined]
     raise ModelError(
-        f"no channels express {cause.name!r}: {lost([cause])!r} is no affine function of its amount"
+        f"no channels express {cause.name!r}: {lost([cause])!r} is not affine in its amount"
         + (
             ", nor a fraction. Let `changed` follow a straight line between its ends, or give "
-            f"{type(cause).__name__} an `opened` of its own."
+            f"{type(cause).__name__} its `opened`."
             if read_off
             else " as displacements, velocities and accelerations are. Give the sensor a `row` and "
             "a quantity, or leave that uncertainty out."
