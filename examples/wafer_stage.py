@@ -150,7 +150,7 @@ def hinf(plant: fx.StandardPlant) -> tuple[Any, ...]:
 def servo(plant: fx.StandardPlant) -> tuple[Any, ...]:
     """Return the servo of the largest bandwidth that keeps |S| at u below 6 dB, by geometry."""
     static = fx.design_static(plant)  # a Kalman filter in the loop allows less
-    given = {"observer": static, "integrator": 10.0}  # Hz: settles sooner than unasked
+    given = {"observer": static}
     return static, fx.design_servo(plant, bandwidth=fx.servo_bandwidth(plant, **given), **given)
 
 

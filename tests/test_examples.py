@@ -173,7 +173,7 @@ def test_the_closed_loops(result):
     ours, best = (
         1e9 * loops[name]["exposures"][0][0] for name in ("tolerant, measured", "best servo")
     )
-    # a servo of a wide lead and an integrator of 10 Hz has 18.6 nm; of a narrow lead it had 22.6
+    # a servo of a wide lead has 18.6 nm; of a narrow lead it had 22.6
     assert ours < 10.0 < 15.0 < best
     # what the design's own model promises, with the modes that its plant left out
     for name in ("best servo", "tolerant, measured"):
