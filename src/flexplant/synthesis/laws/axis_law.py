@@ -182,8 +182,12 @@ class AxisLaw:
 
     def best(self) -> FloatArray:
         """Return the law of the highest bandwidth."""
-        given = starts(self)
-        rough = [one for start in given if (one := self.raised(start, _FEW)) is not None]
+        rough: list[FloatArray] = []
+        for number, start in enumerate(starts(self)):
+            if rough and number >= _STARTS:
+                break
+            found = self.raised(start, _FEW)
+            rough += [] if found is None else [found]
         if not rough:
             raise SolverError(self.failure())
         rough.sort(key=_first, reverse=True)
@@ -498,7 +502,7 @@ _NOTCHES = ((1.0, 0.05, 0.3), (1.1, 0.4, 0.4))
 _MODES = 3  # with such notches, at most
 #: bandwidths; points on which they are tried, and to either side of each mode
 _TRIALS, _GRID_POINTS, _AROUND = 50, 300, 10
-#: starts that are kept in all, and with the same notches, so far apart
+#: starts that are tried, and more until one serves; those with the same notches, so far apart
 _STARTS, _EACH, _APART = 12, 3, 0.25
 #: what a start may lack of the distance, and what that costs in its score
 _LACK, _LATER = 0.25, 4.0
@@ -518,7 +522,7 @@ def starts(of: AxisLaw) -> list[FloatArray]:
             if np.isfinite(score) and len(own) < _EACH and apart:
                 own += [(score, numbers)] if of.is_stable(numbers) else []
     best = sorted((one for own in found for one in own), key=lambda one: -one[0])
-    return [numbers for _, numbers in best[:_STARTS]]
+    return [numbers for _, numbers in best]
 
 
 def _sets(of: AxisLaw) -> list[FloatArray]:
