@@ -68,8 +68,9 @@ def design_servo(
     are close, the one with the smaller peak of |S| at u is used. In the same way the lead of a mass
     line is chosen wide (16 instead of 4) if a mode lies above the bandwidth within a factor of 4. A
     wide lead suppresses the error up to a higher frequency, but less at low frequencies: pass
-    `integrator` if errors must settle sooner than the margin allows. The certificate is for the loop that will run: with
-    observer, flexible modes and delay, and with the truncated modes if they are known.
+    `integrator` if errors must settle sooner than the margin allows. The certificate is for the
+    loop that will run: with observer, flexible modes and delay, and with the truncated modes if
+    they are known.
     `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
