@@ -334,8 +334,7 @@ class ServoTask:
         most = _COST * self.loop.peak(self.notched(law))[0]
         for part in _FASTER:
             axes = (
-                replace(a, integrator=part * a.bandwidth) if a.line == WIDE else a
-                for a in law.axes
+                replace(a, integrator=part * a.bandwidth) if a.line == WIDE else a for a in law.axes
             )
             faster = law._replace(axes=tuple(axes))
             ended = self.notched(faster)
