@@ -259,10 +259,9 @@ class Drawn:
         return white, single
 
 
-#: number of samples per stretch and of parallel runs that fit the cache of one core
+#: number of samples per stretch, a power of two that every size of a block divides, and number of
+#: parallel runs that fit the cache of one core
 STRETCH, ABREAST = 128, 16
-#: number of controller samples that divides a stretch in blocks, for any block size
-_WHOLE = 128
 #: length of a run for which the preparation of blocks must pay off [samples]; fixed, since the
 #: first samples of a long run equal those of a short one to the last bit
 _TYPICAL = 10_000
@@ -435,7 +434,7 @@ class InBlocks:
         while self.size > 1 and self.size * hold > STRETCH:
             self.size //= 2
         self.cost = cost / hold
-        self.stretch = hold * max(PIECE // hold // _WHOLE, 1) * _WHOLE
+        self.stretch = hold * max(PIECE // hold // STRETCH, 1) * STRETCH
         self.w = np.zeros((self.stretch, given.shape[1]))
         self.v = np.empty((self.stretch, self.inputs))
 
