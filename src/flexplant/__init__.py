@@ -91,24 +91,24 @@ from run to run.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 3.3 s | scipy eigsh | 23 s | 7 |
-| 24 modes of a plate, 30 603 DOFs | 1.1 s | scipy eigsh on CHOLMOD (not installed here) | - | - |
-| all 243 modes of a plate, dense | 22 ms | scipy eigh | 6.4 ms | 0.3 |
-| 200 lines of a plate's responses, 30 000 DOFs | 2.4 s | scipy splu (4 of them) | 420 s | 180 |
-| 8 x 8 frequency responses, 10 000 lines | 4.5 ms | python-control, slycot | 0.13 s | 28 |
-| H-infinity norm, 48 states, 0.1 % damping | 4.3 ms | slycot ab13dd | 2.7 ms | 0.64 |
-| the same, A dense | 4.3 ms | slycot ab13dd | 2.8 ms | 0.64 |
-| H2 norm, 200 states | 2.2 ms | python-control, slycot | 4.3 ms | 1.9 |
-| zero-order hold, 48 states | 0.59 ms | scipy cont2discrete | 0.23 ms | 0.39 |
-| a discrete Riccati equation, 48 states | 3.5 ms | scipy solve_discrete_are | 7.9 ms | 2.2 |
-| 100 000 samples through a Kalman filter | 29 ms | filterpy (5000 of them) | 5.1 s | 180 |
-| 100 000 samples of a loop, 218 states | 60 ms | python-control | 1.5 s | 25 |
-| the same, commands saturated | 2.2 s | python-control (2000 of them) | 3.9 s | 1.8 |
-| H-infinity, 3 states: norm 0.138 | 68 ms | python-control, slycot: 0.137 | 23 ms | 0.33 |
-| H-infinity, 61 states of a stage: norm 0.947 | 0.45 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 29 ms | slycot ab13md, the upper one | 15 ms | 0.54 |
-| poles of a close pair in noise: error 5e-07 | 0.51 s | scikit-rf: 7e-07 | 0.5 s | 0.97 |
-| a sparse OUTPUT4 file of Nastran | 7.1 ms | pyYeti | 32 ms | 4.5 |
+| 24 modes of a solid, 27 783 DOFs | 3.7 s | scipy eigsh | 30 s | 8.2 |
+| 24 modes of a plate, 30 603 DOFs | 1.3 s | scipy eigsh on CHOLMOD (not installed here) | - | - |
+| all 243 modes of a plate, dense | 15 ms | scipy eigh | 5.6 ms | 0.37 |
+| 200 lines of a plate's responses, 30 000 DOFs | 1.8 s | scipy splu (4 of them) | 460 s | 250 |
+| 8 x 8 frequency responses, 10 000 lines | 7.4 ms | python-control, slycot | 0.16 s | 22 |
+| H-infinity norm, 48 states, 0.1 % damping | 2.8 ms | slycot ab13dd | 2.5 ms | 0.87 |
+| the same, A dense | 2.5 ms | slycot ab13dd | 2.3 ms | 0.91 |
+| H2 norm, 200 states | 3.4 ms | python-control, slycot | 8 ms | 2.3 |
+| zero-order hold, 48 states | 0.24 ms | scipy cont2discrete | 0.16 ms | 0.64 |
+| a discrete Riccati equation, 48 states | 3.6 ms | scipy solve_discrete_are | 7.5 ms | 2.1 |
+| 100 000 samples through a Kalman filter | 41 ms | filterpy (5000 of them) | 5 s | 120 |
+| 100 000 samples of a loop, 212 states | 73 ms | python-control | 1.3 s | 18 |
+| the same, commands saturated | 1.8 s | python-control (2000 of them) | 3.2 s | 1.8 |
+| H-infinity, 3 states: norm 0.137 | 34 ms | python-control, slycot: 0.137 | 18 ms | 0.52 |
+| H-infinity, 61 states of a stage: norm 0.902 | 0.59 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 20 ms | slycot ab13md, the upper one | 13 ms | 0.68 |
+| poles of a close pair in noise: error 5e-07 | 0.33 s | scikit-rf: 7e-07 | 0.28 s | 0.84 |
+| a sparse OUTPUT4 file of Nastran | 12 ms | pyYeti | 35 ms | 2.8 |
 
 Peers are faster where checks are not wanted. For all modes of the plate, a third of the time goes
 into residuals, and a third into the separation of rigid-body motions and the full accuracy of soft
