@@ -128,3 +128,8 @@ def test_a_response_from_20_hz_up_that_holds_a_delay_judges_a_slow_filter_with_i
         assert found.on_measurement.margin == pytest.approx(margin, rel=0.02)
     with pytest.raises(fx.errors.ModelError, match="delay counts samples"):
         JUDGED.continuous.measured(given, delay=0.7)
+
+
+def test_a_plant_is_checked_by_its_own_method():
+    with pytest.raises(fx.errors.ModelError, match=r"method check\(\)"):
+        fx.check(FEW)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_reduction as oracle
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.modes import solve_modes
 from flexplant.reduction import (
@@ -18,7 +19,7 @@ from flexplant.reduction import (
     reduce,
     select_dofs,
 )
-from flexplant.structure import Damper, ModalDamping
+from flexplant.structure import Damper, FEModel, ModalDamping
 from plates import make_plate
 
 
@@ -183,3 +184,11 @@ def test_complex_modes_are_distinguished_as_they_are(criterion):
     rows = modes.phi[modes.dofs.indices(chosen.labels)]
     assert chosen.condition == pytest.approx(np.linalg.cond(rows), rel=1e-6)
     assert chosen.condition < 30
+
+
+def test_a_mode_that_only_turns_asks_for_rotations_as_candidates():
+    dofs = DofSet([1, 1, 2], ["x", "ry", "x"], [[0, 0, 0], [0, 0, 0], [1, 0, 0]])
+    modes = solve_modes(FEModel(np.eye(3), np.diag([1e4, 2e3, 3e4]), dofs=dofs), count=2)
+    with pytest.raises(ModelError, match=r"candidates=modes\.dofs\.labels"):
+        select_dofs(modes, 2)
+    assert set(select_dofs(modes, 2, candidates=modes.dofs.labels).labels) == {"1:x", "1:ry"}

@@ -76,6 +76,11 @@ def test_an_unknown_unit_is_refused(wrong):
         units(**wrong)
 
 
+def test_a_unit_of_force_is_refused_since_it_follows():
+    with pytest.raises(ModelError, match=r"force follows .* N from mm, t and s"):
+        units("mm", "t", "N")
+
+
 def test_an_interpolation_does_not_keep_its_old_unit():
     plate = fx.kirchhoff_plate(
         size=(1, 1), thickness=0.01, elements=(2, 2), density=1, youngs_modulus=1, poisson_ratio=0.3

@@ -152,7 +152,11 @@ def identify_modes(
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
         sampled plant. Modes above half the rate then appear folded, as broad modes with several per
-        cent of damping, unless a filter removes them.
+        cent of damping, unless a filter removes them. A delay of n samples in the response has to
+        be removed first, ``frf.replace(data=frf.data * np.exp(2j * np.pi * frf.freq * n / rate))``,
+        which is exact for whole samples. After that of a fraction of a sample the modes above half
+        the rate, and strong modes, fit worse: weak modes are then less accurate, and outputs seem
+        to disagree.
     dofs : mapping {channel: DOF label}, optional
         DOFs of outputs and inputs. They label the shapes, which are mass-normalised where an input
         and an output share a DOF.

@@ -473,7 +473,8 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
         warn(
             f"{apart[1]} disagree on the frequencies by {100 * apart[0]:.2g} % (standard "
             "deviation), which explains most of the misfit: a moved sensor or hammer with mass, "
-            "or an amplitude or temperature that changed between measurements. "
+            "an amplitude or temperature that changed between measurements, or a delay of a "
+            "fraction of a sample in a held response (see hold=). "
             f"{apart[2]}Poles are means over the {apart[1]}, with deviations from how these "
             "differ."
         )

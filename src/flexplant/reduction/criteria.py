@@ -307,8 +307,13 @@ def select_dofs(
     if not singular[-1] * top > singular[0]:
         raise ModelError(
             f"no {number} of these DOFs distinguish the modes (condition above {top:.3g}): the "
-            "required ones depend on each other, or all candidates lie on node lines. Name other "
-            "candidates."
+            "required ones depend on each other, or all candidates lie on node lines. "
+            + (
+                "Without candidates= only displacements are tried: modes in which a body turns "
+                "about its node need rotations, candidates=modes.dofs.labels."
+                if candidates is None and len(straight) < len(modes.dofs)
+                else "Name other candidates."
+            )
         )
     condition = float(singular[0] / singular[-1])
     return DofSelection(tuple(chosen), condition, rule.values(picked), rule)

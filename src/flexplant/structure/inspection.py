@@ -144,9 +144,11 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     elif isinstance(model, FEMatrices):
         matrices_ = model
     else:
+        hint = "fx.structure.FEMatrices(K, M, dofs=...) takes matrices of any quality."
+        if hasattr(model, "check"):
+            hint = "This one is checked by its method check()."
         raise ModelError(
-            f"check needs an FEModel or FEMatrices, got {type(model).__name__}. "
-            "Pass fx.structure.FEMatrices(K, M, dofs=...), which takes matrices of any quality."
+            f"check needs an FEModel or FEMatrices, got {type(model).__name__}. {hint}"
         )
     with Progress(0, "check"):
         found = facts(matrices_, model if isinstance(model, FEModel) else None)

@@ -112,7 +112,8 @@ def _unit_size(given: Any, name: str, known: Mapping[str, float]) -> float:
     if given not in known:
         raise ModelError(
             f"{name} {short(given)} is not a known unit: {', '.join(known)}. Pass one of these, "
-            f"or the size of the unit in {next(iter(known))} as a number."
+            f"or the size of the unit in {next(iter(known))} as a number. The unit of force "
+            "follows from length, mass and time: N from mm, t and s."
         )
     return known[given]
 
