@@ -9,15 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import FloatArray, positive
-from ...errors import (
-    AssumptionError,
-    CertificateError,
-    FlexplantError,
-    InfeasibleError,
-    ModelError,
-    SolverError,
-    attempted,
-)
+from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...loop import ClosedLoop, close_loop
 from ...loop.machine_figures import axis_bandwidths
 from ...loop.other_machines import BEYOND, mode_tolerances
@@ -245,25 +237,16 @@ class _StageTask:
         return min(hertz for ref, hertz in reached.items() if ref in followed)
 
     def _designed(self, bandwidth: float, below: float) -> _StageTry | None:
-        """Return a controller, from the other methods where the first finds none."""
-        known = self.uncertain
+        """Return a controller that is not verified yet, None where there is none."""
         weighted = self.through.weighted(self.weights(bandwidth))
-        given = evened(weighted, known, damped_below=below)
-        with attempted(
-            f"one Riccati method for {bandwidth:.4g} Hz",
-            (SolverError, InfeasibleError, CertificateError),
-        ):
+        given = evened(weighted, self.uncertain, damped_below=below)
+        try:
             opened = with_mode_channels(weighted, given.channels)
             system, solution = solved(opened, Riccati(progress=False))
-            return _StageTry(bandwidth, weighted, given, system, solution=solution)
-        try:
-            found = tolerant(weighted, given, known)
-            return _StageTry(bandwidth, weighted, given, found.system, found)
-        except (AssumptionError, ModelError):
-            raise
-        except FlexplantError as error:
+        except (SolverError, InfeasibleError) as error:
             self.failures[bandwidth] = error
             return None
+        return _StageTry(bandwidth, weighted, given, system, solution)
 
     def _judged(self, system: StateSpace) -> tuple[float, float]:
         """Return the modulus margin of a controller, and the least with its modes off."""
@@ -341,19 +324,10 @@ class _StageTask:
                 "on machines drawn. Measure their poles, lower margin=, or move the actuators."
                 + (f" ({causes})" if causes else "")
             )
-        best, found, drawn = self.best, self.best.found, self.best.drawn
-        if found is None:
-            try:
-                found = tolerant(
-                    best.weighted, best.given, self.uncertain, Riccati(), found=best.solution
-                )
-            except CertificateError:  # rounding: what takes its place must hold as well
-                found = tolerant(best.weighted, best.given, self.uncertain)
-                margin, drawn = self._judged(found.system)
-                if margin < self.margin or drawn < _KEPT * self.margin:
-                    raise
+        best = self.best
+        found = tolerant(best.weighted, best.given, self.uncertain, Riccati(), found=best.solution)
         certificate = found.certificate | {
-            f"least modulus margin of {_DRAWS} machines drawn": drawn,
+            f"least modulus margin of {_DRAWS} machines drawn": best.drawn,
             "weights for Hz": best.bandwidth,
         }
         return found.replace(
@@ -386,8 +360,6 @@ class _StageTry(NamedTuple):
     weighted: StandardPlant
     given: Evened
     system: StateSpace
-    #: verified figures, if another method than `Riccati` found it
-    found: Controller | None = None
-    #: result of `Riccati`, not verified
-    solution: SolvedController | None = None
+    #: what `Riccati` found for the prepared problem
+    solution: SolvedController
     drawn: float = 0.0
