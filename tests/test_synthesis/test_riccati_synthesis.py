@@ -137,7 +137,7 @@ def test_normalised_coprime_factors_have_glover_and_mcfarlanes_optimum(seed, n, 
     assert best * (1 - 1e-5) <= found.gamma <= 1.06 * best
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @given(seed=st.integers(0, 10**6), unit=st.floats(-9, 9), dt=st.sampled_from([0.0, 0.1]))
 def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
     """D11 and D22 not zero; gamma is linear in the unit of w."""

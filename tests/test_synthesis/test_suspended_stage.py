@@ -101,7 +101,7 @@ def test_the_error_settles_on_springs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bandwidth", [2.0, 10.0, 40.0])
+@pytest.mark.parametrize("bandwidth", [pytest.param(2.0, marks=pytest.mark.long), 10.0, 40.0])
 def test_springs_of_any_stiffness_are_held_below_and_above_their_modes(bandwidth):
     """Springs at 6.9 and 12 Hz: on their line, next to their modes, on the mass line."""
     plant = held(freq=6.93)

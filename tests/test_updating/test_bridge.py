@@ -13,7 +13,7 @@ def bridge():
     return Bridge()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_truth_is_reached_from_stored_starts(bridge):
     assert ends(bridge, bridge.starts[:2]).max() < 1e-8
 
