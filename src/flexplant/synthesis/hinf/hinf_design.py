@@ -26,7 +26,6 @@ from ...plant import AnyPlant, StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...words import instance
 from ..controller import (
-    AGREEMENT,
     Controller,
     SolvedController,
     SynthesisMethod,
@@ -48,10 +47,9 @@ _MIXED = 1e3
 TOLERATED = "all frequencies at once"
 #: ratio of gamma to its lower bound up to which bad coordinates may have been harmless
 _CLOSE = 1.06
-#: number of draws of one rounding of the plant: no controller is given where these change gamma by
-#: more than the certificate's agreement; the loop is examined where its norm by two routes differs
-#: by more than the second number
-_DRAWS, _FELT = 3, 1e-5
+#: relative change of gamma by one rounding of the plant above which no controller is given, and the
+#: number of draws of it; the loop is examined where its norm by two routes differs by more
+_SENSITIVE, _DRAWS, _FELT = 2e-4, 3, 1e-5
 
 
 @one_thread()
@@ -281,7 +279,7 @@ def _require_resolved(P: StateSpace, K: StateSpace) -> None:
         }
         norm = hinf_norm(lft(P.replace(**moved, blocks=None), K))
         change = max(change, abs(norm / gamma - 1.0) if gamma else 0.0)
-    if change > AGREEMENT:
+    if change > _SENSITIVE:
         raise SolverError(
             f"a controller with gamma {gamma:.4g} was found, but one rounding of each entry of A, "
             f"B and C changes it by {100 * change:.2g} %. Loosen the weights, or leave out states "
