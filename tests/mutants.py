@@ -25,8 +25,8 @@ SOURCE = TOP / "src" / "flexplant"
 #: module, right text, wrong text
 LINES = [
     ("structure/unit_systems.py", "self.mass / self.time, ", "self.mass, "),
-    ("lti/lyapunov.py", "if not residual <= TOLERANCE:", "if False:"),
-    ("lti/equations.py", "for term in (moved, bent, Q))) <= _OFF:", "for term in (Q,))) >= 0:"),
+    ("lti/lyapunov.py", "if not residual <= RESIDUAL:", "if False:"),
+    ("lti/equations.py", "for term in (moved, bent, Q))) <= TYPED:", "for term in (Q,))) >= 0:"),
     ("lti/peaks.py", " + radius**3 * model.rest(centre, radius, 2)", ""),
     ("lti/peaks.py", "return centre[unsure[_largest(T0[unsure]) > level]], bound <= level",
      "return centre[unsure[_largest(T0[unsure]) > level]], bound <= 1.1 * level"),
