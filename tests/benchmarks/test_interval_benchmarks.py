@@ -42,27 +42,44 @@ KINDS = {
         "known": (0.1, 0.2), "bandwidth": 40.0, "poles": 11, "soft": 0.53, "order": 19,
         "push": [(0.09, 0.06), (0.36, 0.075), (0.1, 0.24), (0.33, 0.22)],
     },
+    "solid on springs": {
+        "size": (0.6, 0.4, 0.03), "zeta": 0.01, "cells": (16, 11, 2), "known": (0.2, 0.3),
+        "inset": (0.2, 0.75), "bandwidth": 50.0, "poles": 11, "springs": 43e3,
+    },
 }  # fmt: skip
 #: half-width [m] of the weak strip across the plate, which makes a soft pair at 412 and 419 Hz
 STRIP = 0.07
+#: stiffness of the solid's springs along x, y and z over that along z, as of rubber feet
+SOFTER = (0.5, 0.5, 1.0)
 ALUMINIUM = {"density": 2702.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
 
 
 def layout(kind):
-    a, b = kind["size"]
+    a, b = kind["size"][:2]
     low, high = kind.get("inset", (0.0, 1.0))
     forces = kind.get("push") or [(x * a, y * b) for y in (low, high) for x in (low, high)]
     corners = [(x, y) for y in (0.0, b) for x in (0.0, a)]
     return forces, corners, (0.5 * a, 0.5 * b)
 
 
+def height(kind):
+    """Height [m] of the plane of forces, sensors and POI."""
+    return (*kind["size"], 0.0)[2]
+
+
+def corners(kind):
+    """Places of the sensors."""
+    return [(*place, height(kind)) for place in layout(kind)[1]]
+
+
 def ports(kind):
-    forces, corners, poi = layout(kind)
+    forces, _, poi = layout(kind)
+    c = height(kind)
     return fx.Ports(
-        w=[fx.Disturbance(f"amp{i}", at=(*p, 0.0), asd=FORCE) for i, p in enumerate(forces, 1)],
-        u=[fx.Actuator(f"u{i}", at=(*p, 0.0)) for i, p in enumerate(forces, 1)],
-        z=[fx.Poi("die", at=(*poi, 0.0), axes=("z", "rx", "ry"))],
-        y=[fx.Sensor(f"y{i}", at=(*p, 0.0), asd=NOISE) for i, p in enumerate(corners, 1)],
+        w=[fx.Disturbance(f"amp{i}", at=(*p, c), asd=FORCE) for i, p in enumerate(forces, 1)],
+        u=[fx.Actuator(f"u{i}", at=(*p, c)) for i, p in enumerate(forces, 1)],
+        z=[fx.Poi("die", at=(*poi, c), axes=("z", "rx", "ry"))],
+        y=[fx.Sensor(f"y{i}", at=p, asd=NOISE) for i, p in enumerate(corners(kind), 1)],
         references=[fx.Reference("die")],
     )
 
@@ -73,7 +90,24 @@ def modulus(kind, soft, size=70e9):
     return lambda x, y: size * (1.0 - soft * np.exp(-(((x - middle) / STRIP) ** 2))) + 0.0 * y
 
 
+def solid(kind, cells, mass=0.0, stiffer=0.0, firmer=0.0):
+    """A block on springs at its lower corners, pushed and seen on its upper side."""
+    a, b, c = kind["size"]
+    material = ALUMINIUM | {"youngs_modulus": 70e9 * (1.0 + stiffer)}
+    model = fx.solid_block(size=(a, b, c), elements=cells, **material)
+    firm = kind["springs"] * (1.0 + firmer)
+    springs = [
+        fx.Spring(model.dofs.nearest((x, y, 0.0), along), firm * part)
+        for x in (0.0, a) for y in (0.0, b) for along, part in zip("xyz", SOFTER, strict=True)
+    ]  # fmt: skip
+    model = model.with_parts(springs)
+    at = model.dofs.nearest((*kind["known"], c), "z")
+    return (model.with_parts(fx.PointMass(at, mass)) if mass > 0 else model), at
+
+
 def drawn(kind, cells, make=fx.plate, mass=0.0, stiffer=0.0, softer=0.0):
+    if "springs" in kind:
+        return solid(kind, cells, mass, stiffer, softer)
     stiff = modulus(kind, kind.get("soft", 0.0) + softer, 70e9 * (1.0 + stiffer))
     material = ALUMINIUM | {"youngs_modulus": stiff}
     model = make(size=kind["size"], thickness=kind["thickness"], elements=cells, **material)
@@ -92,8 +126,10 @@ def solved(kind, cells, make, *changes, **options):
 
 
 def machine_of(kind, seed):
+    if "springs" in kind:
+        return solid_machine_of(kind, seed)
     rng = np.random.default_rng([seed, 60])
-    forces, corners, poi = layout(kind)
+    forces, sensors, poi = layout(kind)
     a, b = kind["size"]
     plate = a * b * kind["thickness"] * 2702.0
     masses = [
@@ -102,28 +138,44 @@ def machine_of(kind, seed):
     ]
     young = modulus(kind, kind["soft"] * rng.normal(1.0, 0.03)) if "soft" in kind else 70e9
     return unlike_machines.plate_machine(
-        rng, kind["size"], kind["thickness"], 2702.0, young, 0.33, forces=forces, sensors=corners,
+        rng, kind["size"], kind["thickness"], 2702.0, young, 0.33, forces=forces, sensors=sensors,
         poi=poi, zeta=kind["zeta"], masses=masses, order=kind.get("order", unlike_machines.ORDER),
+    )  # fmt: skip
+
+
+def solid_machine_of(kind, seed):
+    rng = np.random.default_rng([seed, 60])
+    a, b, c = kind["size"]
+    upper = [[(*p, c) for p in places] for places in layout(kind)[:2]]
+    block = a * b * c * 2702.0
+    masses = [
+        ((*kind["known"], c), block * rng.uniform(0.005, 0.02)),
+        ((a * rng.random(), b * rng.random(), c), block * 0.003 * rng.random()),
+    ]
+    firm = kind["springs"] * rng.normal(1.0, 0.05)
+    return unlike_machines.solid_machine(
+        rng, (a, b, c), 2702.0, 70e9, 0.33, forces=upper[0], sensors=upper[1],
+        poi=(0.5 * a, 0.5 * b, c), zeta=kind["zeta"], masses=masses,
+        springs=[((x, y, 0.0), firm * np.array(SOFTER)) for x in (0.0, a) for y in (0.0, b)],
     )  # fmt: skip
 
 
 def measured_of(machine, model, count, seed):
     """Poles with the noise of a measurement and shapes at the corners, as the model's modes."""
     rng = np.random.default_rng([seed, 61])
-    poles = machine.poles(count)
+    poles, shapes = machine.measured(count)
     std = 1e-5 * np.abs(poles)
     poles = poles + std * (rng.normal(size=count) + 1j * rng.normal(size=count)) / np.sqrt(2)
-    shapes = machine.sensors[:, 3 : 3 + count]
     names = [f"y{i}" for i in range(1, 5)]
     found = fx.MeasuredModes(poles, covariance=std**2, shapes=shapes, dofs=names)
     return lambda kind: fx.numbered(
-        found, model, at={n: (*p, 0.0) for n, p in zip(names, layout(kind)[1], strict=True)},
+        found, model, at=dict(zip(names, corners(kind), strict=True)),
         partial=True, least_mac=0.7, tolerance=0.05,
     )  # fmt: skip
 
 
-def strip(kind, rom, make):
-    """What a weaker strip adds to the stiffness of the reduced model."""
+def third(kind, rom, make):
+    """What a weaker strip or firmer springs add to the stiffness of the reduced model."""
     K = [drawn(kind, kind["cells"], make, 0.0, 0.0, more)[0].K for more in (0.0, 0.1)]
     return rom.T.T @ ((K[1] - K[0]) @ rom.T) / 0.1
 
@@ -133,11 +185,14 @@ def judged(kind, seed, make=fx.plate):
     machine = machine_of(kind, seed)
     at = drawn(kind, kind["cells"], make)[1]
     modes = solved(kind, kind["cells"], make, count=24, compliance_at=[at])
-    rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 25, required=[at]).labels))
+    kept = [at, *(modes.dofs.nearest(place, "z") for place in corners(kind) if "springs" in kind)]
+    rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 25, required=kept).labels))
     measured = measured_of(machine, rom, kind["poles"], seed)(kind)
-    unknown = [fx.AddedMass(at), fx.MatrixParameter("stiffness", dK=rom.K)]
-    if "soft" in kind:
-        unknown.append(fx.MatrixParameter("strip", dK=strip(kind, rom, make)))
+    other = third(kind, rom, make) if kind.keys() & {"soft", "springs"} else None
+    own = rom.K - other if "springs" in kind else rom.K
+    unknown = [fx.AddedMass(at), fx.MatrixParameter("stiffness", dK=own)]
+    if other is not None:
+        unknown.append(fx.MatrixParameter("strip or springs", dK=other))
     fit = fx.update(rom, unknown, [fx.Eigenvalues(measured)])
     whole = solved(kind, kind["cells"], make, *fit.values, count=120)
     whole = whole.calibrated(measured_of(machine, whole, kind["poles"], seed)(kind))

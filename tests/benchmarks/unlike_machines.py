@@ -13,6 +13,8 @@ from oracles_mindlin import _line, mindlin_matrices
 
 #: order of the polynomials and modes of a machine: to four times half the sampling rate
 ORDER, MODES = 13, 120
+#: a mode is measured where sensors move by this part of what they move in another one
+SEEN = 0.1
 
 
 @dataclass
@@ -41,11 +43,12 @@ class Machine:
         )
         return A, B, C
 
-    def poles(self, count):
-        """The lowest poles that swing, by frequency."""
-        swings = self.omega > 0
-        omega, zeta = self.omega[swings][:count], self.zeta[swings][:count]
-        return omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    def measured(self, count):
+        """Poles and shapes at the sensors of the lowest modes that swing and are seen there."""
+        size = np.linalg.norm(self.sensors, axis=0)
+        own = np.flatnonzero((self.omega > 0) & (size > SEEN * size.max()))[:count]
+        omega, zeta = self.omega[own], self.zeta[own]
+        return omega * (-zeta + 1j * np.sqrt(1 - zeta**2)), self.sensors[:, own]
 
 
 def _row(size, place, order, slope=None):
@@ -120,3 +123,84 @@ def true_errors(machine, filter_system, forces_asd, noise_asd, rate, count):
     E = np.hstack([z - Df @ y, -Cf])
     X = la.solve_discrete_lyapunov(joint, noise)
     return np.sqrt(np.diag(E @ X @ E.T + Df @ R @ Df.T))
+
+
+#: order of the polynomials of a solid along x, y and z
+SOLID = (9, 8, 3)
+
+
+def _solid_row(size, place, motion, order=SOLID):
+    """Row over the coefficients of x, y, z of a motion at a place; rx is dz/dy, ry is -dz/dx."""
+    at = [np.array([2 * p / n - 1]) for p, n in zip(place, size, strict=True)]
+    lines = [_line(k, one) for k, one in zip(order, at, strict=True)]
+    turned = {"rx": (1, 1.0), "ry": (0, -1.0)}.get(motion)
+    factors = [values[0] for values, _ in lines]
+    sign = 1.0
+    if turned:
+        along, sign = turned
+        factors[along] = lines[along][1][0] * 2 / size[along]
+    row = sign * np.kron(np.kron(factors[0], factors[1]), factors[2])
+    which = {"x": 0, "y": 1}.get(motion, 2)
+    return np.concatenate([row if i == which else 0.0 * row for i in range(3)])
+
+
+def solid_matrices(size, density, E, nu, *, springs=(), masses=(), order=SOLID):
+    """M, K of a block in Legendre polynomials; E is a number or a function of (x, y).
+
+    `springs` are pairs of a place and the stiffness [N/m] along x, y and z, `masses` of a place
+    and kg.
+    """
+    half = 0.5 * np.asarray(size)
+    points, weights = zip(*(np.polynomial.legendre.leggauss(n + 3) for n in order), strict=True)
+    lines = [_line(n, p) for n, p in zip(order, points, strict=True)]
+
+    def field(along=None):
+        parts = [lines[i][1] / half[i] if i == along else lines[i][0] for i in range(3)]
+        return np.kron(np.kron(parts[0], parts[1]), parts[2])
+
+    volume = half.prod() * np.kron(np.kron(weights[0], weights[1]), weights[2])
+    grid = np.meshgrid(*(h * (1 + p) for h, p in zip(half, points, strict=True)), indexing="ij")
+    young = E(grid[0].ravel(), grid[1].ravel()) if callable(E) else E
+    D = [field(i) for i in range(3)]
+    shear = volume * young / (2 * (1 + nu))
+    bulk = volume * young * nu / ((1 + nu) * (1 - 2 * nu))
+
+    def block(i, j):
+        found = D[i].T @ (bulk[:, None] * D[j]) + D[j].T @ (shear[:, None] * D[i])
+        if i == j:
+            found = found + sum(d.T @ (shear[:, None] * d) for d in D)
+        return found
+
+    K = np.block([[block(i, j) for j in range(3)] for i in range(3)])
+    F = field()
+    M = la.block_diag(*(3 * [F.T @ ((density * volume)[:, None] * F)]))
+    for matrix, parts in ((K, springs), (M, masses)):
+        for place, amount in parts:
+            for motion, size_of in zip("xyz", np.broadcast_to(amount, 3), strict=True):
+                row = _solid_row(size, place, motion, order)
+                matrix += size_of * np.outer(row, row)
+    return 0.5 * (M + M.T), 0.5 * (K + K.T)
+
+
+def solid_machine(
+    rng, size, density, E, nu, *, forces, sensors, poi, zeta, masses, springs, scatter=0.02
+):
+    """A block on springs whose stiffness varies by `scatter`, and its dampings by a quarter."""
+    heights = rng.normal(size=(3, 3)) * scatter / 1.5
+
+    def stiff(x, y):
+        waves = [
+            np.cos(np.pi * np.arange(3) * at[..., None] / n)
+            for at, n in zip((x, y), size[:2], strict=True)
+        ]
+        return E * (1.0 + np.einsum("...i,ij,...j->...", waves[0], heights, waves[1]))
+
+    M, K = solid_matrices(size, density, stiff, nu, springs=springs, masses=masses)
+    values, phi = la.eigh(K, M, subset_by_index=(0, MODES - 1))
+    rows = {
+        "push": [_solid_row(size, p, "z") for p in forces],
+        "sensors": [_solid_row(size, p, "z") for p in sensors],
+        "poi": [_solid_row(size, poi, motion) for motion in ("z", "rx", "ry")],
+    }
+    seen = {name: np.array(part) @ phi for name, part in rows.items()}
+    return Machine(np.sqrt(values), zeta * np.exp(0.25 * rng.normal(size=MODES)), **seen)
