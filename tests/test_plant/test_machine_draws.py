@@ -407,6 +407,27 @@ def test_any_figure_of_a_loop_has_an_interval(plant):
     assert sentence.endswith("m on 95 % of such machines")
 
 
+def test_the_response_of_the_fit_judges_loops(case):
+    """A plant of a model that was fitted to a response says the same as plant.measured(frf)."""
+    system = case.plant().continuous.Gyu.select(["y1", "y2"], ["u1", "u2"])
+    frf = fx.frequency_response(system, np.linspace(1.0, 1500.0, 1500))
+    places = {"y1": (0, 0, 0), "y2": (1, 0, 0), "u1": (0.25, 0, 0), "u2": (0.75, 0, 0)}
+    fitted = fx.FrfResidual(frf, places=places, lines=range(25, 150))
+    rom = case.fit.model
+    with warnings.catch_warnings(action="ignore"):
+        fit = fx.update(rom, [fx.MatrixParameter("E", dK=rom.K)], [fitted])
+    model = fit.calibrated(case.measured)
+    own = fx.assemble_plant(model, ports()).discretized(5e3, delay=1)
+    observer = fx.design_static(own)
+    servo = fx.design_servo(own, bandwidth=20.0, observer=observer)
+    found = fx.close_loop(own, observer, servo).on_measurement
+    wanted = fx.close_loop(own.measured(frf), observer, servo).on_measurement
+    assert found.margin == wanted.margin > 0.1
+    assert found.summary in repr(fx.close_loop(own, observer, servo))
+    held = fx.assemble_plant(model.replace(machines=None), ports()).discretized(5e3, delay=1)
+    assert fx.close_loop(held, observer, servo).on_measurement is None
+
+
 def test_the_report_says_where_figures_lie(plant, tmp_path):
     observer = fx.design_static(plant)
     loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=20.0, observer=observer))

@@ -206,3 +206,15 @@ def test_measured_shapes_are_compared_mode_by_mode():
     wrong = fx.update(rom, unknown, [fx.Eigenvalues(measured.replace(shapes=other))])
     assert f"mode 3 has another shape than measured (MAC {mac:.2f})" in repr(wrong)
     assert fit.likeness(measured.replace(shapes=None, dofs=None)) == {}
+    five = fx.chain(masses=[1.0, 1.2, 0.9, 1.1, 1.3], stiffnesses=[4e5, 3e5, 5e5, 2e5])
+    modes = fx.solve_modes(five, count=5, damping=fx.ModalDamping(0.01))
+    rom = fx.reduce(modes, fx.DesiredDofs(modes.dofs.labels))
+    poles = modes.omega[1:] * (-0.01 + 1j) * [1.001, 0.9995, 1.0002, 0.9998]
+    shapes = np.array(modes.phi[:, 1:], dtype=complex)
+    known = fx.MeasuredModes(poles, shapes=shapes, dofs=modes.dofs.labels)
+    known = fx.numbered(known, rom)
+    fit = fx.update(rom, [fx.MatrixParameter("k", dK=rom.K)], [fx.Eigenvalues(known)])
+    assert not fit.machines(known).missing
+    shapes[:, 2] = shapes[::-1, 2]
+    missing = fit.machines(known.replace(shapes=shapes)).missing
+    assert missing.startswith("mode 4 has another shape than measured")

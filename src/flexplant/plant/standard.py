@@ -251,6 +251,9 @@ class StandardPlant(Partition):
     def measured(self, frf: Frf, *, hold: bool = True, delay: float = 0.0) -> StandardPlant:
         """Return the plant with the measured response of its machine, on which loops are judged.
 
+        A plant of ``fit.calibrated(measured)`` has the response to which the model was fitted
+        (`FrfResidual` without a hold) where channels have the names of its actuators and sensors.
+
         Parameters
         ----------
         frf : Frf

@@ -96,10 +96,10 @@ class Machines(Value):
         """Trend of the residual of measured frequencies."""
         return trend_of(self.fit, self.measured)
 
-    @property
+    @cached_property
     def missing(self) -> str:
         """Reason why no interval exists, in one sentence; empty if there is an interval."""
-        return self.trend.missing
+        return self.trend.missing or next(iter(self.fit.unlike_shapes(self.measured)), "")
 
     @cached_property
     def damping_changes(self) -> FloatArray:

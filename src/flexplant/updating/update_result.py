@@ -287,13 +287,17 @@ class UpdateResult(Value):
         with attempted("the trend of the residual", ModelError):
             found = self.trend()
         lines = [] if found is None or found.dof < 1 or not found.missing else [found.missing]
-        unlike = {mode: mac for mode, mac in self.likeness().items() if mac < ALIKE}
-        lines += [
+        lines += self.unlike_shapes()[:3]
+        return [f"  {line}" for line in lines]
+
+    def unlike_shapes(self, measured: MeasuredModes | None = None) -> list[str]:
+        """Return a sentence on each measured shape that is not the model's; see `likeness`."""
+        return [
             f"mode {mode} has another shape than measured (MAC {mac:.2f}): what is promised of it "
             "does not hold"
-            for mode, mac in list(unlike.items())[:3]
+            for mode, mac in self.likeness(measured).items()
+            if mac < ALIKE
         ]
-        return [f"  {line}" for line in lines]
 
     def likeness(self, measured: MeasuredModes | None = None) -> dict[int, float]:
         """Return the MAC of each measured shape with that of the updated model.
