@@ -268,6 +268,9 @@ _INTEGRATOR = {WIDE: 0.02}
 #: the faster corners that are tried instead, and the factor by which they may raise |S|: a tenth of
 #: the margin, for errors that settle up to five times sooner
 _FASTER, _COST = (0.1, 0.05), 1.1
+#: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
+#: bandwidth, which a free mass has with the usual lead
+_WELL_BELOW, _SUPPRESSED = 20.0, 0.3
 #: wide leads are tried where a mode lies above the bandwidth within this factor
 _NEAR = 4.0
 
@@ -325,7 +328,17 @@ class ServoTask:
         if wide == best or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
             return best
         ends = [self.notched(best), self.notched(wide)]
-        return best if self._best(ends) is ends[0] else self._settling_soon(wide)
+        if self._best(ends) is ends[0]:
+            return best
+        wide = self._settling_soon(wide)
+        return wide if self._suppresses(wide) or not self._suppresses(best) else best
+
+    def _suppresses(self, law: ServoLaw) -> bool:
+        """Return whether every axis suppresses errors well below its bandwidth."""
+        low = law.driven.freq / _WELL_BELOW
+        plant = gains_at(self.plant, law.driven, low)
+        laws = np.array([a.law.at(np.array([f]))[0] for a, f in zip(law.axes, low, strict=True)])
+        return bool(np.all(np.abs(1.0 + laws * plant) >= 1.0 / _SUPPRESSED))
 
     def _settling_soon(self, law: ServoLaw) -> ServoLaw:
         """Return a law of wide leads with the fastest integral action that costs little margin."""

@@ -90,11 +90,14 @@ class Axis:
         return (Pid(0.0, i=1.0),) if self.line == "spring" else ()
 
 
-def gains_at(plant: StandardPlant, axes: DrivenAxes) -> FloatArray:
-    """Return the responses (r,) of the decoupled axes to their commands at j 2 pi freq, complex."""
+def gains_at(
+    plant: StandardPlant, axes: DrivenAxes, freq: FloatArray | None = None
+) -> ComplexArray:
+    """Return the responses (r,) of the decoupled axes, at their frequencies [Hz] or at others."""
+    at = axes.freq if freq is None else freq
     found = [
         (complex_gain(plant.system, 2j * np.pi * f, [name], axes.actuators) @ axes.T[:, i])[0]
-        for i, (name, f) in enumerate(zip(axes.channels, axes.freq, strict=True))
+        for i, (name, f) in enumerate(zip(axes.channels, at, strict=True))
     ]
     return np.array(found)
 
