@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import scipy.linalg as la
+from scipy.signal import place_poles
 
 import flexplant as fx
 import oracles_loop as oracle
 from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.loop.budget import Source, source_variances
 from flexplant.lti import StateSpace
 from flexplant.plant import Actuator, Disturbance, Sensor, StandardPlant
 from machines import OMEGA, RATE, SHAPES, observer, servo, stage
@@ -213,3 +215,36 @@ def test_what_has_no_stationary_state_is_refused(loop):
     rest = StateSpace([], [], [], np.zeros((1, 1)), inputs=["y1"], outputs=["u1"])
     with pytest.raises(AssumptionError, match="rigid-body mode or integrator"):
         fx.close_loop(idle, rest).psd("die:z")
+
+
+def slow_servo(rng, dt=1e-4):
+    """Return A, G, c of a mass with one mode, its observer and an integrator of 0.05 Hz."""
+    mass, omega = rng.uniform(1, 50), 2 * np.pi * 10 ** rng.uniform(1.5, 3.3)
+    held = la.block_diag(*([[[0, 1], [-w * w, -0.02 * w]] for w in (0.0, omega)]))
+    drive = np.array([[0.0], [1.0], [0.0], [1.0]]) / mass
+    whole = la.expm(dt * np.block([[held, drive], [np.zeros((1, 5))]]))
+    A, B, C = whole[:4, :4], whole[:4, 4:], np.array([[1.0, 0.0, 1.0, 0.0]])
+    with_sum = np.block([[A, np.zeros((4, 1))], [dt * C, np.eye(1)]])
+    fast, faster = 10 ** rng.uniform(1.3, 2.3, 4), 10 ** rng.uniform(2.0, 2.8, 4)
+    poles = [np.exp(-2 * np.pi * dt * np.array(f)) for f in ([0.05, *fast], faster)]
+    F = place_poles(with_sum, np.vstack([B, [[0.0]]]), poles[0]).gain_matrix
+    L = place_poles(A.T, C.T, poles[1]).gain_matrix.T
+    joint = np.block(
+        [[A, -B @ F], [L @ C, A - B @ F[:, :4] - L @ C, -B @ F[:, 4:]], [dt * C, 0 * C, np.eye(1)]]
+    )
+    none = np.zeros((4, 1))
+    G = np.block([[B, none], [none, 1e-9 * L], [np.zeros((1, 2))]])
+    return joint, G, np.hstack([C, np.zeros((1, 5))])
+
+
+@pytest.mark.parametrize("seed", [7, 28, 50, 59])
+def test_a_slow_pole_among_states_of_different_size_has_a_variance(seed):
+    """The entries of the Gramians have lost their digits, the rms has not (extended precision)."""
+    A, G, c = slow_servo(np.random.default_rng(seed))
+    power, X = A.astype(np.longdouble), G.astype(np.longdouble) @ G.T
+    for _ in range(26):
+        X, power = X + power @ X @ power.T, power @ power
+    noise = Source("noise", G, np.zeros((1, 2)))
+    found, off = source_variances(StateSpace(A, G, c, np.zeros((1, 2)), 1e-4), 0, [noise])
+    assert found[0] == pytest.approx(float((c @ X @ c.T)[0, 0]), rel=1e-6, abs=0)
+    assert off < 1e-6

@@ -21,7 +21,7 @@ from ..errors import (
     short,
 )
 from ..lti.frequency_sweep import resonance_grid
-from ..lti.lyapunov import solve_lyapunov, solve_stein
+from ..lti.lyapunov import controllability_factor, observability_factor
 from ..lti.response_solvers import responder
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
@@ -131,16 +131,18 @@ def source_variances(
     monitored: StateSpace, row: int, noises: Sequence[Source]
 ) -> tuple[FloatArray, float]:
     """Return the variance of an output by source, and its largest relative difference."""
-    # by the observability Gramian, trace(G' Q G) + D D', and by the states' covariance
+    # by the observability Gramian, trace(G' Q G) + D D', and by the states' covariance. Factors of
+    # both make each variance a sum of squares: a slow pole among states of different size costs the
+    # entries of a Gramian their digits, and not its trace
     if not noises:
         return np.zeros(0), 0.0
     c = monitored.C[[row]]
-    solve = solve_stein if monitored.dt else solve_lyapunov
-    Q = solve(monitored.A.T, c.T @ c)
-    found = [float(np.sum(one.G * (Q @ one.G)) + np.sum(one.D[row] ** 2)) for one in noises]
-    variances = np.maximum(np.array(found), 0.0)
     G, D = (np.hstack(parts) for parts in zip(*((n.G, n.D[[row]]) for n in noises), strict=True))
-    other = float((c @ solve(monitored.A, G @ G.T) @ c.T + D @ D.T)[0, 0])
+    driven = StateSpace(monitored.A, G, c, D, monitored.dt)
+    seen = observability_factor(driven).T
+    found = [float(np.sum((seen @ one.G) ** 2) + np.sum(one.D[row] ** 2)) for one in noises]
+    variances = np.array(found)
+    other = float(np.sum((c @ controllability_factor(driven)) ** 2) + np.sum(D**2))
     total = float(variances.sum())
     difference = abs(other - total) / total if total else 0.0
     if not difference <= TYPED:
