@@ -156,6 +156,34 @@ def test_elastic_shapes_move_the_rigid_body_where_nobody_weighed_it(case):
     assert part.std() == pytest.approx(np.sqrt(2) * 2e-3, rel=0.15)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_on_isolators_stays_as_stiff_as_its_scattered_springs(seed):
+    """The measured modes are elastic; in the mode of the isolator the body bends as before."""
+    rng, springs, s = np.random.default_rng(seed), np.full(5, 4e6), 0.01
+    held = fx.chain(masses=rng.uniform(0.5, 2.0, 6), stiffnesses=springs, ground=[2e2] + [0.0] * 5)
+    modes = fx.solve_modes(held, damping=fx.ModalDamping(0.01))
+    poles = modes.poles[1:] * np.exp(s * rng.standard_normal(5))
+    measured = fx.MeasuredModes(poles, modes=range(2, 7))
+    with warnings.catch_warnings(action="ignore"):  # scatter is more than noise
+        fit = fx.update(held, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    family = MachineFamily(realise(modes), fit.machines(measured))
+
+    def stretch(shape):
+        return np.linalg.norm(np.diff(shape)) / np.linalg.norm(shape)
+
+    model = stretch(modes.phi[:, 0])
+    found, true = [], []
+    for draw in range(10):
+        V = own(drawn(family, s=s, dp=(0.0,), seed=draw))[1]
+        found.append(stretch(family.over @ V[:, 0]) / model)
+        k = springs * np.exp(2 * s * rng.standard_normal(5))
+        rows = np.diff(np.eye(6), axis=0)
+        K = rows.T @ (k[:, None] * rows) + np.diag([2e2] + [0.0] * 5)
+        true.append(stretch(la.eigh(K, held.M.toarray())[1][:, 0]) / model)
+    assert max(np.abs(np.array(true) - 1)) < 0.1
+    assert max(np.abs(np.array(found) - 1)) < 0.1
+
+
 @pytest.mark.parametrize("angle", [-1.2, 0.3, 0.9])
 def test_close_pairs_turn_to_their_measured_shapes(case, angle):
     """What was measured is a pair turned by an angle, each shape with any factor."""

@@ -73,6 +73,22 @@ class MachineFamily:
         return [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(near)]
 
     @cached_property
+    def _together(self) -> FloatArray:
+        """Factors (b, b) of the scatter of stiffness between modes below and in the measured band.
+
+        A mode below the lowest measured one, as of a body on isolators, strains other springs than
+        the measured modes. What these scatter changes the work of the lower mode's forces on the
+        higher shape by a part of its own stiffness omega_i^2, and not of omega_i omega_j.
+        """
+        r, omega = self.whole.n_rigid, self.omega
+        lowest = float(np.min(omega[self.measured]))
+        lower = np.minimum.outer(omega, omega)
+        higher = np.maximum.outer(omega, omega)
+        apart = (lower < lowest) & (lowest <= higher)
+        apart[:r], apart[:, :r] = False, False
+        return np.divide(lower, higher, out=np.ones_like(lower), where=apart)
+
+    @cached_property
     def _seen(self) -> FloatArray:
         """Rows (n, b) of the evaluation model's modes where shapes were measured."""
         known = self.machines.measured
@@ -186,7 +202,7 @@ class MachineFamily:
         r, b, rng = self.whole.n_rigid, self.omega.size, draw.rng
         g = self.omega / (2.0 * np.pi * self.machines.trend.highest)
         trend = 0.5 * np.sign(draw.slope) * np.log1p(2.0 * abs(draw.slope) * g)
-        E = draw.deviation * _symmetric(rng, b)
+        E = draw.deviation * self._together * _symmetric(rng, b)
         # nothing holds rigid-body motions: their rows are mass, which nobody weighed
         unweighed = np.zeros((b, b))
         unweighed[:r], unweighed[:, :r] = E[:r], E[:, :r]

@@ -53,8 +53,10 @@ class Machines(Value):
       a fraction r of it, uniform between 0 and 1, acts as mass and the rest as stiffness;
     - ``M' = exp(-r t) (I + sum dp dM) exp(-r t)``, ``K' = Omega exp(E) Omega + sum dp dK``, E
       symmetric with ``2 (s e + (1 - r) t)`` on its diagonal and deviations ``sqrt(2) s`` off it:
-      frequencies and shapes change together. Rigid-body masses have the deviation 2 s, since they
-      were not measured;
+      frequencies and shapes change together. The scatter between a mode below the measured band
+      and one in or above it is smaller by the ratio of their frequencies, since a body on isolators
+      strains other springs than the measured modes. Rigid-body masses have the deviation 2 s,
+      since they were not measured;
     - poles of measured modes from their covariance; other dampings from Student's predictive
       distribution of the measured ones.
 
