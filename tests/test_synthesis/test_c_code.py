@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 from test_aftercare import designed, pi_controller, plant
 
 import flexplant as fx
@@ -22,6 +23,7 @@ from flexplant.export import write_c
 from flexplant.lti import StateSpace
 from flexplant.simulation import Saturation
 from flexplant.synthesis import anti_windup_form
+from flexplant.synthesis.aftercare.forms import two_state_form
 from oracles_lti import periodic_answer
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
@@ -497,6 +499,25 @@ def test_a_wrong_block_is_found(monkeypatch, tmp_path):
     monkeypatch.setattr(two_state, "_arranged", wrong)
     with pytest.raises(CertificateError, match="differ from the system"):
         write_c(designed()[1], tmp_path / "a.c")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_channel_of_rounding_is_no_obstacle(seed):
+    """Two laws that do not see each other, in mixed states: what couples them is rounding."""
+    rng, dt, channels = np.random.default_rng(seed), 1e-4, [0] * 6 + [1] * 6
+    omega, zeta = 2 * np.pi * 10 ** rng.uniform(-1, 3, 12), 10 ** rng.uniform(-2, 0, 12)
+    pairs = [[[0.0, w], [-w, -2 * z * w]] for w, z in zip(omega, zeta, strict=True)]
+    A, own = la.expm(dt * la.block_diag(*pairs)), np.eye(2)[np.repeat(channels, 2)]
+    B, C = own * rng.standard_normal((24, 2)), 1e8 * own.T * rng.standard_normal((2, 24))
+    Q, d = la.qr(rng.standard_normal((24, 24)))[0], 10 ** rng.uniform(-3, 3, 24)
+    mixed = StateSpace(
+        Q @ A @ Q.T * d / d[:, None], Q @ B / d[:, None], C @ Q.T * d, np.zeros((2, 2)), dt
+    )
+    form, freq = two_state_form(mixed), np.geomspace(1.0, 4e3, 50)
+    z = np.exp(2j * np.pi * freq * dt)
+    exact = C @ np.linalg.solve(z[:, None, None] * np.eye(24) - A, B)
+    gap = np.abs(form.response(freq, dt) - exact.transpose(1, 2, 0)).max(axis=2)
+    assert gap.max() < 1e-8 * np.abs(exact).max(axis=0).diagonal().min()
 
 
 @pytest.mark.slow

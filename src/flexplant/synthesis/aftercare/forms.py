@@ -90,7 +90,7 @@ def two_state_form(
     # the values of the first `inputs`
     most, error = (_SINGLE if single else _DOUBLE), np.inf
     for form, sizes in _block_forms(K):
-        found = _compared(K, _arranged(form, sizes, driven, inputs), single)
+        found = _compared(K, _arranged(form, sizes, driven, inputs), single, most)
         if found.error <= most:
             return found
         error = min(error, found.error)
@@ -113,14 +113,15 @@ def scheduled_form(
     # to a scale for each state
     sizes = [state_scale(K.A, K.B, K.C) for K in laws]
     d = np.exp(np.mean(np.log(sizes), axis=0))
-    found = []
+    found, most = [], _SINGLE if single else _DOUBLE
     for K in laws:
         K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
         own = _arranged(K, [K.n_states], [slice(driven)], None, paired=0)  # A follows the place
         own = _in_single(own) if single else own
-        found.append(own._replace(error=_difference(K, partial(_entries_response, K, own))))
+        away = partial(_entries_response, K, own)
+        found.append(own._replace(error=_difference(K, away, most)))
     error = max(one.error for one in found)
-    if error > (most := _SINGLE if single else _DOUBLE):
+    if error > most:
         cure = (
             "Write it in double precision, or reduce the controllers."
             if single
@@ -193,14 +194,14 @@ def _arranged(
     return TwoStateForm(np.array(entries), rest, rows(K.B), C, K.D, np.array(start), 0.0)
 
 
-def _compared(K: StateSpace, form: TwoStateForm, single: bool) -> TwoStateForm:
+def _compared(K: StateSpace, form: TwoStateForm, single: bool, most: float) -> TwoStateForm:
     """Return a form, in single precision if asked, with what its response differs by."""
     form = _in_single(form) if single else form
 
     def away(freq: FloatArray) -> ComplexArray:
         return form.response(freq, K.dt) - frequency_response(K, freq).data
 
-    return form._replace(error=_difference(K, away))
+    return form._replace(error=_difference(K, away, most))
 
 
 def _in_single(form: TwoStateForm) -> TwoStateForm:
@@ -241,10 +242,11 @@ def _at_rest(K: StateSpace, driven: slice) -> FloatArray:
     return np.asarray(first + free @ more)
 
 
-def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray]) -> float:
+def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray], most: float) -> float:
     """Return how large a difference from the response is, relative to the channel's largest gain.
 
     A channel far below the others of its output and input counts as part of them: it is rounding.
+    What is below the rounding of those others is at most the allowed difference `most`.
     """
     if not K.n_states:
         return 0.0
@@ -255,7 +257,8 @@ def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray]) -> fl
     apart = np.abs(np.exp(2j * np.pi * grid * K.dt)[:, None] - poles)
     grid = grid[np.all(moved < _MOVED * apart, axis=1)]
     size = np.abs(frequency_response(K, grid).data).max(axis=2, initial=0.0)
-    least = _SMALL * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
+    small = max(_SMALL, ROUNDING / most)
+    least = small * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
     gap = np.abs(away(grid)).max(axis=2, initial=0.0)
     return float(np.max(gap / divisor(np.maximum(size, least)), initial=0.0))
 
