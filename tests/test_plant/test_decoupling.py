@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import StateSpace, low_pass_filter
 from flexplant.plant import (
@@ -129,3 +130,33 @@ def test_refusals():
     assert repr(gravity_axes(plant)).startswith(
         "<GravityAxes z, rx, ry at (0.3, 0.3, 0) m: 4 actua"
     )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_axes_are_apart_whatever_the_bandwidth(seed):
+    """The response is singular far above the modes, as of a robot whose gears are soft there."""
+    rng, omega = np.random.default_rng(seed), 2 * np.pi * np.array([1.0, 2.0, 30.0])
+    c, b = rng.standard_normal((2, 2)), rng.standard_normal((2, 2))
+    more = rng.standard_normal(2)
+    c, b = np.column_stack([c, -c @ b @ more / (more @ more)]), np.vstack([b, more])
+    xyz = np.arange(3)[:, None] * np.eye(3)[0]
+    dofs = fx.DofSet([1, 2, 3], ["x"] * 3, xyz)
+    model = fx.FEModel(np.eye(3), np.diag(omega**2), dofs=dofs)
+
+    def plant(b):
+        def at(row):
+            return dict(zip(dofs.labels, row.tolist(), strict=True))
+
+        drives = [Actuator(f"u{i}", at=at(column)) for i, column in enumerate(b.T)]
+        goals = [fx.Poi(f"p{i}", at=at(row), axes=("x",)) for i, row in enumerate(c)]
+        modes = fx.solve_modes(model, damping=fx.ModalDamping(1e-4))
+        return assemble_plant(modes, fx.Ports(u=drives, z=goals, y=[Sensor("y", at="1:x")]))
+
+    for freq in (0.1, 3.0, 30.0, 3000.0):
+        found, sigma = fx.plant.driven_axes(plant(b), freq=freq), 2 * np.pi * freq
+        assert found.channels == ("p0:x", "p1:x")
+        if freq < 100.0:
+            T = np.linalg.inv(c @ np.diag(1 / (sigma**2 + omega**2)) @ b) / sigma**2
+            np.testing.assert_allclose(found.T, T, rtol=0, atol=1e-3 * np.abs(T).max())
+        with pytest.raises(AssumptionError, match="do not move these axes apart"):
+            fx.plant.driven_axes(plant(b[:, [0, 0]]), freq=freq)
