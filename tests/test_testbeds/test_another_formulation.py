@@ -258,7 +258,7 @@ def test_the_search_judges_the_modes_left_out():
     assert fx.close_loop(plant, fast).modulus_margin > 0.45
     assert one.loop(own, fast).spectral_radius > 1.003
     judged = plant.replace(evaluation=whole)
-    with pytest.raises(InfeasibleError, match=r"no loop with weights for .* keeps"):
+    with pytest.raises(InfeasibleError, match="crossing 1 at 100 Hz: modulus margin"):
         fx.design_stage(judged.uncertain(frequency=off), bandwidth=100.0)
     controller = fx.design_stage(judged.uncertain(frequency=off), bandwidth=50.0)
     promised = fx.close_loop(judged, controller)

@@ -163,7 +163,8 @@ class _StageTask:
         self.errors = reference_errors(self.plant, poi=poi) if followed else None
         self.through = self.plant if self.errors is None else self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
-        self.failures: dict[float, FlexplantError] = {}
+        #: what was tried, by the bandwidth of the loop [Hz], and why it does not hold
+        self.causes: list[str] = []
         self.best: _StageTry | None = None
 
     @cached_property
@@ -179,15 +180,18 @@ class _StageTask:
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
-        return self._kept(bandwidth, lambda below: self._designed(bandwidth, below))
+        design = partial(self._designed, bandwidth)
+        return self._kept(bandwidth, design, _CROSSES * bandwidth)
 
     def reaches(self, wanted: float) -> bool:
         """Design a loop whose |S| crosses 1 at a bandwidth, and return whether it holds."""
         if self.errors is None:
             return self.holds(wanted / _CROSSES)
-        return self._kept(wanted / _CROSSES, lambda below: self._moved(wanted, below))
+        return self._kept(wanted / _CROSSES, partial(self._moved, wanted), wanted)
 
-    def _kept(self, bandwidth: float, design: Callable[[float], _StageTry | None]) -> bool:
+    def _kept(
+        self, bandwidth: float, design: Callable[[float], _StageTry | FlexplantError], asked: float
+    ) -> bool:
         """Keep the first design that holds, of those that damp more and more modes."""
         damped = None
         for factor in _DAMPED:
@@ -196,10 +200,13 @@ class _StageTask:
             if now == damped:
                 break
             damped, one = now, design(below)
-            self.tried.setdefault(bandwidth if one is None else one.bandwidth, 0.0)
-            if one is None:
+            if isinstance(one, FlexplantError):
+                self.tried.setdefault(bandwidth, 0.0)
+                self.causes.append(f"{asked:.4g} Hz: {one}")
                 continue
-            margin, drawn = self._judged(one.system)
+            self.tried.setdefault(one.bandwidth, 0.0)
+            margin, drawn, cause = self._judged(one.system)
+            self.causes.append(f"{asked:.4g} Hz: modulus margin {cause}")
             if margin < self.margin:  # of the model itself: more damping does not help
                 self.tried[one.bandwidth] = max(self.tried[one.bandwidth], margin)
                 break
@@ -210,14 +217,14 @@ class _StageTask:
                 return True
         return False
 
-    def _moved(self, wanted: float, below: float) -> _StageTry | None:
+    def _moved(self, wanted: float, below: float) -> _StageTry | FlexplantError:
         """Return a design whose |S| crosses 1 at a bandwidth, the slowest weights that have it."""
         at, ends = wanted, [0.0, np.inf]  # of weights that are too slow, and too fast
         known: list[tuple[float, float]] = []
         for _ in range(_DESIGNS):
             one = self._designed(at, below)
-            if one is None:
-                return None
+            if isinstance(one, FlexplantError):
+                return one
             reached = self._crossing(one.system)
             if abs(reached / wanted - 1.0) <= _REACHED:
                 return one
@@ -227,8 +234,7 @@ class _StageTask:
                 break
             at = min(_next(known, wanted, ends), self.highest)
         tried = ", ".join(f"{there:.4g} Hz" for _, there in known)
-        self.failures[wanted] = InfeasibleError(f"|S| crosses 1 at {tried}")
-        return None
+        return InfeasibleError(f"|S| crosses 1 at {tried} instead")
 
     def _crossing(self, system: StateSpace) -> float:
         """Return where |S| of the slowest axis that is followed crosses 1 [Hz]."""
@@ -236,34 +242,36 @@ class _StageTask:
         followed = () if self.errors is None else self.errors.inputs
         return min(hertz for ref, hertz in reached.items() if ref in followed)
 
-    def _designed(self, bandwidth: float, below: float) -> _StageTry | None:
-        """Return a controller that is not verified yet, None where there is none."""
+    def _designed(self, bandwidth: float, below: float) -> _StageTry | FlexplantError:
+        """Return a controller that is not verified yet, or why there is none."""
         weighted = self.through.weighted(self.weights(bandwidth))
         given = evened(weighted, self.uncertain, damped_below=below)
         try:
             opened = with_mode_channels(weighted, given.channels)
             system, solution = solved(opened, Riccati(progress=False))
         except (SolverError, InfeasibleError) as error:
-            self.failures[bandwidth] = error
-            return None
+            return error
         return _StageTry(bandwidth, weighted, given, system, solution)
 
-    def _judged(self, system: StateSpace) -> tuple[float, float]:
-        """Return the modulus margin of a controller, and the least with its modes off."""
+    def _judged(self, system: StateSpace) -> tuple[float, float, str]:
+        """Return the modulus margin, the least one with modes off, and both in words."""
         # the latter is 0 where a single mode off makes the loop unstable. No further machine is
         # drawn after one on which the loop is unstable
         loop = self._loop(system)
         wholes = [] if self.whole is None else [loop.around(self.whole)]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
-        if margin < self.margin or not self._tolerates(loop, self.ranges):
-            return margin, 0.0
+        said = f"{margin:.3g} on the plant"
+        if margin < self.margin:
+            return margin, 0.0, said
+        if not self._tolerates(loop, self.ranges):
+            return margin, 0.0, f"{said}, below {_KEPT * self.margin:.3g} with one frequency off"
         least = 1.0
         for machine in self.machines:
             one = loop.around(machine)
             least = min(least, one.modulus_margin if one.is_stable else 0.0)
             if least < _KEPT * self.margin:
                 break
-        return margin, least
+        return margin, least, f"{said}, {least:.3g} on a machine drawn"
 
     def _loop(self, system: StateSpace) -> ClosedLoop:
         """Return the loop on the plant alone: the evaluation of a rejected loop is not needed."""
@@ -317,12 +325,14 @@ class _StageTask:
         """Return the best controller, with what was tried."""
         tried = {f"{f:.4g} Hz": margin for f, margin in self.tried.items()}
         if self.best is None:
-            causes = "; ".join(f"{f:.4g} Hz: {error}" for f, error in self.failures.items())
+            off, causes = 100.0 * max(self.ranges.values()), dict.fromkeys(self.causes)
             raise InfeasibleError(
-                f"no loop with weights for {', '.join(tried)} keeps the modulus margin "
-                f"{self.margin:g} with its modes off as far as they are uncertain, each alone and "
-                "on machines drawn. Measure their poles, lower margin=, or move the actuators."
-                + (f" ({causes})" if causes else "")
+                f"no loop keeps the modulus margin {self.margin:g} on the plant, and "
+                f"{_KEPT * self.margin:.3g} with any one modal frequency off (by up to {off:.2g} "
+                f"%) and on {_DRAWS} machines drawn. Tried for |S| crossing 1 at "
+                f"{'; '.join(causes)}. State how well the frequencies and dampings are known, "
+                "plant.uncertain(...), lower margin=, ask for another bandwidth=, or move the "
+                "actuators."
             )
         best = self.best
         found = tolerant(best.weighted, best.given, self.uncertain, Riccati(), found=best.solution)
