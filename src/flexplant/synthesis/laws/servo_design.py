@@ -265,8 +265,9 @@ _TRIALS, _SLOWEST = 80, 2e-4
 _ROLLOFF = {"mass": 8.0, WIDE: 16.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
 #: corner of the integral action relative to the bandwidth; below the zero of a wide lead
 _INTEGRATOR = {WIDE: 0.02}
-#: the faster corners that are tried instead, and the factor by which they may raise |S|: a tenth of
-#: the margin, for errors that settle up to five times sooner
+#: the faster corners that are tried instead, and the factor by which they may raise |S| and lower
+#: the frequency up to which |S| of the references is below 1: a tenth, for errors that settle up to
+#: five times sooner
 _FASTER, _COST = (0.1, 0.05), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead
@@ -344,14 +345,17 @@ class ServoTask:
         """Return a law of wide leads with the fastest integral action that costs little margin."""
         if self.integrator is not None:
             return law
-        most = _COST * self.loop.peak(self.notched(law))[0]
+        plain = self.notched(law)
+        most = _COST * self.loop.peak(plain)[0]
         for part in _FASTER:
             axes = (
                 replace(a, integrator=part * a.bandwidth) if a.line == WIDE else a for a in law.axes
             )
             faster = law._replace(axes=tuple(axes))
             ended = self.notched(faster)
-            if self.loop.peak(ended)[0] <= most and self.closed(ended).is_stable:
+            if self.loop.peak(ended)[0] > most or not self.closed(ended).is_stable:
+                continue
+            if suppressed_up_to(self.closed(ended)) >= suppressed_up_to(self.closed(plain)) / _COST:
                 return faster
         return law
 
