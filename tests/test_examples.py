@@ -296,7 +296,7 @@ def test_the_readme_says_what_the_run_says(result):
         ("one that tolerates modal uncertainty: S < 1 up to", ours["bandwidth"], 1.0),
         ("its modulus margin", ours["margin"], 0.011),
         ("its mean error over an exposure after a move", ours["mean"], 0.6),
-        ("that of the best servo (90 Hz)", best["mean"], 0.6),
+        ("that of the best servo (92 Hz)", best["mean"], 0.6),
     ):
         numbers = [float(n) for n in re.findall(r"\d+\.?\d*", " ".join(said[row]))]
         assert len(numbers) in (2, 4), row
@@ -352,7 +352,7 @@ def test_each_order_buys_what_the_example_says(later, tmp_path):
         peak, late = ({name: example.figures(run)[i] for name, run in runs.items()} for i in (0, 1))
         assert peak["acceleration"] < 0.03 * peak["none"]
         assert peak["jerk"] < 0.5 * peak["acceleration"]
-        assert peak["snap"] < 0.9 * peak["jerk"] and peak["inverse"] < 0.8 * peak["snap"]
+        assert peak["snap"] < 0.9 * peak["jerk"] and peak["inverse"] < 0.9 * peak["snap"]
         assert late["snap"] < 0.02 * late["none"]
     errors = result["learnt"].errors
     assert errors[1] < 0.5 * errors[0] and errors[2] < 1.1 * errors[1]

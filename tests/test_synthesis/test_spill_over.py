@@ -232,9 +232,9 @@ def by_servo(bandwidth):
     ("make", "peak"),
     [
         (lambda: [by_lmi(Lmi(), 5.0)], "low"),
-        (lambda: [by_lmi(Lmi(), 15.0)], "high"),
+        (lambda: [by_lmi(Lmi(), 11.0)], "high"),
         (lambda: [by_lmi(Lmi(), 100.0)], "unstable"),
-        (lambda: [by_lmi(Riccati(), 14.0)], "high"),
+        (lambda: [by_lmi(Riccati(), 11.0)], "high"),
         (lambda: by_servo(10.0), "low"),
         (lambda: by_servo(32.0), "high"),
         (lambda: by_servo(50.0), "unstable"),
