@@ -376,8 +376,8 @@ def test_no_clock_decides_and_the_starts_are_listed(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_low_order_comes_near_the_full_one_by_growing_from_lower_ones():
-    """A free mass with a resonance of 0.1 %, in SI units: from the reduced full order it is 2.4."""
+def test_a_low_order_comes_near_the_full_one():
+    """A free mass with a resonance of 0.1 %, in SI units; lower orders alone end at 234."""
     w = 2 * np.pi * 200.0
     A = [[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, -(w**2), -2e-3 * w]]
     b, c = np.array([[0, 0.1, 0, 0.1]]).T, np.array([[1.0, 0, 0.5, 0]])
@@ -386,5 +386,5 @@ def test_a_low_order_comes_near_the_full_one_by_growing_from_lower_ones():
     P = StateSpace(A, np.hstack([0.1 * b, 0 * b, b]), np.vstack([1e6 * c, 0 * c, c]), D,
                    inputs=["d", "n", "f"], outputs=["e", "effort", "x"])  # fmt: skip
     full = design_hinf(P, u=["f"], y=["x"])
-    found = design_structured(P, FixedOrder(3), u=["f"], y=["x"], starts=1)
+    found = design_structured(P, FixedOrder(3), u=["f"], y=["x"], starts=3)
     assert full.gamma < found.gamma < 1.15 * full.gamma
