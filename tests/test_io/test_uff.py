@@ -125,6 +125,17 @@ def test_signs_of_both_directions(tmp_path):
         assert frf["2:z", "u 2:z"] == pytest.approx(sign * one, rel=1e-4)
 
 
+def test_rotations_and_moments_have_their_units(tmp_path):
+    """Also under other names; a force and a translation keep theirs."""
+    pairs = [((out, way), (7, to)) for out, way in ((2, 3), (41, -5)) for to in (1, 6)]
+    frf = read_frf_uff(written(tmp_path, [record(*pair, DATA[(2, 3), (2, 3)]) for pair in pairs]))
+    renamed = frf.replace(outputs=["gap", "tilt"]).replace(inputs=["push", "turn"])
+    for one in (frf, renamed):
+        found = [one.unit(*channel) for channel in one]
+        assert found == ["m/s^2/N", "m/s^2/(N m)", "rad/s^2/N", "rad/s^2/(N m)"]
+    assert "[rad/s^2/(N m)]" in repr(renamed.select(["tilt"], ["turn"]))
+
+
 def test_kinds_are_converted_when_asked(tmp_path):
     one = DATA[(2, 3), (2, 3)]
     sets = [

@@ -191,9 +191,22 @@ def test_pieces_that_nothing_joins():
     report = fx.check(fx.structure.FEMatrices(K, M, dofs=dofs))
     assert report.n_pieces == 2
     assert (report.n_zero, report.n_rigid, report.mechanisms) == (12, 12, ())
-    assert "2 bodies, each with its own motions" in line(report, "rigid body")[2]
+    said = line(report, "rigid body")[2]
+    assert "2 separate bodies with 12 rigid-body motions; all move freely together in x" in said
     assert {"connectivity"} <= set(report.of("note"))
     assert fx.check(one).n_pieces == 1
+
+
+def test_a_stage_that_floats_next_to_a_held_frame_is_kept():
+    K, M = (sp.block_diag([part, part]).toarray() for part in (truss().K, truss().M))
+    K[0, 0] += 1e4  # the first body in x, all else stays free
+    one = truss().dofs
+    xyz = np.r_[one.xyz, one.xyz + np.array([9.0, 0, 0])]
+    dofs = fx.DofSet(np.r_[one.nodes, one.nodes + 10], one.directions * 2, xyz)
+    state, _, said, do = line(fx.check(fx.structure.FEMatrices(K, M, dofs=dofs)), "rigid body")
+    assert state == "note"
+    assert "2 separate bodies with 11 rigid-body motions" in said
+    assert do.startswith("rigid-body modes at 0 Hz, which are kept: a controller holds a stage")
 
 
 def test_a_solver_diagonal_is_noticed():

@@ -31,6 +31,7 @@ from .uff_records import (
     paired_records,
     record_scale,
     record_sides,
+    rotation_units,
     whole_entry,
 )
 from .uff_systems import is_permutation, turning, uff_nodes
@@ -176,10 +177,13 @@ def _in_global_directions(frf: Frf, path: str | Path) -> Frf:
         for names in (outputs, inputs)
     )
     pick = np.ix_(rows, columns)
+    outputs = [outputs[i] for i in rows.tolist()]
+    inputs = [f"u {inputs[i]}" for i in columns.tolist()]
     return frf.replace(
         data=np.einsum("ab,bcf,dc->adf", left, frf.data, right)[pick],
-        outputs=tuple(outputs[i] for i in rows.tolist()),
-        inputs=tuple(f"u {inputs[i]}" for i in columns.tolist()),
+        outputs=outputs,
+        inputs=inputs,
+        units=rotation_units(outputs, inputs, frf.quantity),
         coherence=None if coherence is None else coherence[pick],
     )
 

@@ -14,7 +14,7 @@ from ..labels import DIRECTIONS
 from ..lti.frequency import Frf
 from .coordinate_systems import turned_motions
 from .files import ONCE, damaged, refused, spaced_numbers, unread
-from .uff_records import KINDS, datasets, derivative, whole_entry
+from .uff_records import KINDS, datasets, derivative, rotation_units, whole_entry
 from .uff_systems import UffNodes
 
 #: of dataset 2414: lines of records 1 to 13
@@ -211,12 +211,14 @@ def responses_of_model(
     data = data * derivative(freq, kind, quantity or kind, path)[:, None, None]
     seen = np.isin(motion, motion[np.any(data, axis=(0, 2))])
     names = [f"{node}:{axis}" for node in parts[0].nodes.tolist() for axis in DIRECTIONS]
+    outputs = [name for name, there in zip(names, seen, strict=True) if there]
     return Frf(
         freq,
         np.moveaxis(data[:, seen], 0, 2),
         inputs=[f"load {number}" for number in sets],
-        outputs=[name for name, there in zip(names, seen, strict=True) if there],
+        outputs=outputs,
         quantity=quantity or kind,
+        units=rotation_units(outputs, (), quantity or kind),
     )
 
 

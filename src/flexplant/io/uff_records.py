@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -269,6 +269,17 @@ def record_scale(
             "contradict each other. Give the factor to SI: scale=..."
         )
     return to_length / to_force
+
+
+def rotation_units(
+    outputs: Sequence[str], inputs: Sequence[str], quantity: str | None
+) -> dict[str, str]:
+    """Return the units of rotations "41:rz" and moments "u 41:rz"; others are m and N."""
+    if quantity is None:
+        return {}
+    angle = "rad" + ("", "/s", "/s^2")[ORDERS[quantity]]
+    units = dict.fromkeys(outputs, angle) | dict.fromkeys(inputs, "N m")
+    return {name: unit for name, unit in units.items() if name.endswith((":rx", ":ry", ":rz"))}
 
 
 def unit_text(part: dict[str, Any], name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -232,6 +232,20 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         self._set(
             inputs=inputs, outputs=outputs, units=units, coherence=coherence, variance=variance
         )
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed; renamed channels keep their units."""
+        # with other data the order of the channels may be another one, too
+        if not {"units", "data"} & changes.keys():
+            units: dict[str, str] = {}
+            for side in ("inputs", "outputs"):
+                before = getattr(self, side)
+                after = changes.get(side, before)
+                if isinstance(after, list | tuple):
+                    pairs = zip(after, before, strict=False)
+                    units |= {new: self.units[old] for new, old in pairs if old in self.units}
+            changes["units"] = units
+        return super().replace(**changes)
 
     def __repr__(self) -> str:
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""

@@ -423,7 +423,8 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
         "note" if partly else "ok",
         "rigid body",
         f"{text} ({expected})",
-        "the supports leave this motion free: a mode at 0 Hz. Hold it where the machine does"
+        "rigid-body modes at 0 Hz, which are kept: a controller holds a stage that floats or "
+        "slides. Is a support missing? fixed(labels), or a spring there"
         if partly
         else "",
     )
@@ -453,8 +454,9 @@ def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
     combined = motions.n_rigid - len(motions.free)
     absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
     if motions.n_bodies > 1:
-        together = f"free in {free}" if free else "held"
-        return f"{motions.n_bodies} bodies, each with its own motions; together {together}{absent}"
+        own = counted(motions.n_rigid, "rigid-body motion")
+        whole = f"all move freely together in {free}" if free else "none moves all of them together"
+        return f"{motions.n_bodies} separate bodies with {own}; {whole}{absent}"
     if combined > 0 and not held:
         of_joints = f"{counted(combined, 'motion')} of components in their joints"
         return f"free in {free}, and {of_joints}{absent}"
