@@ -52,8 +52,9 @@ _WITHIN, _DIVISIONS = 6, 3
 _NEAR = 0.25
 #: number of changes tried for a margin, and number of bisections before the first that fails
 _TRIED, _HALVINGS = 16, 8
-#: number of points between the lines next to the highest one, for the maximum of a peak
-_WITHIN_PEAK = 9
+#: number of points between the lines next to the highest one, for the maximum of a peak: in a loop
+#: near instability it is a tenth as wide as the mode
+_WITHIN_PEAK = 33
 
 
 class ModeChanges(NamedTuple):
@@ -292,6 +293,39 @@ class SizeBound(NamedTuple):
         return above
 
 
+class Peaks(NamedTuple):
+    """The tops of the resonances of some modes, between the lines of a grid.
+
+    Each lies between two frequencies `between` (modes, 2) [Hz] at a change `there` of the mode, and
+    moves with the mode's frequency.
+    """
+
+    loops: ModeLoops
+    modes: IntArray
+    between: FloatArray
+    sign: float
+    there: FloatArray
+    size: float
+
+    def highest(self, change: FloatArray) -> FloatArray:
+        """Return the largest fraction (modes,) of the size, for a change of each mode."""
+        moved = (1.0 + self.sign * (change - self.there))[self.modes]
+        freq = np.linspace(*(self.between * moved[:, None]).T, _WITHIN_PEAK)
+        fine = self.loops.swept(freq.ravel())
+        mode = np.tile(self.modes, _WITHIN_PEAK)
+        at_tops = fine.swept_modes(np.arange(mode.size), mode)
+        return SizeBound.of(fine.S, at_tops, self.size).highest(self.sign * change, len(change))
+
+    def reached_first(self, above: FloatArray) -> FloatArray:
+        """Return the least size of change (modes,) below one at which the size is reached."""
+        below = np.zeros_like(above)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (below + above)
+            over = self.highest(middle) >= 1.0
+            above, below = np.where(over, middle, above), np.where(over, below, middle)
+        return above
+
+
 def _polynomials(
     plant: AnyPlant, broken: BrokenLoop, modes: IntArray, kind: Any
 ) -> tuple[FloatArray, FloatArray]:
@@ -432,19 +466,15 @@ def size_reached(
         below = np.where(first > 0, steps[first - 1, each], 0.0)
         those, change = few.take(np.isin(few.modes.mode, where)), steps[first, each]
         change = np.where(on_line, those.halved(below, change, sign), change)
-        # the peak's top between the lines of the grid
-        share, tops = few.share(sign * change), []
+        share = few.share(sign * change)
+        near_top = np.zeros((count, 2))
         for i in where:
             own = np.flatnonzero(few.modes.mode == i)
             k = int(np.argmax(share[own]))
-            beside = freq[own[max(k - 1, 0)]], freq[own[min(k + 1, own.size - 1)]]
-            tops.append(np.linspace(*beside, _WITHIN_PEAK))
-        fine = modes.loops.swept(np.ravel(tops))
-        mode = np.repeat(where, _WITHIN_PEAK)
-        at_tops = fine.swept_modes(np.arange(mode.size), mode)
-        top = SizeBound.of(fine.S, at_tops, size)
-        where = where[(on_line | (top.highest(sign * change, count) >= 1.0))[where]]
-        change = top.halved(0.5 * change, change, sign)
+            near_top[i] = freq[own[max(k - 1, 0)]], freq[own[min(k + 1, own.size - 1)]]
+        peak = Peaks(modes.loops, where, near_top[where], sign, change, size)
+        where = where[(on_line | (peak.highest(change) >= 1.0))[where]]
+        change = peak.reached_first(change)
         found[where, side] = sign * change[where]
     found[np.bincount(modes.mode[high[modes.at]], minlength=count) > 0] = 0.0
     return found

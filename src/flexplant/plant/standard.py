@@ -277,7 +277,7 @@ class StandardPlant(Partition):
         require_known("sensor", frf.outputs, self.y)
         late = positive(delay, "delay", zero=True)
         if late and not self.dt:
-            raise ModelError("delay counts samples: sample the plant first, discretized(rate).")
+            raise ModelError("delay counts samples: sample it first, plant.discretized(rate).")
         return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold"), late))
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
