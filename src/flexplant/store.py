@@ -123,7 +123,11 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one."""
-        return replace(self, **changes)  # type: ignore[type-var]
+        return replace(self, **self._completed_changes(changes))  # type: ignore[type-var]
+
+    def _completed_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return the changes of `replace` with those that follow from them."""
+        return changes
 
     def save(self, path: str | Path) -> None:
         """Write the value to one `.npz` file (arrays and JSON, no pickle), atomically.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -233,8 +233,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             inputs=inputs, outputs=outputs, units=units, coherence=coherence, variance=variance
         )
 
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed; renamed channels keep their units."""
+    def _completed_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return the changes of `replace`, with the units of renamed channels."""
         # with other data the order of the channels may be another one, too
         if not {"units", "data"} & changes.keys():
             units: dict[str, str] = {}
@@ -244,8 +244,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
                 if isinstance(after, list | tuple):
                     pairs = zip(after, before, strict=False)
                     units |= {new: self.units[old] for new, old in pairs if old in self.units}
-            changes["units"] = units
-        return super().replace(**changes)
+            return changes | {"units": units}
+        return changes
 
     def __repr__(self) -> str:
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
