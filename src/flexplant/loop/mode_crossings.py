@@ -310,7 +310,8 @@ class Peaks(NamedTuple):
     def highest(self, change: FloatArray) -> FloatArray:
         """Return the largest fraction (modes,) of the size, for a change of each mode."""
         moved = (1.0 + self.sign * (change - self.there))[self.modes]
-        freq = np.linspace(*(self.between * moved[:, None]).T, _WITHIN_PEAK)
+        low, high = (self.between * moved[:, None]).T
+        freq = np.linspace(low, high, _WITHIN_PEAK)
         fine = self.loops.swept(freq.ravel())
         mode = np.tile(self.modes, _WITHIN_PEAK)
         at_tops = fine.swept_modes(np.arange(mode.size), mode)
