@@ -182,8 +182,10 @@ def raises_named(name, item):
 
 
 def keywords_closed(name, item):
-    # the names of positions are the user's own, and checked: plant.at(x=0.03)
-    open_ones = [p for p in parameters(item) if p.kind is p.VAR_KEYWORD and p.name != "positions"]
+    # the names of positions are the user's own, and checked: plant.at(x=0.03); so are the fields
+    # that `replace` changes
+    known = {"positions", "changes"}
+    open_ones = [p for p in parameters(item) if p.kind is p.VAR_KEYWORD and p.name not in known]
     return f"{name} takes **keywords" if open_ones else None
 
 

@@ -131,7 +131,7 @@ def test_innovations_beside_their_bounds():
     nis = fx.plot.consistency(estimate_of(white), level=0.9).figure.axes[0]
     top = max(np.ravel(line.get_ydata())[0] for line in nis.get_lines()[1:])
     assert top == pytest.approx(stats.chi2.ppf(0.95, 200) / 200, rel=1e-12)
-    with pytest.raises(ModelError, match="at least 100 samples"):
+    with pytest.raises(ModelError, match="at least 200 samples"):
         fx.plot.consistency(estimate_of(white[:50]))
     with pytest.raises(ModelError, match="Pass what observer"):
         fx.plot.consistency(white)

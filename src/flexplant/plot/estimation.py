@@ -289,7 +289,7 @@ def consistency(
     Raises
     ------
     ModelError
-        When the kinds are wrong, there are fewer than 100 samples with all innovations, or not
+        When the kinds are wrong, there are fewer than 200 samples with all innovations, or not
         three axes.
 
     References
