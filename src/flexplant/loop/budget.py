@@ -272,6 +272,11 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
     return found
 
 
+#: largest number of parts of an interval of the grid, on average: in more of them the difference of
+#: two rules is the rounding of the responses, and the check of the sum decides
+_PARTS = 16
+
+
 def integrated(
     find: Densities, monitored: StateSpace, variances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -300,7 +305,7 @@ def integrated(
     size = divisor(variances)[:, None]
     for _ in range(MOST_STEPS):
         share = np.max(error / size, axis=0, initial=0.0)
-        if share.sum() <= ROOT:
+        if share.sum() <= ROOT or known.shape[1] > _PARTS * edges.size:
             break
         bad = share > ROOT / share.size
         middle = known[:, bad].mean(axis=0)

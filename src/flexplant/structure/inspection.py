@@ -144,7 +144,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     elif isinstance(model, FEMatrices):
         matrices_ = model
     else:
-        hint = "fx.structure.FEMatrices(K, M, dofs=...) takes matrices of any quality."
+        hint = "Pass matrices of any quality as fx.structure.FEMatrices(K, M, dofs=...)."
         if hasattr(model, "check"):
             hint = "This one is checked by its method check()."
         raise ModelError(
