@@ -131,7 +131,7 @@ def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
     far = small.uncertain(frequency=0.1).machines.drawn(20, rng=1)
     task = "flexplant.synthesis.hinf.stage_design._StageTask.machines"
     monkeypatch.setattr(task, getattr(far, "plants", far))
-    with pytest.raises(InfeasibleError, match="on machines drawn"):
+    with pytest.raises(InfeasibleError, match="on a machine drawn"):
         fx.design_stage(uncertain, bandwidth=60.0)
 
 
