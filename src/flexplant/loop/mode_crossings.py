@@ -293,7 +293,7 @@ class SizeBound(NamedTuple):
         return above
 
 
-class Peaks(NamedTuple):
+class ModePeaks(NamedTuple):
     """The tops of the resonances of some modes, between the lines of a grid.
 
     Each lies between two frequencies `between` (modes, 2) [Hz] at a change `there` of the mode, and
@@ -473,7 +473,7 @@ def size_reached(
             own = np.flatnonzero(few.modes.mode == i)
             k = int(np.argmax(share[own]))
             near_top[i] = freq[own[max(k - 1, 0)]], freq[own[min(k + 1, own.size - 1)]]
-        peak = Peaks(modes.loops, where, near_top[where], sign, change, size)
+        peak = ModePeaks(modes.loops, where, near_top[where], sign, change, size)
         where = where[(on_line | (peak.highest(change) >= 1.0))[where]]
         change = peak.reached_first(change)
         found[where, side] = sign * change[where]
