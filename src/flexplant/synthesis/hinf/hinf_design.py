@@ -35,7 +35,7 @@ from ..controller import (
 )
 from ..preparation import Prepared, posed, prepared, require_reach
 from ..scaling import departure_from_normal
-from .hinf_riccati import Riccati, quick_answer
+from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
 from .moved_design import over_positions
 from .singular import require_shown
@@ -220,15 +220,16 @@ def evened(
     # only the scales depend on it: if it fails, the design itself reports why
     with attempted("evening out the scales of modes"):
         opened = with_mode_channels(plant, channels)
-        loop, found = solved(opened, method)
+        # by a whole search: scales of a quick one jump with the weights, and designs with them
+        loop, found = solved(opened, method or Riccati(progress=False))
         channels, first = rebalanced(channels, opened, loop), found.gamma
     return Evened(channels, first)
 
 
-def solved(plant: AnyPlant, method: SynthesisMethod | None) -> tuple[StateSpace, SolvedController]:
-    """Return a controller, not verified, and the results of a method or of a quick search."""
+def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
+    """Return the controller that a method finds, not verified, and the method's own results."""
     problem = prepared(plant.system, plant.u, plant.y)
-    found = quick_answer(problem) if method is None else method.solve(problem)
+    found = method.solve(problem)
     return problem.restored(found.A, found.B, found.C, found.D), found
 
 
