@@ -364,20 +364,20 @@ def test_no_clock_decides_and_the_starts_are_listed(monkeypatch):
     D = np.zeros((10, 10))
     D[2:6, 6:] = np.eye(4)
     plant = named(DIS3["A"], np.hstack([np.eye(6), B]), np.vstack([np.eye(6), C]), D, 4, 4)
-    found = design_structured(plant, FixedOrder(0), starts=2)
+    found = design_structured(plant, FixedOrder(0), starts=4)
     for name in ("perf_counter", "monotonic", "process_time", "time"):
         plain = getattr(time, name)
         monkeypatch.setattr(time, name, lambda plain=plain: 1e6 * plain())
-    again = design_structured(plant, FixedOrder(0), starts=2)
+    again = design_structured(plant, FixedOrder(0), starts=4)
     assert again.gamma == found.gamma
     assert found.gamma < 1.02 * 1.0816
-    assert list(found.tried) == ["start 1", "start 2"]
+    assert list(found.tried) == ["start 1", "start 2", "start 3", "start 4"]
     assert min(found.tried.values()) == pytest.approx(found.gamma, rel=1e-3)
 
 
 @pytest.mark.slow
 def test_a_low_order_comes_near_the_full_one():
-    """A free mass with a resonance of 0.1 %, in SI units; lower orders alone end at 234."""
+    """A free mass with a resonance of 0.1 %, in SI units, on any kernel of OpenBLAS."""
     w = 2 * np.pi * 200.0
     A = [[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, -(w**2), -2e-3 * w]]
     b, c = np.array([[0, 0.1, 0, 0.1]]).T, np.array([[1.0, 0, 0.5, 0]])
@@ -386,5 +386,5 @@ def test_a_low_order_comes_near_the_full_one():
     P = StateSpace(A, np.hstack([0.1 * b, 0 * b, b]), np.vstack([1e6 * c, 0 * c, c]), D,
                    inputs=["d", "n", "f"], outputs=["e", "effort", "x"])  # fmt: skip
     full = design_hinf(P, u=["f"], y=["x"])
-    found = design_structured(P, FixedOrder(3), u=["f"], y=["x"], starts=3)
-    assert full.gamma < found.gamma < 1.15 * full.gamma
+    found = design_structured(P, FixedOrder(3), u=["f"], y=["x"], starts=1)
+    assert full.lower <= found.gamma < 1.02 * full.gamma

@@ -310,7 +310,7 @@ def _function(line: str, prefix: str) -> str:
     return f"EXPORT {head};\n{head}\n{{\n{unused}    {lines}\n}}\n"
 
 
-#: base units of FMI, and those with a name of their own in terms of others
+#: base units of FMI, and units with a name, in terms of others
 _BASE = ("kg", "m", "s", "A", "rad")
 _NAMED = {
     "N": "kg m s^-2", "Pa": "N m^-2", "J": "N m", "W": "J s^-1", "V": "W A^-1", "Hz": "s^-1",

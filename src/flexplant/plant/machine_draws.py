@@ -77,8 +77,8 @@ class MachineFamily:
         """Factors (b, b) of the scatter of stiffness between modes below and in the measured band.
 
         A mode below the lowest measured one, as of a body on isolators, strains other springs than
-        the measured modes. What these scatter changes the work of the lower mode's forces on the
-        higher shape by a part of its own stiffness omega_i^2, and not of omega_i omega_j.
+        the measured modes. Scatter then changes the coupling of a lower mode i and a higher mode j
+        by a fraction of omega_i^2, the stiffness of the lower mode, and not of omega_i omega_j.
         """
         r, omega = self.whole.n_rigid, self.omega
         lowest = float(np.min(omega[self.measured]))

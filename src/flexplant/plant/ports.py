@@ -366,7 +366,7 @@ class Ports(Value):
         """The SI units of all channels that have one, and of derived channels.
 
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
-        sensors, where a coloured one has no `unit` of its own, references, errors and estimates
+        sensors, where a coloured one states no `unit`; references, errors and estimates
         like their POI, efforts like their actuator. A sum of displacements and rotations has the
         unit of the part whose weights have length 1, as a displacement has with levers [m] of
         rotations; no unit if both parts do, or none. Filters of ports do not change units.

@@ -243,7 +243,7 @@ class _StageTask:
         return min(hertz for ref, hertz in reached.items() if ref in followed)
 
     def _designed(self, bandwidth: float, below: float) -> _StageTry | FlexplantError:
-        """Return a controller that is not verified yet, or why there is none."""
+        """Return a controller that is not verified yet, or the error of the design."""
         weighted = self.through.weighted(self.weights(bandwidth))
         given = evened(weighted, self.uncertain, damped_below=below)
         try:

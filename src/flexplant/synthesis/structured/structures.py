@@ -21,6 +21,7 @@ from ...plant import AnyPlant
 from ...store import Value, checked, rebuild
 from ...words import flag, function, instance, name_list
 from ..hinf.hinf_design import design_hinf
+from ..hinf.hinf_riccati import Riccati
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws
 from ..preparation import Prepared
@@ -28,6 +29,10 @@ from .judges import Matrices
 
 #: steps of a derivative by differences of fourth order, and their weights
 _STEPS = tuple((k * 1e-3, w / 12e-3) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0)))
+
+#: relative distance from the least gamma of the controller of full order that is reduced to a start:
+#: closer to it a controller has fast poles, whose reduction stabilises on some processors only
+_RELAXED = 0.5
 
 #: entries of B and C of a state that is added to a controller of lower order
 _COUPLING = 0.1
@@ -134,7 +139,8 @@ class FixedOrder(Value):
         known = self.start
         if known is None and self.order:
             with attempted("a start from the controller of full order, reduced to this one"):
-                full = design_hinf(plant).system
+                lower = self.order < plant.system.n_states
+                full = design_hinf(plant, Riccati(back_off=_RELAXED) if lower else None).system
                 if full.n_states > self.order:
                     full = balanced(full, order=self.order).system
                 known = full if full.n_states == self.order else None
