@@ -43,7 +43,8 @@ CHANCE = 1e-3
 INTERVAL = 0.95
 #: number of standard deviations that are taken as the size of what is not known: 95 %
 DEVIATIONS = 2.0
-#: number of standard deviations that noise exceeds in one of 10^8 values: larger values do not come from noise
+#: number of standard deviations that noise exceeds in one of 10^8 values: larger values do not come
+#: from noise
 CERTAIN = 6.0
 #: largest number of steps of an iteration that converges: 60 bisections or doublings reach rounding
 MOST_STEPS = 60

@@ -30,8 +30,9 @@ from .judges import Matrices
 #: steps of a derivative by differences of fourth order, and their weights
 _STEPS = tuple((k * 1e-3, w / 12e-3) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0)))
 
-#: relative distance from the least gamma of the controller of full order that is reduced to a start:
-#: closer to it a controller has fast poles, whose reduction stabilises on some processors only
+#: relative distance from the least gamma of the controller of full order that is reduced to a
+#: start: closer to it a controller has fast poles, whose reduction stabilises on some processors
+#: only
 _RELAXED = 0.5
 
 #: entries of B and C of a state that is added to a controller of lower order
