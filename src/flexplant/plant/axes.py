@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 
 from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
@@ -226,23 +227,42 @@ def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
     return scaled, columns
 
 
-def opposing_part(plant: Partition, actuators: Sequence[str], forces: FloatArray) -> FloatArray:
-    """Return the part of forces (m, runs) that moves none of the POIs' axes at rest.
+def idle_forces(plant: Partition, actuators: Sequence[str]) -> FloatArray:
+    """Return a basis (m, k) of forces that move none of the POIs' axes at rest.
 
-    Actuators that move none of them even alone do not push against others: they have no part.
+    Actuators that move none of them even alone take no part.
     """
     channels = _channels(plant.assembled.ports.z)
     G = felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, actuators)
     moves = np.any(G, axis=0)
-    found = np.zeros_like(forces)
     if not channels or not np.any(moves):
-        return found
+        return np.zeros((len(actuators), 0))
     scaled, columns = _balanced(G[:, moves])
     size, directions = np.linalg.svd(scaled)[1:]
-    idle = directions[int(np.sum(size > _APART * size[0])) :]
-    given = forces[moves] / columns[:, None]
-    found[moves] = columns[:, None] * (idle.T @ (idle @ given))
-    return found
+    idle = directions[int(np.sum(size > _APART * size[0])) :].T
+    basis = np.zeros((len(actuators), idle.shape[1]))
+    basis[moves] = columns[:, None] * idle
+    return basis
+
+
+def opposing_part(idle: FloatArray, forces: FloatArray) -> FloatArray:
+    """Return the largest part of forces (m,) that could be left out without moving an axis.
+
+    It is a sum of idle forces (m, k) that has the sign of the force, and at most its size, in each
+    actuator: an actuator that carries a load alone pushes against none.
+    """
+    size = np.abs(forces)
+    if not idle.shape[1] or not np.any(size):
+        return np.zeros_like(forces)
+    basis = idle / np.abs(idle).max(axis=0)
+    signed = np.sign(forces)[:, None] * basis
+    limits = np.concatenate([size / size.max(), np.zeros(size.size)])
+    still = basis[size == 0.0]
+    best = scipy.optimize.linprog(
+        -signed.sum(axis=0), np.vstack([signed, -signed]), limits,
+        still, np.zeros(len(still)), bounds=(None, None),
+    )  # fmt: skip
+    return np.asarray(basis @ best.x * size.max())
 
 
 def real_gain(

@@ -11,7 +11,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, some_names, warn
 from ..loop import ClosedLoop
 from ..plant import StandardPlant, driven_axes
-from ..plant.axes import complex_gain, opposing_part, resting_frequency
+from ..plant.axes import complex_gain, idle_forces, opposing_part, resting_frequency
 from ..plant.rest_expansion import at_rest, followed_at_rest, solved
 from ..tolerances import NEGLIGIBLE
 from ..words import several
@@ -132,9 +132,10 @@ def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     mean = end.mean(axis=2)
     if not np.any(np.abs(mean) > _SHARE * most):
         return
-    mean = opposing_part(loop.machine, loop.driven, mean)
-    # the deviation of these forces alone: those that move the machine may vary more
-    about = opposing_part(loop.machine, loop.driven, end.reshape(len(end), -1)).reshape(end.shape)
+    idle = idle_forces(loop.machine, loop.driven)
+    mean = np.stack([opposing_part(idle, one) for one in mean.T], axis=1)
+    # the deviation of idle forces alone: those that move the machine may vary more
+    about = np.tensordot(idle @ np.linalg.pinv(idle), end, axes=1)
     steady = np.abs(mean) > np.maximum(_SHARE * most, _STEADY * about.std(axis=2))
     opposed = np.sum(steady, axis=0) > 1  # a single actuator cannot oppose itself
     if np.any(opposed):

@@ -34,8 +34,10 @@ class ResidualVibration(Value):
         Largest magnitude after the end by the sum of the modes.
     simulated : float
         The same from a simulation.
+    decaying : float
+        Largest magnitude after the end of the part that does not vibrate.
     rest : float
-        Final value of the channel, from which both are counted.
+        Final value of the channel, from which all are counted.
     unit : str
         Unit of the channel.
     judged : bool
@@ -48,6 +50,7 @@ class ResidualVibration(Value):
     amplitude: FloatArray
     predicted: float
     simulated: float
+    decaying: float
     rest: float
     unit: str
     judged: bool
@@ -58,7 +61,8 @@ class ResidualVibration(Value):
         sizes = [with_unit(size, self.unit) for size in (self.predicted, self.simulated)]
         lines = [
             f"<ResidualVibration of {self.channel}: {sizes[0]} predicted, {sizes[1]} simulated",
-            f"  {modes or 'no mode vibrates'}",
+            f"  vibrates by {modes}" if modes else "  no mode vibrates",
+            f"  decays without vibration: {with_unit(self.decaying, self.unit)}",
         ]
         if not self.judged:
             lines.append(f"  {NOT_JUDGED}")
@@ -147,12 +151,15 @@ def residual_vibration(
     run = simulate(own, reference=given, duration=(time.size + 0.25) * machine.dt, noise=False)
     simulated = np.abs(run[seen][last + 1 : last + 1 + after] - rest).max()
     turning = modes.logs.imag > SAME * np.abs(modes.logs)
+    real = np.abs(modes.logs.imag) <= SAME * np.abs(modes.logs)
+    decaying = np.abs((steps[:, real] @ amounts[real]).real).max()
     size = 2.0 * np.abs(amounts[turning])
     order = np.argsort(-size)
     poles = modes.logs[turning][order] / machine.dt
     return ResidualVibration(
         seen, np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles), size[order],
-        float(predicted), float(simulated), rest, own.units.get(seen, ""), own_plant is not None,
+        float(predicted), float(simulated), float(decaying), rest, own.units.get(seen, ""),
+        own_plant is not None,
     )  # fmt: skip
 
 
