@@ -17,7 +17,7 @@ from itertools import groupby
 from pathlib import Path
 from pkgutil import iter_modules
 from types import MappingProxyType
-from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -160,7 +160,11 @@ def _field_text(value: Any) -> str:
     return f"<{type(value).__name__} ...>" if long else text
 
 
-def rebuild(cls: type[Value], state: Mapping[str, Any]) -> Value:
+#: a class of values
+Kind = TypeVar("Kind", bound=Value)
+
+
+def rebuild(cls: type[Kind], state: Mapping[str, Any]) -> Kind:
     """Return a value from its fields as they were, without the checks of construction."""
     value = object.__new__(cls)
     for name, item in state.items():

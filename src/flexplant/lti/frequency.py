@@ -510,6 +510,4 @@ def _of_system(g: StateSpace, freq: FloatArray) -> Frf:
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
     known = ("quantity", "coherence", "variance", "correlation", "resolution", "window", "freedom")
-    frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})
-    assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
-    return frf
+    return rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})

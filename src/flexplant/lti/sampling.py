@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
@@ -10,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, positive, real_array
 from ..errors import AssumptionError, ModelError, warn
+from ..store import rebuild
 from ..tolerances import CLOSE, SAME, TINY, divisor
 from ..words import check_names
 from .blocks_of_states import block_diagonal, block_eigenvalues, diagonal_blocks, uncoupled_run
@@ -87,8 +89,11 @@ def held_exactly(
     if pairs is None:
         return sample_and_hold(g, rate, dict.fromkeys(names, late))[0]
     own, integral = pair_exponential(pairs, 1.0 / rate)
-    B = integral @ g.B.reshape(len(pairs), 2, -1)
-    return g.replace(A=block_diagonal(own), B=B.reshape(g.B.shape), dt=1.0 / rate)
+    # e^(A h) has the blocks of A: the numbers alone are checked
+    A = block_diagonal(real_array(own, "e^(A h)", copy=False))
+    B = (integral @ g.B.reshape(len(pairs), 2, -1)).reshape(g.B.shape)
+    B = real_array(B, "B of the sampled system", copy=False)
+    return rebuild(StateSpace, g._fields() | {"A": A, "B": B, "dt": 1.0 / rate})
 
 
 #: `e^(A t)` and `int_0^t e^(A s) ds B` of a time [s]
@@ -400,8 +405,14 @@ def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
     return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
 
 
-#: terms of the Taylor series of an integral: 0.125^10 / 11! is rounding
-_TERMS = 10
+#: terms of the integral's Taylor series are four times four: at 0.5 the next one is rounding
+_ROWS = 4
+
+
+@cache
+def _series() -> FloatArray:
+    """Return the coefficients 1 / (k + 1)! of the series."""
+    return 1.0 / np.cumprod(np.arange(1.0, 1.0 + _ROWS**2)).reshape(_ROWS, _ROWS)
 
 
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
@@ -413,18 +424,23 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
     even = pairs.copy()
     even[:, 0, 1] /= units
     even[:, 1, 0] *= units
-    size = float(np.max(np.abs(even).sum(axis=2))) * h
-    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.125))))
-    t = h / 2**doublings
-    step, identity = even * t, np.broadcast_to(np.eye(2), pairs.shape)
-    integral = identity
-    for k in range(_TERMS, 1, -1):
-        integral = identity + step @ integral / k
-    integral = t * integral
-    flow = identity + even @ integral
-    for _ in range(doublings):
-        integral = integral + flow @ integral
-        flow = flow @ flow
+    size = float(np.abs(even).sum(axis=2).max()) * h
+    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
+    t, identity = h / 2**doublings, np.eye(2)
+    step = even * t
+    powers = np.empty((_ROWS, *pairs.shape))
+    powers[0], powers[1] = identity, step
+    np.matmul(step, step, out=powers[2])
+    np.matmul(powers[2], step, out=powers[3])
+    fourth = powers[2] @ powers[2]
+    terms = (_series() @ powers.reshape(_ROWS, -1)).reshape(powers.shape)
+    integral = t * (terms[0] + fourth @ (terms[1] + fourth @ (terms[2] + fourth @ terms[3])))
+    if doublings:
+        flow = identity + even @ integral
+        for _ in range(doublings - 1):
+            integral += flow @ integral
+            flow = flow @ flow
+        integral += flow @ integral
     integral[:, 0, 1] *= units
     integral[:, 1, 0] /= units
     return pair_expm(pairs, h), integral
@@ -432,36 +448,49 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
 
 def _even_units(pairs: FloatArray) -> FloatArray:
     """Return the unit (b,) of each first state, a power of two, that makes a pair symmetric."""
-    ahead, back = np.abs(pairs[:, 0, 1]), np.abs(pairs[:, 1, 0])
-    both = (ahead > 0) & (back > 0)
-    gap = np.log2(np.where(both, ahead, 1.0)) - np.log2(np.where(both, back, 1.0))
-    return np.asarray(np.exp2(np.round(0.5 * gap)))
+    ahead, back = pairs[:, 0, 1], pairs[:, 1, 0]
+    gap = np.frexp(ahead)[1] - np.frexp(back)[1]
+    return np.ldexp(1.0, np.where((ahead != 0) & (back != 0), gap // 2, 0))
 
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
     # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
     # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
-    # pair, linear in h for a rigid-body pair. The exponentials of the poles m +- r of an overdamped
-    # pair are formed separately, because cosh(r h) overflows long before e^(m h) has decayed; the
-    # smaller pole is the determinant over the larger, because m +- r would cancel its digits
+    # pair, linear in h for a rigid-body pair
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
-    N = pairs - mean[:, None, None] * np.eye(2)
+    N = pairs.copy()
+    N[:, 0, 0] -= mean
+    N[:, 1, 1] -= mean
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
-    root = np.sqrt(np.abs(q))
-    safe = divisor(root)
-    swing = q < 0
+    root, still = np.sqrt(np.abs(q)), q >= 0
+    decay, turning = np.exp(mean * h), root * h
+    even, odd = decay * np.cos(turning), decay * np.sin(turning) / divisor(root)
+    if still.any():
+        even[still], odd[still] = _overdamped(pairs[still], mean[still], root[still], h)
+    E = odd[:, None, None] * N
+    E[:, 0, 0] += even
+    E[:, 1, 1] += even
+    return E
+
+
+def _overdamped(
+    pairs: FloatArray, mean: FloatArray, root: FloatArray, h: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``e^(m h) cosh(r h)`` and ``e^(m h) sinh(r h) / r`` where poles m +- r are real."""
+    # exponentials of both poles, because cosh(r h) overflows long before e^(m h) has decayed; the
+    # smaller pole is the determinant over the larger, because m +- r would cancel its digits
     determinant = pairs[:, 0, 0] * pairs[:, 1, 1] - pairs[:, 0, 1] * pairs[:, 1, 0]
     large = mean + np.where(mean > 0, root, -root)
-    small = np.where(large != 0, determinant / np.where(large != 0, large, 1.0), 0.0)
-    upper, lower = np.maximum(large, small), np.minimum(large, small)
-    turning, decay = np.where(swing, root * h, 0.0), np.where(swing, mean * h, upper * h)
-    decay = np.exp(decay)
-    apart = np.where(swing, 0.0, root * h)
-    even = np.where(swing, decay * np.cos(turning), 0.5 * (decay + np.exp(lower * h)))
-    odd = np.where(swing, np.sin(turning), -0.5 * np.expm1(-2.0 * apart)) / safe
-    odd = decay * np.where(root > 0, odd, h)
-    return np.asarray(even[:, None, None] * np.eye(2) + odd[:, None, None] * N)
+    small = determinant / np.where(large != 0, large, 1.0)
+    decay = np.exp(np.maximum(large, small) * h)
+    even = 0.5 * (decay + np.exp(np.minimum(large, small) * h))
+    odd = -0.5 * np.expm1(-2.0 * root * h) / divisor(root)
+    return even, decay * np.where(root > 0, odd, h)
+
+
+#: Gauss nodes of an interval that is short against the fastest pole: exact to rounding
+_NODES = 10
 
 
 def accumulated_noise(
@@ -478,9 +507,9 @@ def accumulated_noise(
     # the error is a Bessel function of order 2 count and argument |A| time, which is negligible
     # beyond
     size = min(rate * time, 2.0 * n)
-    count, doublings = _TERMS + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
+    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
     if count * m >= n:
-        count, doublings = _TERMS, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
+        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
     parts = [
