@@ -8,15 +8,16 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..certificates import Certificate, Verified, stability_check
-from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
 from ..lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
-from .controller import Controller, SolvedController, required_stability, with_left_out
+from .controller import Controller, SolvedController, required_stability
 from .hinf.singular import lacking, made_regular
+from .pipeline import Design, Solution, designed
 from .preparation import Prepared, posed, prepared, require_reach
 from .structured.judges import require_finite_h2
 
@@ -92,34 +93,38 @@ def design_h2(
     """
     plant = posed(plant, u, y, "H2 synthesis")
     require_finite_h2(plant, plant.w, plant.z)
-    problem = prepared(plant.system, plant.u, plant.y, direct=True)
-    try:
-        found = _optimal_controller(problem)
-    except FlexplantError:  # a mode that u or y misses is named, with channel and frequency
-        require_reach(prepared(plant.system, plant.u, plant.y))
-        raise
-    K = problem.restored(found.A, found.B, found.C, found.D).replace(name="h2", units=plant.units)
-    # a norm of the scaled problem, in the user's unit of time
-    certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)
-    answer = Controller(
-        K,
-        "H2 by two Riccati equations",
-        gamma=certificate["H2 norm"],
-        lower=None if found.notes else min(certificate["claim"], certificate["H2 norm"]),
-        certificate=certificate | found.certificate,
-        notes=found.notes,
-    )
-    return with_left_out(answer, plant)
+    return designed(_LeastH2(), plant, plant)
 
 
-def _optimal_controller(p: Prepared) -> SolvedController:
-    """Return the optimal controller; noise and effort are added where the problem is singular."""
-    lack = lacking(p)
-    return (
-        _solve_regular(p)
-        if lack.is_full and not lack.modes
-        else made_regular(p, _solve_regular, lack, h2_norm)
-    )
+class _LeastH2(Design):
+    """The least H2 norm, by two Riccati equations."""
+
+    name = "h2"
+
+    def prepare(self, plant: AnyPlant) -> Prepared:
+        if plant.dt:
+            require_reach(prepared(plant.system, plant.u, plant.y))
+        return prepared(plant.system, plant.u, plant.y, direct=True)
+
+    def solve(self, problem: Prepared) -> SolvedController:
+        # noise and effort are added where the problem is singular
+        lack = lacking(problem)
+        if lack.is_full and not lack.modes:
+            return _solve_regular(problem)
+        return made_regular(problem, _solve_regular, lack, h2_norm)
+
+    def certify(self, solution: Solution) -> Controller:
+        plant, problem, K, found = solution
+        # a norm of the scaled problem, in the user's unit of time
+        certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)
+        return Controller(
+            K,
+            "H2 by two Riccati equations",
+            gamma=certificate["H2 norm"],
+            lower=None if found.notes else min(certificate["claim"], certificate["H2 norm"]),
+            certificate=certificate | found.certificate,
+            notes=found.notes,
+        )
 
 
 def _solve_regular(p: Prepared) -> SolvedController:

@@ -206,6 +206,21 @@ def prepared(
     )
 
 
+#: ratio of A to its poles above which a failure is attributed to badly scaled coordinates
+MIXED = 1e3
+
+
+def badly_scaled(problem: Prepared) -> str:
+    """Return that the plant was given in bad coordinates, in words; empty where it was not."""
+    if problem.departure < MIXED:
+        return ""
+    return (
+        f"the coordinates of the plant's states are badly conditioned: A is "
+        f"{problem.departure:.1e} times as large as its poles, and rounding of that size hides "
+        "what the plant is. Give it in modal, balanced or physical coordinates."
+    )
+
+
 def _with_image(
     P: StateSpace, A: FloatArray, B: FloatArray, C: FloatArray
 ) -> tuple[StateSpace, StateSpace]:

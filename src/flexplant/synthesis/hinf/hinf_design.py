@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import (
-    AssumptionError,
-    CertificateError,
-    FlexplantError,
-    ModelError,
-    SolverError,
-    attempted,
-    counted,
-    short,
-)
+from ...errors import CertificateError, ModelError, SolverError, counted, short
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.response_solvers import remembered, responder
@@ -31,18 +23,16 @@ from ..controller import (
     SynthesisMethod,
     certified_norm,
     reached_norms,
-    with_left_out,
 )
-from ..preparation import Prepared, posed, prepared, require_reach
+from ..pipeline import Design, Solution, designed, solved, verified
+from ..preparation import MIXED, Prepared, badly_scaled, posed
 from ..scaling import departure_from_normal
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
-from .moved_design import over_positions
+from .moved_design import PlantRange, over_positions
 from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
-#: ratio of A to its poles above which a failure is attributed to badly scaled coordinates
-_MIXED = 1e3
 #: in the certificate: the upper bound of real mu of all uncertain frequencies together
 TOLERATED = "all frequencies at once"
 #: ratio of gamma to its lower bound up to which bad coordinates may have been harmless
@@ -146,124 +136,137 @@ def design_hinf(
     >>> fx.close_loop(plant, errors, controller).is_stable
     True
     """
-    if method is not None and not hasattr(method, "solve"):
+    method = Riccati() if method is None else method
+    if not hasattr(method, "solve"):
         raise ModelError(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
+    if progress is not None and isinstance(method, Riccati):
+        method = method.replace(progress=progress)
+    design, what = HinfDesign(method), "H-infinity synthesis"
     if isinstance(plant, Mapping):
         if uncertain is not None:
             raise ModelError(
                 "plants by position are designed for as they are: leave out uncertain=, and check "
                 "the loop at each position."
             )
-        posed_at = {x: posed(one, u, y, "H-infinity synthesis") for x, one in plant.items()}
-        if bandwidth is not None and posed_at:
-            middle = list(posed_at.values())[len(posed_at) // 2]
-            weights = stage_weights(middle, bandwidth)
-            posed_at = {x: one.weighted(weights) for x, one in posed_at.items()}
-        return over_positions(posed_at, lambda one: _design_one(one, method, progress), progress)
-    plant = posed(plant, u, y, "H-infinity synthesis")
+        plants = {x: posed(one, u, y, what) for x, one in plant.items()}
+        if bandwidth is not None and plants:
+            weights = stage_weights(list(plants.values())[len(plants) // 2], bandwidth)
+            plants = {x: one.weighted(weights) for x, one in plants.items()}
+        return over_positions(PlantRange.of(plants), design, progress)
+    plant = posed(plant, u, y, what)
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))
     known = plant.uncertainty if uncertain is None else uncertain
     if uncertain is not None or (known is not None and known.frequencies):
         instance(known, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
-        found = tolerant(plant, evened(plant, known, method, damped_below), known, method, progress)
-    else:
-        found = _design_one(plant, method, progress)
-    return with_left_out(found, plant)
+        return designed(TolerantDesign(design, known, damped_below), plant, plant)
+    return designed(design, plant, plant)
 
 
-class Evened(NamedTuple):
-    """Channels for modes, scaled in closed loop, and gamma before they were."""
+@dataclass(frozen=True)
+class HinfDesign(Design):
+    """The least H-infinity norm, by `Riccati`, `Lmi` or a method of the same kind."""
 
+    method: SynthesisMethod
+    name = "hinf"
+
+    def prepare(self, plant: AnyPlant) -> Prepared:
+        """Return the scaled problem of a plant whose z and w miss no motion that would drift."""
+        problem: Prepared = super().prepare(plant)
+        if plant.modal_blocks.size:
+            require_shown(problem)
+        return problem
+
+    def solve(self, problem: Prepared) -> SolvedController:
+        """Return what the method finds."""
+        return self.method.solve(problem)
+
+    def certify(self, solution: Solution) -> Controller:
+        """Return the controller with the norm of its loop, by two routes, and a lower bound."""
+        plant, problem, K, found = solution
+        loop = lft(plant.system, K)
+        respond = remembered(responder(loop))  # swept twice over the same frequencies
+        try:
+            certificate = certified_norm(loop, found.gamma, respond)
+        except CertificateError:
+            _require_resolved(plant.system, K)  # the cause, if it is rounding
+            raise
+        gamma = certificate["norm"]
+        # the loops of the method and of the plant are equal: they differ by the effect of rounding
+        if badly_scaled(problem) or abs(gamma - found.gamma) > _FELT * gamma:
+            _require_resolved(plant.system, K)
+        lower = raised_bound(problem, gamma, max(found.lower, pointwise_bound(problem)))
+        _require_known(problem, gamma, lower)
+        name = type(self.method).__name__
+        return Controller(
+            K,
+            f"H-infinity by {name}",
+            gamma=gamma,
+            lower=lower,
+            certificate=certificate | found.certificate,
+            reached=reached_norms(plant, loop, respond),
+            notes=found.notes,
+            tried={f"{name}()": gamma},
+        )
+
+
+class _Opened(NamedTuple):
+    """A plant with channels for its modes, and gamma before they were scaled in closed loop."""
+
+    plant: AnyPlant
     channels: tuple[ModeChannel, ...]
     first: float
 
 
-def tolerant(
-    plant: AnyPlant,
-    given: Evened,
-    uncertain: UncertainPlant[Any],
-    method: SynthesisMethod | None = None,
-    progress: bool | None = None,
-    found: SolvedController | None = None,
-) -> Controller:
-    """Return the verified controller of a plant with channels for its modes.
+@dataclass(frozen=True)
+class TolerantDesign(Design):
+    """The same on a plant with a channel for each mode whose frequency is uncertain."""
 
-    `found`: what the method has found for it already.
-    """
-    channels = given.channels
-    answer = _design_one(with_mode_channels(plant, channels), method, progress, found)
-    scales = {one.mode: one.D for one in channels}
-    stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
-    share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
-    return answer.replace(
-        certificate=answer.certificate | {TOLERATED: share},
-        reached={},  # of the weights, without the channels of modes
-        tried={"before the scales were evened out": given.first, "after": answer.gamma},
-        notes=(
-            *answer.notes,
-            f"gamma is with a channel for each of {counted(len(channels), 'mode')}",
-        ),
-    )
+    design: HinfDesign
+    uncertain: UncertainPlant[Any]
+    damped_below: float = 0.0
 
-
-def evened(
-    plant: AnyPlant,
-    uncertain: UncertainPlant[Any],
-    method: SynthesisMethod | None = None,
-    damped_below: float = 0.0,
-) -> Evened:
-    """Return channels for the modes, their scales evened out in closed loop."""
-    channels, first = mode_channels(plant, uncertain, damped_below), np.inf
-    # only the scales depend on it: if it fails, the design itself reports why
-    with attempted("evening out the scales of modes"):
+    def prepare(self, plant: AnyPlant) -> _Opened:
+        """Return the plant with channels, their scales evened out in closed loop."""
+        channels = mode_channels(plant, self.uncertain, self.damped_below)
         opened = with_mode_channels(plant, channels)
         # by a whole search: scales of a quick one jump with the weights, and designs with them
-        loop, found = solved(opened, method or Riccati(progress=False))
-        channels, first = rebalanced(channels, opened, loop), found.gamma
-    return Evened(channels, first)
+        first = solved(self.design, opened)
+        channels = rebalanced(channels, opened, first.K)
+        return _Opened(with_mode_channels(plant, channels), channels, first.found.gamma)
 
+    def solve(self, problem: _Opened) -> Solution:
+        """Return the solution on the plant with channels."""
+        return solved(self.design, problem.plant)
 
-def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
-    """Return the controller that a method finds, not verified, and the method's own results."""
-    problem = prepared(plant.system, plant.u, plant.y)
-    found = method.solve(problem)
-    return problem.restored(found.A, found.B, found.C, found.D), found
+    def restore(self, plant: AnyPlant, problem: _Opened, found: Solution) -> StateSpace:
+        """Return its controller."""
+        return found.K
 
-
-def _design_one(
-    plant: AnyPlant,
-    method: SynthesisMethod | None,
-    progress: bool | None,
-    found: SolvedController | None = None,
-) -> Controller:
-    """Return the verified controller of a plant."""
-    problem = prepared(plant.system, plant.u, plant.y)
-    method = method or Riccati()
-    if progress is not None and isinstance(method, Riccati):
-        method = method.replace(progress=progress)
-    try:
-        require_reach(problem)
-        if plant.modal_blocks.size:  # for any method: this motion would drift
-            require_shown(problem)
-        if found is None:
-            found = method.solve(problem)
-        answer = _verified(plant, problem, type(method).__name__, found)
-        norm = float(answer.gamma or 0.0)
-        lower = raised_bound(problem, norm, max(found.lower, pointwise_bound(problem)))
-        _require_known(problem, norm, lower)
-    except (AssumptionError, SolverError, CertificateError) as error:
-        raise _blamed(problem, error) from error
-    return answer.replace(lower=lower)
+    def certify(self, solution: Solution) -> Controller:
+        """Return the controller with the norm of all channels, and real mu of the frequencies."""
+        plant, (_, channels, first), K, found = solution
+        answer = verified(self.design, found)
+        scales = {one.mode: one.D for one in channels}
+        stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, self.uncertain)]
+        share = tolerated(stated, with_mode_channels(plant, stated), K)
+        return answer.replace(
+            certificate=answer.certificate | {TOLERATED: share},
+            reached={},  # of the weights, without the channels of modes
+            tried={"before the scales were evened out": first, "after": answer.gamma},
+            notes=(
+                *answer.notes,
+                f"gamma is with a channel for each of {counted(len(channels), 'mode')}",
+            ),
+        )
 
 
 def _require_known(problem: Prepared, gamma: float, lower: float) -> None:
     """Raise SolverError when rounding in the given coordinates may have made another plant."""
-    if problem.departure < _MIXED:
-        return
-    if gamma > _CLOSE * lower or departure_from_normal(problem.A, 1.0) > _MIXED:
+    bad = gamma > _CLOSE * lower or departure_from_normal(problem.A, 1.0) > MIXED
+    if bad and badly_scaled(problem):
         raise SolverError(
             f"a controller with gamma {gamma:.4g} was found, the lower bound is {lower:.4g}, and "
             "both hang on rounding."
@@ -286,41 +289,3 @@ def _require_resolved(P: StateSpace, K: StateSpace) -> None:
             f"B and C changes it by {100 * change:.2g} %. Loosen the weights, or leave out states "
             "whose gains 16 digits do not resolve."
         )
-
-
-def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
-    """Return the error, or one that names badly scaled states as the reason."""
-    if problem.departure < _MIXED:
-        return error
-    return SolverError(
-        f"the coordinates of the plant's states are badly conditioned: A is "
-        f"{problem.departure:.1e} times as large as its poles, and rounding of that size hides "
-        "what the plant is. Give it in modal, balanced or physical coordinates. "
-        f"(What was found in these: {error})"
-    )
-
-
-def _verified(plant: AnyPlant, problem: Prepared, name: str, found: SolvedController) -> Controller:
-    """Return what a method found, its norm verified on the plant."""
-    K = problem.restored(found.A, found.B, found.C, found.D)
-    K = K.replace(name="hinf", units=plant.units)
-    loop = lft(plant.system, K)
-    respond = remembered(responder(loop))  # swept twice over the same frequencies
-    try:
-        certificate = certified_norm(loop, found.gamma, respond)
-    except CertificateError:
-        _require_resolved(plant.system, K)  # the cause, if it is rounding
-        raise
-    gamma = certificate["norm"]
-    # the loops of the method and of the plant are equal: their difference is the effect of rounding
-    if problem.departure >= _MIXED or abs(gamma - found.gamma) > _FELT * gamma:
-        _require_resolved(plant.system, K)
-    return Controller(
-        K,
-        f"H-infinity by {name}",
-        gamma=gamma,
-        certificate=certificate | found.certificate,
-        reached=reached_norms(plant, loop, respond),
-        notes=found.notes,
-        tried={f"{name}()": gamma},
-    )

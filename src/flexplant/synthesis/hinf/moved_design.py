@@ -22,6 +22,7 @@ from ...plant.uncertainty.channels import with_channels
 from ...tolerances import SAME
 from ...words import mapping
 from ..controller import Controller
+from ..pipeline import Design, solved, verified
 from ..preparation import prepared
 from .lower_bound import pointwise_bound
 
@@ -107,16 +108,11 @@ class PlantRange:
         return np.asarray(0.5 * (self.places[1:] + self.places[:-1]))
 
 
-def over_positions(
-    given: Mapping[float, Any],
-    design: Callable[[AnyPlant], Controller],
-    progress: bool | None = None,
-) -> Controller:
+def over_positions(moving: PlantRange, design: Design, progress: bool | None = None) -> Controller:
     """Return the controller whose worst norm over the positions is least of those tried."""
     # tried are the mean plant and those at the ends and in the middle, one by one; then the mean
     # plant with a channel for each row and column that moves, `y = (C + delta dC) x` and `x+ = ...
     # + (B + delta dB) u`, whose size and scale are searched
-    moving = PlantRange.of(given)
     search, motion = _Search(moving, design), _MotionChannels(moving)
     with Progress(_MOST, _DESIGNS, progress=progress, even=False):
         first = search.tried_with("the mean plant", motion.mean)
@@ -132,7 +128,7 @@ def over_positions(
 class _Search:
     """Designs for one plant or another, each judged by its loops at all positions."""
 
-    def __init__(self, moving: PlantRange, design: Callable[[AnyPlant], Controller]) -> None:
+    def __init__(self, moving: PlantRange, design: Design) -> None:
         self.moving, self.design = moving, design
         self.tried: dict[str, float] = {}
         self.best: Controller | None = None
@@ -145,8 +141,8 @@ class _Search:
     def tried_with(self, name: str, plant: AnyPlant) -> Controller | None:
         """Design for a plant, judge, and keep what is best."""
         found, worst = None, np.inf
-        with attempted(f"the design for {name}"):
-            found = self.design(plant)
+        with attempted(f"the design for {name}"):  # another plant may serve all positions
+            found = verified(self.design, solved(self.design, plant))
             worst = _worst_norm(self.moving, found.system, self.least)
             if worst < self.least:
                 self.best = found

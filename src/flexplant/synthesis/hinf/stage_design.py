@@ -16,17 +16,17 @@ from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
-from ...plant import AnyPlant, StandardPlant, reference_errors, stage_weights, standard_plant
+from ...plant import AnyPlant, reference_errors, stage_weights, standard_plant
 from ...plant.machine_plants import PlantMachines
 from ...plant.realisation import natural
 from ...plant.uncertainty.frequencies import Frequencies
 from ...plant.uncertainty.mode_delta import DampingDelta
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...updating.residuals.modal_residuals import USUAL
-from ..controller import Controller, SolvedController, with_left_out
-from .hinf_design import Evened, evened, solved, tolerant
+from ..controller import Controller, with_left_out
+from ..pipeline import Solution, solved, verified
+from .hinf_design import HinfDesign, TolerantDesign
 from .hinf_riccati import Riccati
-from .tolerated_modes import with_mode_channels
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
 _CROSSES = 2.0 / 3.0
@@ -205,7 +205,7 @@ class _StageTask:
                 self.causes.append(f"{asked:.4g} Hz: {one}")
                 continue
             self.tried.setdefault(one.bandwidth, 0.0)
-            margin, drawn, cause = self._judged(one.system)
+            margin, drawn, cause = self._judged(one.solution.K)
             self.causes.append(f"{asked:.4g} Hz: modulus margin {cause}")
             if margin < self.margin:  # of the model itself: more damping does not help
                 self.tried[one.bandwidth] = max(self.tried[one.bandwidth], margin)
@@ -225,7 +225,7 @@ class _StageTask:
             one = self._designed(at, below)
             if isinstance(one, FlexplantError):
                 return one
-            reached = self._crossing(one.system)
+            reached = self._crossing(one.solution.K)
             if abs(reached / wanted - 1.0) <= _REACHED:
                 return one
             ends[int(reached > wanted)] = at
@@ -245,13 +245,11 @@ class _StageTask:
     def _designed(self, bandwidth: float, below: float) -> _StageTry | FlexplantError:
         """Return a controller that is not verified yet, or the error of the design."""
         weighted = self.through.weighted(self.weights(bandwidth))
-        given = evened(weighted, self.uncertain, damped_below=below)
+        design = TolerantDesign(HinfDesign(Riccati(progress=False)), self.uncertain, below)
         try:
-            opened = with_mode_channels(weighted, given.channels)
-            system, solution = solved(opened, Riccati(progress=False))
-        except (SolverError, InfeasibleError) as error:
+            return _StageTry(bandwidth, design, solved(design, weighted))
+        except (SolverError, InfeasibleError) as error:  # other weights or dampings may serve
             return error
-        return _StageTry(bandwidth, weighted, given, system, solution)
 
     def _judged(self, system: StateSpace) -> tuple[float, float, str]:
         """Return the modulus margin, the least one with modes off, and both in words."""
@@ -335,7 +333,7 @@ class _StageTask:
                 "actuators."
             )
         best = self.best
-        found = tolerant(best.weighted, best.given, self.uncertain, Riccati(), found=best.solution)
+        found = verified(best.design, best.solution)
         certificate = found.certificate | {
             f"least modulus margin of {_DRAWS} machines drawn": best.drawn,
             "weights for Hz": best.bandwidth,
@@ -367,9 +365,6 @@ class _StageTry(NamedTuple):
     """The controller for the weights of a bandwidth [Hz], and the machines' least margin."""
 
     bandwidth: float
-    weighted: StandardPlant
-    given: Evened
-    system: StateSpace
-    #: what `Riccati` found for the prepared problem
-    solution: SolvedController
+    design: TolerantDesign
+    solution: Solution
     drawn: float = 0.0

@@ -1,0 +1,84 @@
+"""The way of every design: prepare, solve, restore, certify, judge on the evaluation model."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar, NamedTuple
+
+from ..errors import AssumptionError, CertificateError, SolverError
+from ..lti.statespace import StateSpace
+from ..plant import AnyPlant
+from .controller import Controller, with_left_out
+from .preparation import Prepared, badly_scaled, prepared, require_reach
+
+
+class Solution(NamedTuple):
+    """A controller that is not verified yet, with its plant, its problem and what was found."""
+
+    plant: Any
+    problem: Any
+    K: StateSpace
+    found: Any
+
+
+class Design(ABC):
+    """A method, with the steps in which it differs from the others: all else is `designed`.
+
+    The steps that are written here are those of one plant ``[w; u] -> [z; y]``, as `posed`.
+    """
+
+    #: name of the controller
+    name: ClassVar[str] = "controller"
+
+    def prepare(self, plant: Any) -> Any:
+        """Return the scaled problem."""
+        return prepared(plant.system, plant.u, plant.y)
+
+    @abstractmethod
+    def solve(self, problem: Any) -> Any:
+        """Return what the method finds for the problem, or raise."""
+
+    def restore(self, plant: Any, problem: Any, found: Any) -> StateSpace:
+        """Return the controller of the plant as given."""
+        K: StateSpace = problem.restored(found.A, found.B, found.C, found.D)
+        return K.replace(name=self.name, units=plant.units)
+
+    @abstractmethod
+    def certify(self, solution: Solution) -> Controller:
+        """Return the answer, verified on the plant as given by another route."""
+
+
+def designed(design: Design, plant: Any, judged: AnyPlant | None) -> Controller:
+    """Return the verified controller of a posed plant, judged on the evaluation model of one."""
+    answer = verified(design, solved(design, plant))
+    return answer if judged is None else with_left_out(answer, judged)
+
+
+def solved(design: Design, plant: Any) -> Solution:
+    """Return the controller of a posed plant, not verified yet."""
+    problem = design.prepare(plant)
+    with _blaming(problem):
+        if isinstance(problem, Prepared) and not problem.direct:
+            require_reach(problem)
+        found = design.solve(problem)
+        return Solution(plant, problem, design.restore(plant, problem, found), found)
+
+
+def verified(design: Design, solution: Solution) -> Controller:
+    """Return the answer with what was verified of a solution."""
+    with _blaming(solution.problem):
+        return design.certify(solution)
+
+
+@contextmanager
+def _blaming(problem: Any) -> Iterator[None]:
+    """Name badly scaled states as the cause of an error, where they are."""
+    try:
+        yield
+    except (AssumptionError, SolverError, CertificateError) as error:
+        cause = badly_scaled(problem) if isinstance(problem, Prepared) else ""
+        if not cause:
+            raise
+        raise SolverError(f"{cause} (What was found in these: {error})") from error
