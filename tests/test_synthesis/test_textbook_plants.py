@@ -86,6 +86,13 @@ def test_what_is_typed_first(kind):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["three lags", "sampled"])
+def test_unequal_slow_lags_in_a_row(kind):
+    """Each is within reach of rounding, not so their product: these were refused."""
+    assert judged(kind, 42).word == "right"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind(kind, seed):

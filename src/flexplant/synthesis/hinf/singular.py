@@ -12,7 +12,6 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
-from ...lti.modal_map import eigenvalues_with_error
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING
@@ -39,14 +38,10 @@ _SETTLED = 1.2
 _GROWTH = 3.0
 
 
-#: relative to the loop's speed: a mode that decays more slowly is taken for undamped; what z or w
-#: shows by less than the other, the root of rounding, is missed. Eigenvalues of a Riccati equation
-#: at this distance from the limit of stability stand apart by a hundred times that root. Modes of
-#: isolators (0.5 Hz, 0.3 %) in loops of 60 Hz decay at 3e-5
-_SLOW, _SHOWN = 1e-6, 1e-8
-#: the same of poles in a chain (equal lags in a row), which rounding splits by its third root; and
-#: the uncertainty of a pole by rounding that tells them: single ones have 1e-16 to 1e-13
-_SLOW_CHAIN, _CHAIN = 1e-4, 1e-12
+#: relative to the loop's speed: a mode that decays more slowly is taken for undamped, and what z or
+#: w shows by less than the root of rounding is missed. A chain of modes (lags in a row) is shown by
+#: no more than the product of their decays, so that those up to the fourth root of it count
+_SLOW, _SHOWN, _CHAIN = 1e-6, 1e-8, 1e-2
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
     "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
@@ -109,10 +104,7 @@ def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
         # [A - s I, B2; C1, D12] loses rank at poles of A, or of A without what D12 can hide: its
         # least singular value on the limit of stability is at most the distance to that pole then
         inner = A - B @ np.linalg.pinv(D) @ C
-        (own, _, error), (hidden, _, its) = map(eigenvalues_with_error, (A, inner))
-        chained = np.concatenate([error, its]) > _CHAIN
-        decay = np.where(chained, _SLOW_CHAIN, _SLOW)
-        for s, distance in _limit(p, np.concatenate([own, hidden]), decay):
+        for s, distance in (*_limit(p, la.eigvals(A)), *_limit(p, la.eigvals(inner))):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
             if la.svdvals(pencil)[-1] <= max(distance, shown):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
@@ -121,18 +113,19 @@ def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _limit(p: Prepared, poles: ComplexArray, decay: FloatArray) -> list[tuple[complex, float]]:
-    """Return the points of the limit of stability next to slow poles, and the distances there."""
+def _limit(p: Prepared, poles: ComplexArray) -> list[tuple[complex, float]]:
+    """Return points of the limit of stability at slow poles; distances there, zero in chains."""
+    unit = abs(p.point - 1.0) if p.direct else 1.0
+    near = poles[np.abs(np.abs(poles) - 1.0 if p.direct else poles.real) <= _CHAIN * unit]
     if p.direct:
-        decay = decay * abs(p.point - 1.0)
-        slow = np.abs(np.abs(poles) - 1.0) <= decay
-        near = poles[slow]
-        limit = np.where(np.abs(near - 1.0) <= decay[slow], 1.0, near / np.abs(near))
+        limit = np.where(np.abs(near - 1.0) <= _SLOW * unit, 1.0, near / np.abs(near))
     else:
-        slow = np.abs(poles.real) <= decay
-        near = poles[slow]
-        limit = 1j * np.where(np.abs(near) <= decay[slow], 0.0, near.imag)
-    return [(complex(s), abs(s - pole)) for s, pole in zip(limit, near, strict=True)]
+        limit = 1j * np.where(np.abs(near) <= _SLOW, 0.0, near.imag)
+    apart = np.abs(limit[:, None] - near) / unit
+    distance = np.diagonal(apart)
+    single = distance <= _SLOW
+    chosen = single | (np.count_nonzero(apart <= _CHAIN, axis=1) > 1)
+    return list(zip(limit[chosen].tolist(), np.where(single, distance, 0.0)[chosen], strict=True))
 
 
 def require_shown(p: Prepared) -> None:
