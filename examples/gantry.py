@@ -215,19 +215,20 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     for name, (frf, style) in curves.items():
         axs[0].loglog(there.freq, np.abs(frf[pair]), style, label=name)
     axs[0].set(
-        title="1. From the motor of the carriage to its encoder",
+        title="1  The updated model has the measured response: motor of the carriage to its encoder",
         xlabel="frequency [Hz]", ylabel="displacement per force [m/N]",
     )  # fmt: skip
     freq = np.geomspace(0.5, 1e3, 800)
     S = np.abs(loop.frequency_response(freq)["tool_y:error", "tool_y:ref"])
     fx.plot.sensitivity({"tool along y": (freq, S)}, ax=axs[1])
-    axs[1].set_title("2. |S| of the tolerant loop: errors below 1 are suppressed")
+    axs[1].set_title("2  Sensitivity of the tolerant loop: errors are suppressed below 0 dB")
     for (name, run), color in zip(result["runs"].items(), ("#0072B2", "#D55E00"), strict=True):
         fx.plot.response(run, channels=["tool_y:error"], label=name, color=color, ax=axs[2])
-    axs[2].set_title("3. Error of the tool in a move of 20 mm")
+    axs[2].set_title("3  Feedforward leaves a thirtieth of the tool's error in a move of 20 mm")
     for ax in axs:
         ax.legend()
         ax.grid(alpha=0.3)
+    axs[0].xaxis.set_major_formatter("{x:g}")
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "gantry.png", dpi=90)
     plt.close("all")

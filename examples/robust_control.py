@@ -168,14 +168,13 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     ):
         axs[0].loglog(one.frequencies, one.bounds, ".", ms=4, color=color)
         axs[0].axhline(one.upper, color=color)
-        said = f"{name}: at most {one.upper:.3g} at any frequency"
-        away = {"xytext": (0, -13 if one is robust else 4), "textcoords": "offset points"}
-        axs[0].annotate(said, (85.0, one.upper), color=color, **away)
+        said = f"{name}: at most {one.upper:.3g}"
+        axs[0].annotate(said, (85.0, one.upper), (0, 4), color=color, textcoords="offset points")
     axs[0].axhline(1.0, **fx.plot.STYLES["bound"])
     axs[0].annotate("above 1 a machine may be unstable", (85.0, 1.0), (0, 4), color="0.3",
                     textcoords="offset points")  # fmt: skip
-    axs[0].set(title="mu of what is uncertain: lines bound it, dots are resonances",
-               xlabel="frequency [Hz]", ylabel="structured singular value mu [1]",
+    axs[0].set(title="mu: lines bound all frequencies, dots are resonances",
+               xlabel="frequency [Hz]", ylabel="structured singular value mu [-]",
                xlim=(80.0, 5e3), ylim=(1e-3, 300.0))  # fmt: skip
     near = worst.freq * (1.0 + np.linspace(-2e-3, 2e-3, 201))  # a resonance of 0.1 % damping
     freq = np.union1d(np.geomspace(5.0, 4e3, 1500), near)
@@ -188,17 +187,19 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         wide = {"lw": 4.0, "alpha": 0.4} if loop is found["loop"] else {"lw": 1.2}
         axs[1].loglog(freq, gain, color=color, label=name, **wide)
     axs[1].axhline(worst.upper, label="bound on every machine", **fx.plot.STYLES["bound"])
-    axs[1].set(title="from set-point to error", xlabel="frequency [Hz]",
-               ylabel="|error / set-point| [1]", ylim=(1e-2, 4.0))  # fmt: skip
+    axs[1].set(title="From set-point to error", xlabel="frequency [Hz]",
+               ylabel="|error / set-point| [-]", ylim=(1e-2, 4.0))  # fmt: skip
     nominal = found["runs"]["nominal"]
     within = nominal.time <= 0.2
     off = 1e9 * difference(found["runs"])[within]
     axs[2].plot(1e3 * nominal.time[within], off, **fx.plot.STYLES["difference"])
     largest = 1e6 * np.max(np.abs(nominal["die:error"]))
-    axs[2].set(title=f"worst machine less nominal, whose error is {largest:.0f} µm",
-               xlabel="time [ms]", ylabel="difference of error [nm]")  # fmt: skip
+    axs[2].set(title=f"Error of the worst machine minus nominal (up to {largest:.0f} µm)",
+               xlabel="time [ms]", ylabel="difference of the errors [nm]")  # fmt: skip
     for ax in axs:
         ax.grid(alpha=0.3)
+    for ax in axs[:2]:
+        ax.xaxis.set_major_formatter("{x:g}")
     axs[1].legend(fontsize="small")
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "robust_control.png", dpi=90)

@@ -30,8 +30,14 @@ BAND = 150.0, 1250.0  # Hz, where poles are identified
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 COLORS = ("0.55", "#E69F00", "#0072B2")  # of the loops
-STORY = """At 0.1 % damping predicted errors hold: of sensors alone (geometry), of filters of the
-drawn or measured model, unless the truncated modes are ignored (24 modes).
+ROWS = {  # labels of the first panel
+    "geometry alone": "sensors alone,\nno model",
+    "drawing": "filter of the\ndrawn model",
+    "measured, 24 modes": "updated model,\nother modes ignored",
+    "measured, all modes": "updated model, other\nmodes treated as noise",
+}
+STORY = """Predicted errors hold on the machine (0.1 % damping), except where truncated modes are
+ignored. Above: noise of the amplifiers.
 | A design that trusts the updated model is unstable on the machine. A tolerant one holds.
 | The tolerant loop has the |S| on the machine that its model promised (cut at -50 dB).
 | It follows a move of 100 µm with a smaller error at the die than the best servo.
@@ -262,6 +268,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     errors, force, S, move, rest, places = axs.flat
     given, forces = list(case["errors"].values()), [f"{1e3 * f:g} mN/√Hz" for f in FORCES]
     fx.plot.predictions(given, cases=forces, ax=errors)
+    errors.set_yticks(errors.get_yticks(), [ROWS[t.get_text()] for t in errors.get_yticklabels()])
     for (name, loop), color in zip(case["loops"].items(), COLORS, strict=True):
         run, held = loop["run"], loop["machine"].is_stable
         style = {"label": name + ("" if held else ": unstable"), "color": color}

@@ -43,50 +43,6 @@ _ARGUMENTS = {"workbench": ("--no-browser",), "fleet": ("4",)}
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
 _HOME = "@root@/"  # stands for the way from a page to the folder of the site
 
-_TEMPLATE = """{% extends "default/module.html.jinja2" %}
-{% block title %}{{ module.modulename }}{% endblock %}
-{% block module_list_link %}
-<ul class="ways">
-{% for name, title in ways.items() if name in all_modules %}
-<li><a href="@root@/{{ name }}.html">{{ title }}</a></li>
-{% endfor %}
-</ul>
-{% endblock %}
-{% defaultmacro module_name() %}
-{% if module.modulename.startswith("flexplant") %}<h1>{{ module.modulename }}</h1>{% endif %}
-{% enddefaultmacro %}
-{% block nav_submodules %}
-{% if module.modulename == "flexplant" %}{{ super() | replace("Submodules", "Rooms") }}{% endif %}
-{% endblock %}
-{% block nav_members %}{{ super() | replace("API Documentation", "Names") }}{% endblock %}
-{% defaultmacro bases(cls) %}{% enddefaultmacro %}
-{% defaultmacro inherited(cls) %}
-{% for base, members in cls.inherited_members.items() if base[0].startswith("flexplant.") %}
-{% for m in members if is_public(m) | trim %}
-<div id="{{ m.qualname }}" class="classattr">
-{% if base[1] == "Value" %}<code>.{{ m.name }}</code>{% else %}{{ member(m) }}{% endif %}
-</div>
-{% endfor %}
-{% endfor %}
-{% enddefaultmacro %}
-"""
-_STYLE = """
-main.pdoc img { max-width: 100%; height: auto; }
-main.pdoc table { display: block; overflow-x: auto; font-size: 0.9em; }
-main.pdoc pre { overflow-x: auto; font-size: 0.78rem; }
-main.pdoc p code, main.pdoc h1, main.pdoc h2, main.pdoc h3 { overflow-wrap: anywhere; }
-.pdoc-code.signature { overflow-x: auto; }
-math { font-family: "Latin Modern Math", "STIX Two Math", "Cambria Math", math; font-size: 1.1em; }
-.formula { overflow-x: auto; padding: 0.5rem 0; }
-nav.pdoc ul.ways { list-style: none; padding: 0; margin: 0.5rem 0; }
-.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(15rem, 100%), 1fr));
-  gap: 1rem; }
-.gallery > a { border: 1px solid var(--accent2); border-radius: 4px; padding: 0.6rem; }
-main.pdoc .gallery img, main.pdoc .gallery pre { display: block; width: 100%; height: 10rem;
-  margin: 0 0 0.4rem; object-fit: cover; object-position: top left; overflow: hidden;
-  font-size: 0.5rem; }
-"""
-
 
 class Shown(NamedTuple):
     """What an example prints, and the pictures that it draws."""
@@ -120,17 +76,7 @@ def _run(story: Path) -> None:
         copy = Path(place) / "examples"
         shutil.copytree(_EXAMPLES, copy, ignore=shutil.ignore_patterns("out", "*.png", "__*"))
         if story.stem.startswith("test_"):
-            command = [
-                "-m",
-                "pytest",
-                "-q",
-                "-n",
-                "0",
-                "-p",
-                "no:cacheprovider",
-                "-p",
-                "no:warnings",
-            ]
+            command = "-m pytest -q -n 0 -p no:cacheprovider -p no:warnings".split()
         else:
             command = []
         answer = subprocess.run(
@@ -364,7 +310,6 @@ def _pages(site: _Site, stories: dict[Path, Shown | None]) -> dict[str, Any]:
 def write_site(folder: str | Path, *, runs: bool = True) -> int:
     """Write the documentation as static pages, `folder` / index.html the first; count them."""
     try:
-        import jinja2
         import latex2mathml.converter  # noqa: F401
         from pdoc import doc, docstrings, render
     except ImportError as error:
@@ -386,9 +331,7 @@ def write_site(folder: str | Path, *, runs: bool = True) -> int:
     convert = docstrings.convert
     vars(docstrings)["convert"] = lambda text, *how: convert(site.markdown(text), *how)
     vars(doc)["safe_eval_type"] = _as_written
-    render.configure(docformat="numpy", show_source=False)
-    ours = jinja2.DictLoader({"module.html.jinja2": _TEMPLATE, "custom.css": _STYLE})
-    render.env.loader = jinja2.ChoiceLoader([ours, *filter(None, [render.env.loader])])
+    render.configure(docformat="numpy", show_source=False, template_directory=_PAGES)
     with warnings.catch_warnings():
         # annotations that pdoc cannot evaluate are shown as they are written
         warnings.filterwarnings("ignore", "Error parsing type annotation", UserWarning)
