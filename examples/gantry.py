@@ -215,7 +215,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     for name, (frf, style) in curves.items():
         axs[0].loglog(there.freq, np.abs(frf[pair]), style, label=name)
     axs[0].set(
-        title="1  The updated model has the measured response: motor of the carriage to its encoder",
+        title="1  The updated model has the measured response: carriage's motor to encoder",
         xlabel="frequency [Hz]", ylabel="displacement per force [m/N]",
     )  # fmt: skip
     freq = np.geomspace(0.5, 1e3, 800)

@@ -76,7 +76,9 @@ def _run(story: Path) -> None:
         copy = Path(place) / "examples"
         shutil.copytree(_EXAMPLES, copy, ignore=shutil.ignore_patterns("out", "*.png", "__*"))
         if story.stem.startswith("test_"):
-            command = "-m pytest -q -n 0 -p no:cacheprovider -p no:warnings".split()
+            command = [
+                "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-p", "no:warnings",
+            ]  # fmt: skip
         else:
             command = []
         answer = subprocess.run(
