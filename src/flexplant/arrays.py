@@ -275,3 +275,8 @@ def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
             "Pass a comparison, x < 0.3, say."
         )
     return mask
+
+
+def divisor(size: Any) -> FloatArray:
+    """Return sizes to divide by, and 1 in the place of zero."""
+    return np.asarray(np.where(size > 0, size, 1.0))

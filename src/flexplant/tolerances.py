@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-
-from .arrays import FloatArray
 
 #: relative distance of neighbouring numbers in double precision
 PRECISION = float(np.finfo(np.float64).eps)
@@ -57,8 +53,3 @@ SETTLED = 1e-9
 #: poles closer than this, relative to their size, are one pole: eigenvalue solvers split a double
 #: pole, as of a rigid-body mode, by the root of their rounding (1.5e-8) times its condition
 SPLIT = 1e-6
-
-
-def divisor(size: Any) -> FloatArray:
-    """Return sizes to divide by, and 1 in the place of zero."""
-    return np.asarray(np.where(size > 0, size, 1.0))

@@ -9,8 +9,8 @@ import scipy.signal
 from timing import best
 
 import flexplant as fx
-from flexplant.loop.budget import white_noise
 from flexplant.parallel import one_thread
+from flexplant.plant.building import white_noise
 from flexplant.simulation.runs import Drawn, SampleBySample, machine_of
 from stages import L, ports
 

@@ -8,7 +8,7 @@ from test_real_measurements import ruler, vibration_toolbox
 
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import identify_modes, stabilisation_diagram
-from flexplant.identification.causality import forward_in_time
+from flexplant.identification.identify import forward_in_time
 from flexplant.lti import Frf
 from oracles_identification import pole
 

@@ -8,8 +8,8 @@ import oracles_loop as oracle
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.loop import close_loop
-from flexplant.loop.budget import white_noise
 from flexplant.plant import assemble_plant
+from flexplant.plant.building import white_noise
 from flexplant.simulation import Quantiser, Saturation, simulate
 from flexplant.simulation.runs import Conditions, InBlocks, SampleBySample, make_runner
 from flexplant.simulation.sampled_runs import finer_loop

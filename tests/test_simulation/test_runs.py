@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from flexplant.loop import ClosedLoop, close_loop
-from flexplant.loop.budget import white_noise
 from flexplant.lti import StateSpace
 from flexplant.lti.discretisation import Recursion
 from flexplant.plant import StandardPlant
+from flexplant.plant.building import white_noise
 from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from machines import observer, servo, stage
 

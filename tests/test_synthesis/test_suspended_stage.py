@@ -21,7 +21,7 @@ from flexplant.plant import (
     stage_weights,
     suspend,
 )
-from flexplant.plant.rigid_body import rigid_gain
+from flexplant.plant.building import rigid_gain
 from flexplant.simulation import simulate
 from flexplant.structure import ModalDamping, Spring, kirchhoff_plate, solid_block
 from flexplant.synthesis import design_hinf, design_servo

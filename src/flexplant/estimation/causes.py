@@ -6,11 +6,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import counted
 from ..modes.matching import NEAR
 from ..plant import AnyPlant
-from ..tolerances import NEGLIGIBLE, SAME, TINY, divisor
+from ..tolerances import NEGLIGIBLE, SAME, TINY
 from ..words import with_unit
 from .estimator import KalmanEstimator
 from .filter_models import innovation_root

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
@@ -25,7 +25,7 @@ from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant
 from ..plant.machine_plants import FigureInterval, interval, interval_text
 from ..store import Value
-from ..tolerances import CLOSE, INTERVAL, MISSED, ROOT, ROUNDING, TINY, TYPED, divisor
+from ..tolerances import CLOSE, INTERVAL, MISSED, ROOT, ROUNDING, TINY, TYPED
 from ..words import SHOWN, sizes_of
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 

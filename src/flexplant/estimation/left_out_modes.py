@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import ModelError, counted
 from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
@@ -23,7 +23,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..store import Value
-from ..tolerances import TINY, divisor
+from ..tolerances import TINY
 from .estimator_channels import sensors
 
 #: weight of a different shape relative to a different frequency when modes are paired

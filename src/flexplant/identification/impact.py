@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray, IntArray, between, positive
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known, short
-from ..lti.frequency import Frf
+from ..lti.frequency import Frf, error_statistics
 from ..store import Value
 from ..tolerances import CERTAIN, TINY
 from ..words import instance
 from .line_weights import mains_multiple
 from .result import IdentifiedModes
-from .spectra import Records, dropouts_warned, error_statistics, records
+from .spectra import Records, dropouts_warned, records
 
 #: number of equal samples at the extreme value of a channel that indicate clipping, and number of
 #: quanta that one of the two preceding steps must exceed. The same number of equal samples at a

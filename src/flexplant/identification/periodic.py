@@ -9,11 +9,11 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, frequency_band, positive, whole
 from ..errors import ModelError, counted, warn
-from ..lti.frequency import Frf
+from ..lti.frequency import Frf, error_statistics
 from ..seeds import generator
 from ..store import Value, checked
 from ..tolerances import CHANCE, DEVIATIONS, NEGLIGIBLE, TINY, TYPED
-from .spectra import Records, error_statistics
+from .spectra import Records
 
 #: fraction of the power of an output that counts as rounding
 ROUNDING = 1e-28

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, require_known, warn
-from ..lti.frequency import ORDERS, Frf
-from ..lti.measured_lines import checked_overlap, checked_window
+from ..lti.frequency import ORDERS, Frf, checked_overlap, checked_window, error_statistics
 from ..store import Value, checked
 from ..tolerances import ROUNDING, TINY
 from ..words import signal_names
@@ -196,20 +195,6 @@ def weak_references_warned(found: Averages) -> None:
             "lines out, band=, or excite more there, measure longer, or use "
             "identification.Periodic(...)."
         )
-
-
-def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatArray, ComplexArray]:
-    """Return variance (o, i, f) and correlation (o, o, f) from noise and inverse input spectra."""
-    noise = np.maximum(np.einsum("foo->fo", left).real, 0.0)
-    gain = np.einsum("fii->fi", inverse).real
-    variance = noise[:, :, None] * gain[:, None, :]
-    size = np.sqrt(np.maximum(noise, TINY))
-    correlation = left / (size[:, :, None] * size[:, None, :])
-    correlation = (correlation + correlation.conj().transpose(0, 2, 1)) / 2
-    correlation /= np.maximum(1.0, np.abs(correlation))
-    rows = np.arange(left.shape[1])
-    correlation[:, rows, rows] = 1.0
-    return variance.transpose(1, 2, 0), correlation.transpose(1, 2, 0)
 
 
 def _left_over(found: Averages, G: ComplexArray, *, with_reference: bool) -> ComplexArray:

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, whole
 from ..certificates import Certificate, Verified
 from ..errors import LabelError, ModelError, counted, warn
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
-from ..tolerances import divisor
 from ..words import flag, instance
 from .result import IdentifiedModes
 

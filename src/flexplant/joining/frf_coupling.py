@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..tolerances import CLOSE, RANK, ROOT, SAME, divisor
+from ..tolerances import CLOSE, RANK, ROOT, SAME
 from ..words import flag, instance, mapping
 from .frf_joints import (
     FrfLink,

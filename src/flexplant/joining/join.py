@@ -12,7 +12,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..certificates import Certificate, Verified
 from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
@@ -24,7 +24,7 @@ from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value, frozen
 from ..structure import FEModel
 from ..structure.rigid import rigid_body_basis
-from ..tolerances import MISSED, NEGLIGIBLE, NULL, RESIDUAL, ROOT, SAME, TINY, divisor
+from ..tolerances import MISSED, NEGLIGIBLE, NULL, RESIDUAL, ROOT, SAME, TINY
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, divisor
 from ..errors import ModelError, counted
 from ..lti.lyapunov import solve_lyapunov, solve_stein
-from ..tolerances import NEGLIGIBLE, ROUNDING, TINY, divisor
+from ..tolerances import NEGLIGIBLE, ROUNDING, TINY
 
 #: reached fraction of the wanted decay where several poles coincide, which rounding splits
 _REACHED = 0.5

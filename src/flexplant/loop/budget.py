@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, real_array
+from ..arrays import FloatArray, divisor, real_array
 from ..certificates import Certificate
 from ..errors import (
     AssumptionError,
@@ -23,13 +23,13 @@ from ..errors import (
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import controllability_factor, observability_factor
 from ..lti.response_solvers import responder
-from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import AnyPlant, standard_plant
+from ..plant.building import continuous_factor, white_names
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
-from ..tolerances import MOST_STEPS, ROOT, TYPED, divisor
+from ..tolerances import MOST_STEPS, ROOT, TYPED
 from ..words import in_unit, instance
 
 #: name of the contribution of a set-point
@@ -352,14 +352,6 @@ def periodogram(signal: FloatArray, dt: float) -> Spectrum:
     return Spectrum(np.fft.rfftfreq(n, dt).astype(np.float64), size)
 
 
-class WhiteNoise(NamedTuple):
-    """How white samples enter: `factor` (n, r) into x, `deviation` at the `columns` of w."""
-
-    factor: FloatArray
-    columns: IntArray
-    deviation: FloatArray
-
-
 class Source(NamedTuple):
     """One white noise of unit intensity (continuous) or unit variance (sampled) in a closed loop.
 
@@ -369,36 +361,6 @@ class Source(NamedTuple):
     name: str
     G: FloatArray
     D: FloatArray
-
-
-def white_names(plant: AnyPlant) -> tuple[list[str], list[str]]:
-    """Return the channels of w that are white noise: disturbances, then noises per sample."""
-    # per sample: those of sensors, and disturbances that are held over each sample
-    loud = [name for name, level in plant.asd.items() if level > 0]
-    held = plant.held if plant.dt else ()
-    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y or name in held]
-    white = [name for name in loud if name not in sensors]
-    direct = plant.system.select(inputs=white).D
-    if np.any(direct):
-        i, j = np.argwhere(direct)[0]
-        raise reaches_at_once(white[j], plant.system.outputs[i])
-    return white, sensors
-
-
-def white_noise(plant: AnyPlant) -> WhiteNoise:
-    """Return the noises of a sampled plant, all disturbances together."""
-    # exact over a sample, including aliasing; the variance of a sensor is asd^2 rate / 2
-    white, sensors = white_names(plant)
-    factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
-    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
-    asd = np.array([plant.asd[name] for name in sensors])
-    return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
-
-
-def continuous_factor(plant: AnyPlant) -> FloatArray:
-    """Return the noise factor of the disturbances that are not held over each sample."""
-    total = plant.noise_factor
-    return total[:, : total.shape[1] - len(plant.held)]
 
 
 def sources(plant: AnyPlant, monitored: StateSpace) -> list[Source]:

@@ -19,7 +19,7 @@ from ..lti.modal_map import Obstacle, obstacle
 from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
-from ..plant.machine_plants import FigureInterval
+from ..plant.machine_plants import FigureInterval, fitted_response
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..tolerances import INTERVAL
@@ -309,7 +309,8 @@ class ClosedLoop(Value):
     @cached_property
     def on_measurement(self) -> OnMeasurement | None:
         """Stability and margin on the response of ``plant.measured(frf)``; None: not measured."""
-        return judged(self)
+        known = self.plant.machine.measurement or fitted_response(self.plant.machine)
+        return None if known is None else judged(self, known)
 
     @cached_property
     def on_machines(self) -> MachineLoops:

@@ -9,8 +9,6 @@ import numpy as np
 
 from ..plant.partitioned import MeasuredResponse
 from ..store import Value
-from ..updating import FrfResidual
-from ..updating.machines import Machines
 from .measured_loop import broken_count, in_axes, measured_between
 
 #: what a loop says of which no measured response of the machine is known
@@ -63,27 +61,10 @@ class OnMeasurement(Value):
         return f"<OnMeasurement: {self.summary}>"
 
 
-def _fitted(plant: Any) -> MeasuredResponse | None:
-    """Return the response to which the plant's model was fitted, where it is of its sensors."""
-    machines = getattr(plant.model, "machines", None)
-    if not isinstance(machines, Machines):
-        return None
-    found = [r for r in machines.fit.residuals if isinstance(r, FrfResidual) and r.hold is None]
-    if len(found) != 1:
-        return None
-    frf = found[0].measured
-    quantities = {port.name: port.quantity for port in plant.ports.y}
-    measured = frf.quantity or "displacement"
-    if any(quantities.get(name, measured) != measured for name in frf.outputs):
-        return None
-    return MeasuredResponse(frf)
-
-
-def judged(loop: Any) -> OnMeasurement | None:
-    """Return a loop on the measured response of its machine; None where that was not measured."""
+def judged(loop: Any, known: MeasuredResponse) -> OnMeasurement | None:
+    """Return a loop on a measured response of its machine; None where that lacks a channel."""
     plant = loop.plant
-    known = plant.machine.measurement or _fitted(plant.machine)
-    if known is None or not set(loop.fed_back) <= set(known.frf.outputs):
+    if not set(loop.fed_back) <= set(known.frf.outputs):
         return None
     if not set(loop.driven) <= set(known.frf.inputs):
         return None

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import ModelError, SolverError
-from ..tolerances import MOST_STEPS, PRECISION, SPLIT, TINY, TYPED, divisor
+from ..tolerances import MOST_STEPS, PRECISION, SPLIT, TINY, TYPED
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:

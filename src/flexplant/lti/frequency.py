@@ -11,23 +11,75 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, complex_array, positive, positive_array
+from ..arrays import ComplexArray, FloatArray, between, complex_array, positive, positive_array
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known, short
 from ..parallel import Progress, expect
 from ..store import Value, checked, rebuild
-from ..tolerances import SAME
+from ..tolerances import SAME, TINY
 from ..words import known_units, name_list, signal_names
 from .blocks_of_states import chosen_pair, rows_of, short_list
 from .frequency_sweep import checked_freq as checked_freq
 from .frequency_sweep import default_freq as default_freq
 from .frequency_sweep import sampled_freq as sampled_freq
-from .measured_lines import checked_correlation, checked_overlap, checked_window, line_correlation
+from .measured_lines import line_correlation
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
 #: number of multiplications below which a response needs no progress bar
 _LONG = 1e9
 _NUMBERS = (int, float, complex, np.number)
+
+
+def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
+    """Return the correlation (n_out, n_out, n_freq) of the errors of outputs."""
+    correlation = complex_array(value, "correlation")
+    if correlation.shape != (shape[0], shape[0], shape[2]):
+        raise ShapeError(
+            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
+            f"got {correlation.shape}: one row and column for each output."
+        )
+    unit = np.eye(shape[0])[:, :, None]
+    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
+    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
+    if not (np.all(np.abs(correlation) <= 1 + SAME) and np.all(wrong <= SAME)):
+        raise ModelError(
+            "correlation must be Hermitian with ones on the diagonal and none larger than one. "
+            "Divide a covariance by the standard deviations of both outputs."
+        )
+    return correlation
+
+
+def checked_window(window: Any, name: str = "window") -> str | tuple[Any, ...]:
+    """Return a window that `scipy.signal.get_window` takes."""
+    from scipy.signal import get_window  # slow import that few users need
+
+    window = tuple(window) if isinstance(window, list) else window
+    try:
+        get_window(window, 16)
+    except (ValueError, TypeError, IndexError) as error:
+        raise ModelError(f"{name} {window!r} is not one of scipy.signal: {error}") from error
+    return window  # type: ignore[no-any-return]
+
+
+def checked_overlap(overlap: Any, name: str = "overlap") -> float:
+    """Return an overlap below 0.95."""
+    return between(
+        overlap, name, 0.0, 0.95, "A larger overlap adds no information: try 0.5.", ends="["
+    )
+
+
+def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """Return variance (o, i, f) and correlation (o, o, f) from noise and inverse input spectra."""
+    noise = np.maximum(np.einsum("foo->fo", left).real, 0.0)
+    gain = np.einsum("fii->fi", inverse).real
+    variance = noise[:, :, None] * gain[:, None, :]
+    size = np.sqrt(np.maximum(noise, TINY))
+    correlation = left / (size[:, :, None] * size[:, None, :])
+    correlation = (correlation + correlation.conj().transpose(0, 2, 1)) / 2
+    correlation /= np.maximum(1.0, np.abs(correlation))
+    rows = np.arange(left.shape[1])
+    correlation[:, rows, rows] = 1.0
+    return variance.transpose(1, 2, 0), correlation.transpose(1, 2, 0)
 
 
 def _reciprocal(frf: Any) -> Any:

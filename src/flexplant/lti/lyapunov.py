@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
-from ..tolerances import MOST_STEPS, RESIDUAL, SETTLED, divisor
+from ..tolerances import MOST_STEPS, RESIDUAL, SETTLED
 from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .equations import (
     accumulated,

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray, between, complex_array
-from ..errors import ModelError, ShapeError
+from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ..tolerances import ROUNDING, SAME, TINY
 from .frequency_sweep import around_resonance
 
@@ -17,44 +16,6 @@ from .frequency_sweep import around_resonance
 SAMPLES = 256
 #: correlation below which it is neglected, and largest distance of correlated lines
 LEAST, FARTHEST = 1e-3, 40
-
-
-def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
-    """Return the correlation (n_out, n_out, n_freq) of the errors of outputs."""
-    correlation = complex_array(value, "correlation")
-    if correlation.shape != (shape[0], shape[0], shape[2]):
-        raise ShapeError(
-            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
-            f"got {correlation.shape}: one row and column for each output."
-        )
-    unit = np.eye(shape[0])[:, :, None]
-    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
-    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
-    if not (np.all(np.abs(correlation) <= 1 + SAME) and np.all(wrong <= SAME)):
-        raise ModelError(
-            "correlation must be Hermitian with ones on the diagonal and none larger than one. "
-            "Divide a covariance by the standard deviations of both outputs."
-        )
-    return correlation
-
-
-def checked_window(window: Any, name: str = "window") -> str | tuple[Any, ...]:
-    """Return a window that `scipy.signal.get_window` takes."""
-    from scipy.signal import get_window  # slow import that few users need
-
-    window = tuple(window) if isinstance(window, list) else window
-    try:
-        get_window(window, 16)
-    except (ValueError, TypeError, IndexError) as error:
-        raise ModelError(f"{name} {window!r} is not one of scipy.signal: {error}") from error
-    return window  # type: ignore[no-any-return]
-
-
-def checked_overlap(overlap: Any, name: str = "overlap") -> float:
-    """Return an overlap below 0.95."""
-    return between(
-        overlap, name, 0.0, 0.95, "A larger overlap adds no information: try 0.5.", ends="["
-    )
 
 
 def line_correlation(
@@ -78,7 +39,7 @@ def line_correlation(
     for apart in range(1, min(n, FARTHEST)):
         distance = np.round((freq[apart:] - freq[:-apart]) / resolution, 6)
         values, places = np.unique(distance, return_inverse=True)
-        shares = _window_overlap(values, checked_window(window), overlap)[places]
+        shares = _window_overlap(values, window, overlap)[places]
         if values.size and values.min() > FARTHEST:
             break
         if np.any(shares > LEAST):

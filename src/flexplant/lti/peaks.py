@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import CACHED, ComplexArray, FloatArray
-from ..tolerances import TINY, TYPED, divisor
+from ..arrays import CACHED, ComplexArray, FloatArray, divisor
+from ..tolerances import TINY, TYPED
 from .modal_map import block_form, diagonal_form
 from .statespace import StateSpace
 

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, real_array
+from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..store import Value
-from ..tolerances import MOST_STEPS, RANK, SPLIT, divisor
+from ..tolerances import MOST_STEPS, RANK, SPLIT
 from .equations import (
     OnAxisError,
     accumulated,

@@ -11,10 +11,17 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
+from ..arrays import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    complex_array,
+    divisor,
+    positive,
+    real_array,
+)
 from ..errors import FlexplantError, ModelError, ShapeError, counted, short
 from ..store import Value
-from ..tolerances import divisor
 from ..words import known_units, mapping, signal_names
 from .blocks_of_states import (
     Channels,

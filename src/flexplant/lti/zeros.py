@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray
-from ..tolerances import NULL, SAME, SPLIT, divisor
+from ..arrays import ComplexArray, FloatArray, divisor
+from ..tolerances import NULL, SAME, SPLIT
 from .equations import mean_speed, reciprocal, state_scale
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import ModelError, SolverError
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
-from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SPLIT, TINY, TYPED, divisor
+from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SPLIT, TINY, TYPED
 from .modes import Modes
 from .solve import damper_forces
 from .statics import StiffnessFactor, dissection_of, held_factor, static_response

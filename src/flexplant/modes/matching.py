@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray
-from ..tolerances import NEGLIGIBLE, ROUNDING, SAME, TINY, divisor
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
+from ..tolerances import NEGLIGIBLE, ROUNDING, SAME, TINY
 
 #: shapes below this, relative to the largest one of their span, are rounding and count as zero
 _NONE = SAME

@@ -10,12 +10,12 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, IntArray, Matrix, real_array, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, Matrix, divisor, real_array, whole
 from ..errors import ModelError, SolverError, counted
 from ..sparse.symmetric import dense, orthonormalised
 from ..store import Value
 from ..structure.definite import elastic_modes, signed_square
-from ..tolerances import CLOSE, FOUR_DIGITS, MISSED, RESIDUAL, SAME, divisor
+from ..tolerances import CLOSE, FOUR_DIGITS, MISSED, RESIDUAL, SAME
 from .matching import runs
 
 #: coupling of modes by D, relative to the largest modal damping, below which it counts as zero

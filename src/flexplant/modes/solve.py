@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, positive
+from ..arrays import ComplexArray, FloatArray, divisor, positive
 from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted, short, warn
 from ..labels import Place
@@ -30,7 +30,7 @@ from ..sparse.symmetric import (
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROUNDING, TINY, divisor
+from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROUNDING, TINY
 from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix
+from ..arrays import FloatArray, Matrix, divisor
 from ..errors import ModelError, SolverError, attempted, counted, short
 from ..labels import DofSet, Place
 from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
@@ -20,7 +20,7 @@ from ..sparse.other_factors import Cholmod, CholmodCholesky
 from ..sparse.symmetric import dense, diagonal, rounding_of, same_pattern
 from ..structure import FEModel
 from ..structure.definite import signed, unstable_stiffness
-from ..tolerances import ROUNDING, SAME, TINY, divisor
+from ..tolerances import ROUNDING, SAME, TINY
 
 #: shift in units of the rounding of rigid-body energies: far below the first elastic mode of nearly
 #: all models, and K - sigma M is still well-conditioned

@@ -13,14 +13,14 @@ from typing import TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..errors import SolverError, attempted
 from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.lyapunov import square_root
 from ..lti.riccati import control_dare, riccati_root
 from ..store import Value
-from ..tolerances import RESIDUAL, SAME, SETTLED, TINY, divisor
+from ..tolerances import RESIDUAL, SAME, SETTLED, TINY
 from .criterion import Scorer
 
 #: steps in the weights on one tangent, and the relative gap at which they stop

@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import CACHED, FloatArray, IntArray
+from ..arrays import CACHED, FloatArray, IntArray, divisor
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..store import checked
-from ..tolerances import RANK, ROOT, TINY, divisor
+from ..tolerances import RANK, ROOT, TINY
 from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe

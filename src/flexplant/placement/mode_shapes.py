@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, divisor
 from ..errors import InfeasibleError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
 from ..store import checked
-from ..tolerances import divisor
 from ..words import flag, instance
 from ..work import Work
 from .candidates import Port

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..errors import AssumptionError, CertificateError, counted, some_names
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
 from ..seeds import REFUSED
 from ..store import Value
-from ..tolerances import SAME, SETTLED, TYPED, divisor
+from ..tolerances import SAME, SETTLED, TYPED
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2, PoiLqr

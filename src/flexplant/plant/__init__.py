@@ -111,6 +111,7 @@ from .ports import Reference as Reference
 from .ports import Sensor as Sensor
 from .realisation import FastStates as FastStates
 from .realisation import Feedthrough as Feedthrough
+from .remade import MachineParts as MachineParts
 from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
@@ -126,7 +127,6 @@ from .suspension import suspend as suspend
 from .uncertainty.dampings import Dampings as Dampings
 from .uncertainty.delay import Delay as Delay
 from .uncertainty.delta import Delta as Delta
-from .uncertainty.delta import MachineParts as MachineParts
 from .uncertainty.fit import Fit as Fit
 from .uncertainty.frequencies import Frequencies as Frequencies
 from .uncertainty.gains import Gains as Gains

@@ -10,14 +10,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import AssumptionError, counted, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.equations import state_scale
 from ..lti.statespace import StateSpace
 from ..lti.zeros import axis_zeros
 from ..store import Value
-from ..tolerances import ROUNDING, SAME, SPLIT, TINY, divisor
+from ..tolerances import ROUNDING, SAME, SPLIT, TINY
 from .partitioned import PartitionedSystem
 from .visibility import SHOWN, WEAK, ModeVisibility, aliased_modes, mode_visibility, response_at
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import TYPED, divisor
+from ..tolerances import TYPED
 from ..words import name_list
 from .partitioned import Partition
 from .ports import Poi

@@ -7,11 +7,18 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..arrays import FloatArray, positive
+from ..arrays import FloatArray, IntArray, positive
 from ..errors import ModelError, counted, warn
 from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
-from ..lti.sampling import check_latency, check_rate, held_exactly, light_modes, sample_and_hold
+from ..lti.sampling import (
+    check_latency,
+    check_rate,
+    held_exactly,
+    light_modes,
+    reaches_at_once,
+    sample_and_hold,
+)
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import Structure
@@ -19,11 +26,10 @@ from ..tolerances import NEGLIGIBLE, ROUNDING, SAME
 from ..words import instance
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
-from .partitioned import Partition
+from .partitioned import Partition, PartitionedSystem
 from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural
-from .rigid_body import rigid_gain
 
 
 class PortRows(NamedTuple):
@@ -404,3 +410,58 @@ def warn_of_another_body(own: Partition, other: Partition) -> None:
             f"by {off:.0%} from the plant's, so that answers would be judged on another machine. "
             "Pass the model that the plant was made of, with more modes."
         )
+
+
+def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
+    """Return the accelerations at outputs per force at inputs, of the modes at 0 Hz alone."""
+    # `rows R m^-1 R' pushes'` with R the free motions and m their mass; filters of the ports count
+    # with their static gains
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    r = realisation.n_rigid
+    motions = realisation.outputs[:, 2 * np.arange(r)] * realisation.pairs[:r, 0, 1]
+    forces = {port.name: port.static_push(realisation) for port in ports.forces}
+    places = {p.channel(axis): p.row(realisation, axis) for p in ports.z for axis in p.axes}
+    places |= {s.name: s.static_row(realisation) for s in ports.y}
+    seen, push = (
+        np.array([side[name] for name in names]).reshape(-1, len(motions)) @ motions
+        for side, names in ((places, outputs), (forces, inputs))
+    )
+    return np.asarray(seen @ push.T)
+
+
+class WhiteNoise(NamedTuple):
+    """How white samples enter: `factor` (n, r) into x, `deviation` at the `columns` of w."""
+
+    factor: FloatArray
+    columns: IntArray
+    deviation: FloatArray
+
+
+def white_names(plant: PartitionedSystem) -> tuple[list[str], list[str]]:
+    """Return the channels of w that are white noise: disturbances, then noises per sample."""
+    # per sample: those of sensors, and disturbances that are held over each sample
+    loud = [name for name, level in plant.asd.items() if level > 0]
+    held = plant.held if plant.dt else ()
+    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y or name in held]
+    white = [name for name in loud if name not in sensors]
+    direct = plant.system.select(inputs=white).D
+    if np.any(direct):
+        i, j = np.argwhere(direct)[0]
+        raise reaches_at_once(white[j], plant.system.outputs[i])
+    return white, sensors
+
+
+def white_noise(plant: PartitionedSystem) -> WhiteNoise:
+    """Return the noises of a sampled plant, all disturbances together."""
+    # exact over a sample, including aliasing; the variance of a sensor is asd^2 rate / 2
+    white, sensors = white_names(plant)
+    factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
+    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
+    asd = np.array([plant.asd[name] for name in sensors])
+    return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
+
+
+def continuous_factor(plant: PartitionedSystem) -> FloatArray:
+    """Return the noise factor of the disturbances that are not held over each sample."""
+    total = plant.noise_factor
+    return total[:, : total.shape[1] - len(plant.held)]

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, divisor
 from ..errors import AssumptionError, counted, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import divisor
 from .axes import DrivenAxes, apart, driven_axes, real_gain
 from .partitioned import Partition
 from .rest_expansion import followed_at_rest

@@ -13,12 +13,14 @@ from ..arrays import FloatArray, between, whole
 from ..errors import AssumptionError, ModelError
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..tolerances import INTERVAL
+from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit, with_unit
-from .drawn_modes import DrawnModes
-from .machine_draws import MachineFamily, StatedFamily
+from .machine_draws import DrawnModes, MachineFamily, StatedFamily
+from .partitioned import MeasuredResponse
 from .ports import Ports
-from .uncertainty.delta import MachineParts, with_changes
+from .remade import MachineParts
+from .uncertainty.delta import with_changes
 from .uncertainty.mode_delta import ModeDelta
 from .uncertainty.parameter_amounts import ParameterDelta
 
@@ -54,6 +56,22 @@ def fitted_machines(plant: Any) -> Machines | None:
             return source
     found = getattr(plant.model, "machines", None)
     return found if isinstance(found, Machines) else None
+
+
+def fitted_response(plant: Any) -> MeasuredResponse | None:
+    """Return the response to which the plant's model was fitted, where it is of its sensors."""
+    machines = getattr(plant.model, "machines", None)
+    if not isinstance(machines, Machines):
+        return None
+    found = [r for r in machines.fit.residuals if isinstance(r, FrfResidual) and r.hold is None]
+    if len(found) != 1:
+        return None
+    frf = found[0].measured
+    quantities = {port.name: port.quantity for port in plant.ports.y}
+    measured = frf.quantity or "displacement"
+    if any(quantities.get(name, measured) != measured for name in frf.outputs):
+        return None
+    return MeasuredResponse(frf)
 
 
 class PlantMachines:

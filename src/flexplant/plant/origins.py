@@ -64,26 +64,21 @@ class PlantChannel(Value):
     ----------
     name : str
         Name of the channel.
-    side : {"y", "u"}
+    home : {"y", "u"}
         Whether it is a sensor or an actuator.
 
     Examples
     --------
     >>> import flexplant as fx
     >>> fx.placement.PlantChannel("y1", "y")
-    PlantChannel(name='y1', side='y')
+    PlantChannel(name='y1', home='y')
     """
 
     asd: ClassVar = 0.0
     latency: ClassVar = 0.0
     unit: ClassVar = None
     name: str
-    side: str
-
-    @property
-    def home(self) -> str:
-        """The side of `Ports` that it belongs to."""
-        return self.side
+    home: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +108,7 @@ class Foreign(Value):
     delay: float = 0.0
     continuous: Any = None
     ports: Ports = field(default_factory=Ports)
-
-    @property
-    def realisation(self) -> ModalRealisation:
-        """No modes."""
-        return _NO_MODES
+    realisation: ClassVar[ModalRealisation] = _NO_MODES
 
 
 #: where a plant may have come from

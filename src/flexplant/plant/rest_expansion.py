@@ -7,10 +7,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace
-from ..tolerances import SAME, divisor
+from ..tolerances import SAME
 from .axes import apart, complex_gain, felt, resting_frequency
 from .partitioned import Partition
 

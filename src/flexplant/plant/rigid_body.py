@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from ..arrays import FloatArray
-from ..errors import AssumptionError, ModelError, require_known
+from ..errors import AssumptionError, ModelError
 from ..labels import DIRECTIONS
 from ..store import Value
 from ..structure import FEModel
@@ -158,19 +157,3 @@ def _centre(mass: FloatArray, axes: tuple[str, ...]) -> FloatArray:
 def rigid_parts(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
     """Return the parts (p, r) of rows over the DOFs, which may be none, in motions (n, r)."""
     return np.array(rows).reshape(len(rows), motions.shape[0]) @ motions
-
-
-def rigid_gain(plant: Any, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
-    """Return the accelerations at outputs per force at inputs, of the modes at 0 Hz alone."""
-    # `rows R m^-1 R' pushes'` with R the free motions and m their mass; filters of the ports count
-    # with their static gains
-    realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    r = realisation.n_rigid
-    motions = realisation.outputs[:, 2 * np.arange(r)] * realisation.pairs[:r, 0, 1]
-    forces = {port.name: port for port in ports.forces}
-    require_known("force", inputs, forces)
-    places = {p.channel(axis): p.row(realisation, axis) for p in ports.z for axis in p.axes}
-    places |= {s.name: s.static_row(realisation) for s in ports.y}
-    require_known("motion of a POI or a sensor", outputs, places)
-    push = rigid_parts([forces[name].static_push(realisation) for name in inputs], motions)
-    return np.asarray(rigid_parts([places[name] for name in outputs], motions) @ push.T)

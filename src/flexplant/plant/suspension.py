@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, number, positive
+from ..arrays import ComplexArray, FloatArray, divisor, number, positive
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes import Modes, normal_form
@@ -18,7 +18,7 @@ from ..reduction import ReducedModel
 from ..sparse.symmetric import orthonormalised
 from ..store import Value, checked
 from ..structure import Damper, FEModel, Spring
-from ..tolerances import NEGLIGIBLE, SAME, SPLIT, TYPED, divisor
+from ..tolerances import NEGLIGIBLE, SAME, SPLIT, TYPED
 from ..words import members
 from .port import checked_place, port_direction
 from .realisation import realise

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import positive, whole
+from ..arrays import divisor, positive, whole
 from ..errors import AssumptionError, ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.filters import inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..store import Value
-from ..tolerances import SAME, divisor
+from ..tolerances import SAME
 from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
 from .port import DERIVATIVES

@@ -10,11 +10,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, positive, whole
+from ..arrays import ComplexArray, FloatArray, divisor, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
 from ..store import Value
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import ROUNDING, TINY
 from ..words import instance, name_list
 
 #: shapes at DOFs, real or complex

@@ -13,6 +13,7 @@ from ..arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
+    divisor,
     frequency_band,
     positive,
     real_array,
@@ -34,7 +35,7 @@ from ..modes.solve import modes_reaching
 from ..modes.statics import held_factor, labels_of, places, static_response
 from ..store import Value
 from ..structure import FEModel
-from ..tolerances import FOUR_DIGITS, SAME, divisor
+from ..tolerances import FOUR_DIGITS, SAME
 from .ranking import ErrorBound
 
 #: a `ReducedModel`, whose module imports this one

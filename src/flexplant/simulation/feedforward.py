@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, IntArray, real_array, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, real_array, whole
 from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
@@ -21,7 +21,7 @@ from ..plant.axes import resting_frequency
 from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
 from ..store import Value
-from ..tolerances import SAME, divisor
+from ..tolerances import SAME
 from ..words import instance, name_list
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile

@@ -18,9 +18,9 @@ import scipy.sparse as sp
 from ..arrays import FloatArray, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop, ScheduledLoop
-from ..loop.budget import WhiteNoise, continuous_factor, white_noise
 from ..lti.sampling import pair_expm
 from ..plant import Actuator, Poi, StandardPlant
+from ..plant.building import WhiteNoise, continuous_factor, white_noise
 from ..plant.scheduling import Position
 from ..tolerances import ROOT, SAME
 from .motion import SetPointProfile

@@ -8,11 +8,10 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from ..arrays import FloatArray, between, positive, real_array
+from ..arrays import FloatArray, between, divisor, positive, real_array
 from ..errors import ModelError, require_known, short, unknown_label
 from ..plant import StandardPlant
 from ..store import Value, checked
-from ..tolerances import divisor
 from ..words import instance, why_not_called
 
 

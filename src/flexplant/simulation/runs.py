@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..loop import ClosedLoop
 from ..loop.blocks import applied_law
-from ..loop.budget import WhiteNoise
 from ..lti.discretisation import CALL, ONE_VECTOR, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import StandardPlant
-from ..tolerances import ROOT, divisor
+from ..plant.building import WhiteNoise
+from ..tolerances import ROOT
 from .nonlinear_elements import Acting, Answering
 
 

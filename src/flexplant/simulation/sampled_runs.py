@@ -12,9 +12,9 @@ from ..arrays import FloatArray, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, only_one, require_known, short, warn
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import references, with_known
-from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
+from ..plant.building import white_noise
 from ..plant.partitioned import require_sampled
 from ..plant.port import DERIVATIVES
 from ..seeds import MOST_DRAWS, generator, seed_of, seed_sequence

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, Matrix
+from ..arrays import FloatArray, IntArray, Matrix, divisor
 from ..errors import ModelError
-from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT, divisor
+from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT
 
 #: fraction of non-zero entries below which stored zeros are removed before products
 _FULL = 0.8

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..errors import ModelError, SolverError
 from ..sparse.factor import is_positive_definite
 from ..sparse.lowest import Lowest, lowest_modes
 from ..sparse.symmetric import ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
-from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME, divisor
+from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel

@@ -9,12 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, Matrix, between, complex_array, positive, real_array, whole
+from ..arrays import (
+    FloatArray,
+    Matrix,
+    between,
+    complex_array,
+    divisor,
+    positive,
+    real_array,
+    whole,
+)
 from ..errors import ModelError, ShapeError, short
 from ..sparse.factor import LARGEST_FULL
 from ..sparse.symmetric import dense
 from ..store import Value, checked
-from ..tolerances import ROUNDING, divisor
+from ..tolerances import ROUNDING
 from ..words import flag, several
 from .definite import elastic_modes
 

@@ -11,7 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..arrays import FloatArray, IntArray, Matrix, real_array
+from ..arrays import FloatArray, IntArray, Matrix, divisor, real_array
 from ..errors import SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import DENSE_LIMIT
@@ -25,7 +25,7 @@ from ..sparse.symmetric import (
     orthonormalised,
     unit_diagonal,
 )
-from ..tolerances import CLOSE, NEGLIGIBLE, NULL, PRECISION, RESIDUAL, ROUNDING, TYPED, divisor
+from ..tolerances import CLOSE, NEGLIGIBLE, NULL, PRECISION, RESIDUAL, ROUNDING, TYPED
 
 #: multiple of the usual rounding of a row above which a force belongs to a spring
 _OUTLIER = 30.0

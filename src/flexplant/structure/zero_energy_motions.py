@@ -9,13 +9,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IntArray, divisor
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import LARGEST_FULL
 from ..sparse.lowest import Lowest, lowest_modes
 from ..sparse.symmetric import ZERO, dense, diagonal, orthonormalised
-from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, PRECISION, SAME, divisor
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, PRECISION, SAME
 from .rigid import bodies, farness, force_free, free_motions, rigid_motions
 
 #: motion of a DOF of a mechanism, relative to the largest one, above which it is listed

@@ -6,12 +6,12 @@ import numpy as np
 import scipy.linalg as la
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..lti.equations import bordered_scale, state_scale
 from ..lti.modal_map import eigenvalues_with_error
 from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace
-from ..tolerances import SAME, TINY, divisor
+from ..tolerances import SAME, TINY
 
 #: point at which answers are taken, in the unit of the loop's speed: away from resonances
 POINT = complex(np.exp(0.25j * np.pi))

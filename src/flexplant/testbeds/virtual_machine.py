@@ -11,19 +11,20 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, below_half_rate, positive, whole
 from ..errors import ModelError, require_known
-from ..estimation import design_static
 from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, offsets
 from ..loop import ClosedLoop, ScheduledLoop, close_loop
 from ..lti.frequency import Frf
+from ..lti.statespace import StateSpace
 from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
 from ..plant.realisation import ModalRealisation, realise
 from ..reduction import ReducedModel
 from ..seeds import generator
 from ..simulation import Quantiser, Response, simulate
 from ..store import Value
-from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
+from ..structure import FEModel, ModalDamping, plate, solid_block
 from ..synthesis import design_servo
+from ..tolerances import SAME
 from ..words import instance, several
 
 #: the plate of the paper's Table 1, as its drawing says
@@ -296,13 +297,26 @@ def _holding(ports: Ports, machine: WaferStage) -> tuple[Any, ...]:
     if machine.magnets:
         model = solid_block(elements=(4, 3, 1), **machine.drawing)
     else:
-        model = kirchhoff_plate(elements=(4, 4), **machine.drawing)
+        model = plate(elements=(4, 4), **machine.drawing)
     model = model.with_damping(ModalDamping(0.01))
     model = suspend(model, machine.magnets) if machine.magnets else model
     plant = assemble_plant(model, ports).discretized(machine.rate, delay=machine.delay)
     # against magnets a loop must be several times as fast as what they make grow
     slow = HELD if machine.magnets else 8.0
-    return design_static(plant), design_servo(plant, bandwidth=slow, rolloff=5.0 * slow)
+    return _of_a_rigid_body(plant), design_servo(plant, bandwidth=slow, rolloff=5.0 * slow)
+
+
+def _of_a_rigid_body(plant: StandardPlant) -> StateSpace:
+    """Return where the POIs of a rigid body are by what its sensors read."""
+    own, ports = plant.assembled.realisation, plant.assembled.ports
+    read = [port for port in ports.y if not port.order]
+    seen = [poi.row(own, axis) for poi in ports.z for axis in poi.axes]
+    motions = np.array([*seen, *(port.static_row(own) for port in read)]) @ own.model.body_motions
+    Z, Y = np.split(motions, [len(seen)])
+    hats = [poi.derived(axis, "hat") for poi in ports.z for axis in poi.axes]
+    names = [port.name for port in read]
+    gain = Z @ np.linalg.pinv(Y, rcond=SAME)
+    return StateSpace([], [], [], gain, plant.dt, inputs=names, outputs=hats, name="static")
 
 
 def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:

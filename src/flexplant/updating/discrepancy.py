@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import ModelError, counted, some_names
 from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
-from ..tolerances import DEVIATIONS, INTERVAL, SAME, TYPED, divisor
+from ..tolerances import DEVIATIONS, INTERVAL, SAME, TYPED
 from ..words import instance
 from .family import Point
 from .residuals.modal_residuals import USUAL, Eigenvalues, growth

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, real_array, whole
+from ..arrays import FloatArray, divisor, real_array, whole
 from ..errors import (
     FlexplantError,
     LabelError,
@@ -19,7 +19,7 @@ from ..errors import (
     counted,
 )
 from ..seeds import Rng, generator
-from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, TINY, TYPED, divisor
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, TINY, TYPED
 from .changed_models import changed_model
 from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit

@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import LabelError, ModelError, counted, short
 from ..store import Value
-from ..tolerances import MISSED, SAME, divisor
+from ..tolerances import MISSED, SAME
 from ..words import several
 from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter, checked_parameters, checked_values

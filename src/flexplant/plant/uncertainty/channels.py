@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, divisor
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING, TINY, TYPED, divisor
+from ...tolerances import ROUNDING, TINY, TYPED
 
 #: directions of a Delta's change below this, relative to the largest, are left out
 _RANK = 1e-5

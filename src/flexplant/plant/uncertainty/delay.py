@@ -9,8 +9,9 @@ from typing import ClassVar
 from ...arrays import positive
 from ...errors import ModelError
 from ..partitioned import Partition
+from ..remade import MachineParts
 from .channels import Opened
-from .delta import Delta, MachineParts
+from .delta import Delta
 from .kind import Uncertainty
 
 

@@ -2,97 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar
 
-import numpy as np
-
-from ...arrays import FloatArray
-from ...errors import FlexplantWarning
-from ...lti.statespace import as_statespace
 from ...store import Value
-from ..building import P, sampled
-from ..forces import Actuator
+from ..building import P
 from ..partitioned import Partition
-from ..port import ForcePort, SensorPort
-from ..ports import Poi, Ports
-from ..realisation import ModalRealisation, plant_modes
-from ..remade import rebuilt
+from ..remade import MachineParts
 from .channels import EvenUnits, Opened, with_parts
-
-Port: TypeAlias = ForcePort | SensorPort | Poi
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MachineParts(Value):
-    """What a machine is assembled from, which Deltas change: modes, ports, and delay.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        The nominal plant.
-    realisation : ModalRealisation
-        Modes; their blocks (b, 2, 2) are those of `pairs`.
-    pairs : (b, 2, 2) array [rad/s]
-    ports : Ports
-        Its ports; `with_port` and `with_gain` change one.
-    model : FEModel or ReducedModel, optional
-        A model with other matrices, whose modes are then solved again in place of `realisation`.
-    late : float [samples]
-        Change of the delay.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> machine = fx.plant.MachineParts.of(plant).with_gain("u1", 1.1)
-    >>> machine.assembled().Gyu.D.shape == plant.Gyu.D.shape
-    True
-    """
-
-    plant: Partition
-    realisation: ModalRealisation
-    pairs: FloatArray
-    ports: Ports
-    model: Any = None
-    late: float = 0.0
-
-    @classmethod
-    def of(cls, plant: Partition) -> MachineParts:
-        """Return the nominal machine of a plant."""
-        own = plant.assembled
-        return cls(plant, own.realisation, own.realisation.pairs, own.ports)
-
-    def with_port(self, port: Port) -> MachineParts:
-        """Return the machine with a port in place of the one of its name: at another place, say."""
-        side = [port if one.name == port.name else one for one in getattr(self.ports, port.home)]
-        return self.replace(ports=self.ports.replace(**{port.home: side}))
-
-    def with_gain(self, name: str, gain: float) -> MachineParts:
-        """Return the machine with the gain of an actuator or sensor times a number."""
-        every: tuple[Actuator | SensorPort, ...] = (*self.ports.u, *self.ports.y)
-        port = next(one for one in every if one.name == name)
-        part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
-        # states as before: a command is scaled before the filter, a reading behind it
-        driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
-        return self.with_port(port.replace(dynamics=part.replace(D=gain * part.D, **driven)))
-
-    def assembled(self) -> Any:
-        """Return the plant of the machine, with the nominal one's ports and sampled like it."""
-        plant, realisation = self.plant, self.realisation
-        if self.model is not None:
-            with warnings.catch_warnings():  # the nominal plant has said in which form it is
-                warnings.simplefilter("ignore", FlexplantWarning)
-                realisation = plant_modes(self.model)
-        elif not np.array_equal(self.pairs, realisation.pairs):
-            realisation = realisation.replace(pairs=self.pairs)
-        ports = None if self.ports is plant.assembled.ports else self.ports
-        if not self.late:
-            return rebuilt(plant, ports=ports, realisation=realisation)
-        fresh = rebuilt(plant.continuous, ports=ports, realisation=realisation)
-        return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
 
 
 @dataclass(frozen=True, eq=False)

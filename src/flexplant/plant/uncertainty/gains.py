@@ -12,8 +12,9 @@ from ...arrays import positive
 from ...errors import ModelError, require_known
 from ...lti.statespace import StateSpace
 from ..partitioned import Partition
+from ..remade import MachineParts
 from .channels import Opened, with_channels
-from .delta import Delta, MachineParts
+from .delta import Delta
 from .kind import Uncertainty
 
 

@@ -14,8 +14,9 @@ from ...tolerances import ROUNDING, SAME, TINY
 from ...updating.matrix_parameters import MatrixParameter
 from ..partitioned import Partition
 from ..realisation import MODAL, ModalRealisation
+from ..remade import MachineParts
 from .channels import DeltaChannel, Opened, system_matrix, with_each
-from .delta import Delta, MachineParts, with_changes
+from .delta import Delta, with_changes
 from .parameter_amounts import ParameterDelta
 
 #: relative change at which the plant's dependence on a Delta is read off

@@ -20,8 +20,9 @@ from ..building import continuous_plant
 from ..partitioned import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
+from ..remade import MachineParts
 from .channels import Opened
-from .delta import Delta, MachineParts
+from .delta import Delta
 from .kind import Uncertainty
 
 

@@ -13,9 +13,9 @@ from ...errors import ModelError
 from ...tolerances import DEVIATIONS, SAME, TINY
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
-from ..remade import rebuilt
+from ..remade import MachineParts, rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each
-from .delta import Delta, MachineParts
+from .delta import Delta
 from .kind import Known, Uncertainty
 from .mode_delta import modal_realisation, require_elastic
 

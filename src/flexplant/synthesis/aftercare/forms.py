@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ...arrays import ComplexArray, FloatArray, positive
+from ...arrays import ComplexArray, FloatArray, divisor, positive
 from ...errors import AssumptionError, CertificateError, ModelError
 from ...loop.anti_windup import recovery_gain
 from ...lti.equations import state_scale
@@ -21,7 +21,7 @@ from ...lti.minimal_realisations import minimal
 from ...lti.modal import modal_form
 from ...lti.modal_map import eigenvalues_with_error
 from ...lti.statespace import StateSpace, as_statespace
-from ...tolerances import RANK, ROUNDING, divisor
+from ...tolerances import RANK, ROUNDING
 
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
 LANES = 4

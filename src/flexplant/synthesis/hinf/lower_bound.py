@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
-from ...tolerances import SAME, SPLIT, divisor
+from ...tolerances import SAME, SPLIT
 from ..preparation import Prepared
 
 #: points of the sweep, and times that it is refined

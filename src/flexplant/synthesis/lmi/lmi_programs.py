@@ -11,13 +11,13 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, positive, whole
+from ...arrays import FloatArray, divisor, positive, whole
 from ...errors import InfeasibleError, ModelError, SolverError, counted
 from ...lti.equations import OnAxisError
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...parallel import interruptible
 from ...store import Value, checked
-from ...tolerances import RANK, TINY, divisor
+from ...tolerances import RANK, TINY
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
 from ..hinf.lower_bound import both_sides, pointwise_bound, raised_bound

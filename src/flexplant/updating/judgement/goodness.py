@@ -11,8 +11,8 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...arrays import FloatArray
-from ...tolerances import CHANCE, NEGLIGIBLE, ROUNDING, SAME, TINY, TYPED, divisor
+from ...arrays import FloatArray, divisor
+from ...tolerances import CHANCE, NEGLIGIBLE, ROUNDING, SAME, TINY, TYPED
 from ...words import SHOWN
 from ..family import Point
 from ..search import Objective

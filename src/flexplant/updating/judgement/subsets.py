@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, divisor
 from ...errors import ModelError, SolverError
 from ...modes.matching import ALIKE, mac_matrix
-from ...tolerances import CLOSE, MOST_STEPS, NEGLIGIBLE, TINY, TYPED, divisor
+from ...tolerances import CLOSE, MOST_STEPS, NEGLIGIBLE, TINY, TYPED
 from ..family import ROUNDING, Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd

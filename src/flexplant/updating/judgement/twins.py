@@ -6,9 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from ...arrays import FloatArray
+from ...arrays import FloatArray, divisor
 from ...errors import ModelError
-from ...tolerances import divisor
 from ..search import Objective
 from .subsets import Subset, Subsets, bic
 

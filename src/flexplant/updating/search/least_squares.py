@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import FloatArray, between, positive, whole
+from ...arrays import FloatArray, between, divisor, positive, whole
 from ...errors import ModelError, SolverError, counted
 from ...store import checked
-from ...tolerances import CLOSE, MISSED, NULL, SAME, divisor
+from ...tolerances import CLOSE, MISSED, NULL, SAME
 from ...words import one_of
 from ..family import Point
 from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes

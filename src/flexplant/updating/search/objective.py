@@ -9,11 +9,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import ModelError
 from ...parallel import tick
 from ...store import Value
-from ...tolerances import divisor
 from ...words import instance
 from ..family import Family, Point, first_point
 from ..parameters import Parameter
