@@ -303,16 +303,18 @@ def _holding(ports: Ports, machine: WaferStage) -> tuple[Any, ...]:
     plant = assemble_plant(model, ports).discretized(machine.rate, delay=machine.delay)
     # against magnets a loop must be several times as fast as what they make grow
     slow = HELD if machine.magnets else 8.0
-    return _of_a_rigid_body(plant), design_servo(plant, bandwidth=slow, rolloff=5.0 * slow)
+    return _of_a_rigid_body(plant, model.body_motions), design_servo(
+        plant, bandwidth=slow, rolloff=5.0 * slow
+    )
 
 
-def _of_a_rigid_body(plant: StandardPlant) -> StateSpace:
+def _of_a_rigid_body(plant: StandardPlant, motions: FloatArray) -> StateSpace:
     """Return where the POIs of a rigid body are by what its sensors read."""
     own, ports = plant.assembled.realisation, plant.assembled.ports
     read = [port for port in ports.y if not port.order]
     seen = [poi.row(own, axis) for poi in ports.z for axis in poi.axes]
-    motions = np.array([*seen, *(port.static_row(own) for port in read)]) @ own.model.body_motions
-    Z, Y = np.split(motions, [len(seen)])
+    rows = np.array([*seen, *(port.static_row(own) for port in read)])
+    Z, Y = np.split(rows @ motions, [len(seen)])
     hats = [poi.derived(axis, "hat") for poi in ports.z for axis in poi.axes]
     names = [port.name for port in read]
     gain = Z @ np.linalg.pinv(Y, rcond=SAME)
