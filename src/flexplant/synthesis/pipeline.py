@@ -29,8 +29,9 @@ class Design(ABC):
     The steps that are written here are those of one plant ``[w; u] -> [z; y]``, as `posed`.
     """
 
-    #: name of the controller
+    #: name of the controller, and what of its kind may hide a mode from u or y
     name: ClassVar[str] = "controller"
+    hidden: ClassVar[str] = ""
 
     def prepare(self, plant: Any) -> Any:
         """Return the scaled problem."""
@@ -61,7 +62,7 @@ def solved(design: Design, plant: Any) -> Solution:
     problem = design.prepare(plant)
     with _blaming(problem):
         if isinstance(problem, Prepared) and not problem.direct:
-            require_reach(problem)
+            require_reach(problem, design.hidden)
         found = design.solve(problem)
         return Solution(plant, problem, design.restore(plant, problem, found), found)
 

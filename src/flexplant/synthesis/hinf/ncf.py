@@ -2,32 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray, below_half_rate, positive
-from ...certificates import Certificate, Verified, stability, stability_check
+from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
 from ...lti.discretisation import bilinear, tustin
 from ...lti.equations import OnAxisError, balanced_matrix, mean_speed
 from ...lti.frequency import Frf, frequency_response
-from ...lti.interconnection import connect, series
+from ...lti.interconnection import lft, series
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant
 from ...tolerances import TINY
 from ...words import inner_names
-from ..controller import Controller, with_left_out
-from ..preparation import Prepared, prepared, require_reach
+from ..controller import Controller, required_stability
+from ..pipeline import Design, Solution, designed
+from ..preparation import Prepared, prepared
 from .lower_bound import both_sides
 
 #: corner of the integral action of the recipe, relative to the bandwidth
 _INTEGRAL = 0.1
 #: claim and margin, and the smallest gamma by two computations, agree to this
 AGREEMENT = 1e-4
+#: why a loop that solves its Riccati equations is not stable in rounding
+_HIDDEN = (
+    "A mode that is undamped, integrating or unstable is nearly hidden by the shaping (a zero of "
+    "`before` or `after` next to its pole), or hardly reached or seen. Move that zero, or add an "
+    "actuator or a sensor."
+)
 #: smallest gamma of a shaped plant above which its bandwidth is out of reach
 _LARGEST_GAMMA = 1e3
 
@@ -109,20 +119,86 @@ def design_ncf(
     if bandwidth is not None:
         weight = integral_action(shaped, positive(bandwidth, "bandwidth"))
         first, shaped = series(weight, first), series(weight, shaped)
-    K, least, certificate = verified_controller(shaped, back_off)
-    whole = series(series(last, K), first).replace(
-        inputs=G.outputs, outputs=G.inputs, name="ncf", units=G.units
-    )
-    if not loop_margin(G, whole)[0]:
-        raise hidden_mode(G, whole)
-    answer = Controller(
-        whole,
-        "loop shaping by normalised coprime factors",
-        gamma=1.0 / certificate["margin"],
-        lower=least,
-        certificate=certificate | {"modulus margin": modulus_margin((G, whole))},
-    )
-    return with_left_out(answer, plant) if isinstance(plant, AnyPlant) else answer
+    judged = plant if isinstance(plant, AnyPlant) else None
+    return designed(_LoopShaping(back_off), _Shaped(G, first, last, shaped), judged)
+
+
+class _Shaped(NamedTuple):
+    """A plant with its shaping at u and at y, and all three in series."""
+
+    given: StateSpace
+    before: StateSpace
+    after: StateSpace
+    system: StateSpace
+
+
+class _Robust(NamedTuple):
+    """The controller of a shaped plant, its gamma, and the smallest gamma by two routes."""
+
+    K: StateSpace
+    gamma: float
+    least: float
+    other: float
+
+
+@dataclass(frozen=True)
+class _LoopShaping(Design):
+    """The central controller of the normalised coprime factors, at a distance from the least."""
+
+    back_off: float
+    name = "ncf"
+    hidden = "a zero of `before` or `after` lies on its pole"
+
+    def prepare(self, plant: _Shaped) -> Prepared:
+        g = plant.system
+        # the speed is that of the loop of least |y|^2 + |u|^2, feedthrough apart
+        image = bilinear(g, 1.0 / g.dt) if g.dt else g
+        A, B, C = image.A, image.B, image.C
+        hamiltonian = np.block([[A, -B @ B.T], [-C.T @ C, -A.T]])
+        poles = np.linalg.eigvals(balanced_matrix(hamiltonian)).astype(complex)
+        return prepared(_four_blocks(g), g.inputs, g.outputs, speed=mean_speed(poles))
+
+    def solve(self, problem: Prepared) -> _Robust:
+        return _robust(problem, self.back_off)
+
+    def restore(self, plant: _Shaped, problem: Prepared, found: _Robust) -> StateSpace:
+        K, G = series(series(plant.after, found.K), plant.before), plant.given
+        return K.replace(inputs=G.outputs, outputs=G.inputs, name=self.name, units=G.units)
+
+    def certify(self, solution: Solution) -> Controller:
+        plant, _, whole, (K, gamma, least, other) = solution
+        loop = lft(_four_blocks(plant.system), K)
+        stable, margin = required_stability(loop, _HIDDEN), 1.0 / peak_gain(loop)[0]
+        required_stability(lft(_four_blocks(plant.given), whole), _HIDDEN)
+        if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
+            cause = (
+                "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
+                "size 1, and leave out states that are hardly reached or seen"
+                if least < _LARGEST_GAMMA
+                else "no controller has more than a tiny margin. The delay or the resonances allow "
+                "no loop of that bandwidth: lower it"
+            )
+            raise CertificateError(
+                f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} "
+                f"was claimed, the smallest gamma is {least:.6g} by the Riccati equations and "
+                f"{other:.6g} by the Hankel norm of the factors: {cause}."
+            )
+        limit = (1.0 - AGREEMENT) / gamma
+        found = (
+            Verified("margin", margin, "gain of four blocks", limit, at_least=True),
+            Verified(
+                "smallest gamma", other, "Hankel norm of the factors", least * (1 + AGREEMENT)
+            ),
+            stability_check(stable, plant.system.dt),
+            Verified("modulus margin", modulus_margin((plant.given, whole))),
+        )
+        return Controller(
+            whole,
+            "loop shaping by normalised coprime factors",
+            gamma=1.0 / margin,
+            lower=least,
+            certificate=Certificate(found),
+        )
 
 
 def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> float:
@@ -157,122 +233,40 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     0.7071
     """
     G = plant.Gyu if isinstance(plant, AnyPlant) else as_statespace(plant)
-    return loop_margin(G, as_statespace(controller))[0]
-
-
-def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
-    """Return 1 / the norm of the loop, 0 when unstable, and its stability."""
-    loop = _four_block(G, K)
-    found = stability(loop.poles(), loop.dt)
-    if not found < (1.0 if loop.dt else 0.0):
-        return 0.0, found
-    return 1.0 / peak_gain(loop)[0], found
-
-
-def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
-    """Return ``[K; I] (I - G K)^-1 [I, G]``."""
+    K = as_statespace(controller)
     p, m = len(G.outputs), len(G.inputs)
     if (len(K.inputs), len(K.outputs)) != (p, m):
         raise ModelError(
             f"the controller has {len(K.inputs)} inputs and {len(K.outputs)} outputs, the plant "
             f"{p} y and {m} u: pass the K of u = K y for this plant."
         )
-    # noise adds to y and a force to what u moves; u itself is seen without the force
-    u, moved, y = numbered("u", m), numbered("v", m), numbered("y", p)
-    C, D = np.vstack([K.C, K.C]), np.vstack([K.D, K.D])
-    law = K.replace(C=C, D=D, inputs=y, outputs=[*u, *moved], units={})
-    plant = G.replace(inputs=moved, outputs=y, units={})
-    return connect([plant, law], [*y, *moved], [*u, *y], adding=[*y, *moved])
+    loop = lft(_four_blocks(G), K.replace(inputs=G.outputs, outputs=G.inputs, units={}))
+    return 1.0 / peak_gain(loop)[0] if loop.is_stable else 0.0
 
 
-def verified_controller(
-    shaped: StateSpace, back_off: float
-) -> tuple[StateSpace, float, Certificate]:
-    """Return the controller of a shaped plant, the smallest gamma, and what was verified."""
-    problem = _four_blocks_of(shaped)
-    K, gamma, least, other = _robust(problem, back_off)
-    margin, least_stable = loop_margin(shaped, K)
-    if not margin:
-        raise hidden_mode(shaped, K)
-    if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
-        cause = (
-            "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
-            "size 1, and leave out states that are hardly reached or seen"
-            if least < _LARGEST_GAMMA
-            else "no controller has more than a tiny margin. The delay or the resonances allow no "
-            "loop of that bandwidth: lower it"
-        )
-        raise CertificateError(
-            f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
-            f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
-            f"by the Hankel norm of the factors: {cause}."
-        )
-    found = (
-        Verified("margin", margin, "gain of four blocks", (1.0 - AGREEMENT) / gamma, at_least=True),
-        Verified("smallest gamma", other, "Hankel norm of the factors", least * (1.0 + AGREEMENT)),
-        stability_check(least_stable, shaped.dt),
-    )
-    return K, least, Certificate(found)
-
-
-def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
-    """Return the error for a loop that is not stable: its worst pole, and what misses that mode."""
-    poles = _four_block(G, K).poles()
-    pole = complex(poles[int(np.argmax(np.abs(poles) if G.dt else poles.real))])
-    speed = abs(np.log(pole)) / G.dt if G.dt and pole else abs(pole)
-    # eigenvalues of integrators come out close to zero, not at zero
-    rounding = 1e-9 * (1.0 / G.dt if G.dt else float(np.abs(poles).max()))
-    speed = speed if speed > rounding else 0.0
-    shifted = G.A - pole * np.eye(G.n_states)
-    reached = float(la.svdvals(np.hstack([shifted, G.B]))[-1]) if G.n_states else 1.0
-    seen = float(la.svdvals(np.vstack([shifted, G.C]))[-1]) if G.n_states else 1.0
-    missed = (
-        f"not reached by {', '.join(G.inputs)}"
-        if reached < seen
-        else f"not seen in {', '.join(G.outputs)}"
-    )
-    return AssumptionError(
-        f"the loop keeps a pole at {speed / (2.0 * np.pi):.4g} Hz that is not stable: a mode that "
-        f"is undamped, integrating or unstable is {missed}, or hidden by the shaping (a zero of "
-        "`before` or `after` on its pole, or an integrator on a zero of the plant). Move that "
-        "zero, or add an actuator or a sensor."
-    )
-
-
-def numbered(kind: str, count: int) -> list[str]:
-    """Return the names of channels of one kind."""
-    return [f"{kind}{i}" for i in range(count)]
-
-
-def _four_blocks_of(shaped: StateSpace) -> Prepared:
-    """Return the problem ``[n; f; u] -> [y; u; y]`` of a shaped plant, y with n and u with f."""
-    p, m = shaped.D.shape
-    u, y = shaped.inputs, shaped.outputs
-    seen = np.hstack([np.eye(p), shaped.D, shaped.D])
+def _four_blocks(g: StateSpace) -> StateSpace:
+    """Return ``[n; f; u] -> [y; u; y]`` of a plant, y with n and u with f."""
+    p, m = g.D.shape
+    seen = np.hstack([np.eye(p), g.D, g.D])
     moved = np.hstack([np.zeros((m, p + m)), np.eye(m)])
-    whole = StateSpace(
-        shaped.A,
-        np.hstack([np.zeros((shaped.n_states, p)), shaped.B, shaped.B]),
-        np.vstack([shaped.C, np.zeros((m, shaped.n_states)), shaped.C]),
+    w, z = (inner_names((f"{k}{i}" for i in range(p + m)), g.inputs + g.outputs) for k in "wz")
+    return StateSpace(
+        g.A,
+        np.hstack([np.zeros((g.n_states, p)), g.B, g.B]),
+        np.vstack([g.C, np.zeros((m, g.n_states)), g.C]),
         np.vstack([seen, moved, seen]),
-        shaped.dt,
-        inputs=[*inner_names(numbered("w", p + m), u), *u],
-        outputs=[*inner_names(numbered("z", p + m), y), *y],
+        g.dt,
+        inputs=[*w, *g.inputs],
+        outputs=[*z, *g.outputs],
     )
-    # its speed is that of the loop of least |y|^2 + |u|^2, feedthrough apart
-    g = bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
-    hamiltonian = np.block([[g.A, -g.B @ g.B.T], [-g.C.T @ g.C, -g.A.T]])
-    poles = np.linalg.eigvals(balanced_matrix(hamiltonian)).astype(complex)
-    return prepared(whole, u, y, speed=mean_speed(poles))
 
 
-def _robust(p: Prepared, back_off: float) -> tuple[StateSpace, float, float, float]:
-    """Return the controller, its gamma, and the smallest gamma by two routes."""
+def _robust(p: Prepared, back_off: float) -> _Robust:
+    """Return the controller of the shaped plant."""
     control, estimate = both_sides(p)
     try:
         (X, F), (Z, Ht) = control.least_squares(), estimate.least_squares()
     except (OnAxisError, SolverError, la.LinAlgError) as error:
-        require_reach(p, "a zero of `before` or `after` lies on its pole")
         raise AssumptionError(
             f"no normalised coprime factors of the shaped plant were found: {error}"
         ) from error
@@ -291,7 +285,7 @@ def _robust(p: Prepared, back_off: float) -> tuple[StateSpace, float, float, flo
     drive, sight = np.hstack([B + H @ D, H]), la.solve_triangular(root, C, lower=True)
     factors = StateSpace(p.A + H @ C, drive, sight, np.zeros((len(sight), drive.shape[1])))
     other = float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))
-    return K, gamma, least, other
+    return _Robust(K, gamma, least, other)
 
 
 def require_model(plant: object) -> None:
