@@ -268,19 +268,9 @@ def posed(
                 f"{what} needs channels w, z, u and y, got a plant without {name} "
                 f"({others}). Add a channel {name} ({role})."
             )
-    _require_body(plant, what)
-    return plant
-
-
-def _require_body(plant: AnyPlant, what: str) -> None:
     if plant.modal_blocks.size:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), what)
-
-
-def require_stabilisable(plant: AnyPlant, problem: Prepared, what: str) -> None:
-    """Raise AssumptionError, naming mode and channels, when no controller stabilises a plant."""
-    _require_body(plant, what)
-    require_reach(problem)
+    return plant
 
 
 def require_reach(problem: Prepared, hidden: str = "") -> None:

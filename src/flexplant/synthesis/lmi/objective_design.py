@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,12 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...tolerances import TINY
-from ..controller import AGREEMENT, Controller, with_left_out
+from ..controller import AGREEMENT, Controller
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
-from ..preparation import posed, prepared, require_stabilisable
+from ..pipeline import Design, Solution, designed
+from ..preparation import posed, require_reach
 from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
@@ -106,34 +108,55 @@ def design_lmi(
     """
     given = posed(plant, u, y, "synthesis by LMIs")
     _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
-    require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
-    require_reachable(given, subject_to)
-    scaled = _balanced_plant(given)
-    problem = ObjectivePrograms(given, scaled, minimize, tuple(subject_to))
-    claim, rate = _best_rate(problem)
-    failures: list[Exception] = []
-    own_back_off = positive(back_off, "back_off")
-    for factor in (*(1.0 + own_back_off * looser for looser in _LOOSER), *_FARTHER):
-        bound = factor * claim
-        try:
-            K = problem.controller(bound, rate)
-            reached = _verified_values(given, K, minimize, subject_to)
-        except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
-            failures.append(error)
-            continue
-        answer = Controller(
+    design = _ObjectiveDesign(minimize, tuple(subject_to), positive(back_off, "back_off"))
+    return designed(design, given, given)
+
+
+@dataclass(frozen=True)
+class _ObjectiveDesign(Design):
+    """The least bound of a norm with one Lyapunov matrix, other norms kept below theirs."""
+
+    minimize: Any
+    subject_to: tuple[Any, ...]
+    back_off: float
+
+    def prepare(self, plant: AnyPlant) -> ObjectivePrograms:
+        require_reach(super().prepare(plant))
+        require_reachable(plant, self.subject_to)
+        return ObjectivePrograms(plant, _balanced_plant(plant), self.minimize, self.subject_to)
+
+    def solve(self, problem: ObjectivePrograms) -> tuple[StateSpace, float, float]:
+        # the controller, the optimum of the LMIs, and the bound that it was found for
+        claim, rate = _best_rate(problem)
+        failure: Exception | None = None
+        for factor in (*(1.0 + self.back_off * looser for looser in _LOOSER), *_FARTHER):
+            try:
+                K = problem.controller(factor * claim, rate)
+                _verified_values(problem.given, K, self.minimize, self.subject_to)
+                return K, claim, factor * claim
+            # next to the optimum gains have no bound, and the distance that is needed is not known
+            except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
+                failure = error
+        raise CertificateError(
+            f"the LMIs claim {claim:.6g}, but no controller kept all bounds: {failure} Loosen "
+            "bounds, add a little noise to each sensor, or raise back_off."
+        )
+
+    def restore(self, plant: AnyPlant, problem: ObjectivePrograms, found: Any) -> StateSpace:
+        K: StateSpace = found[0]
+        return K
+
+    def certify(self, solution: Solution) -> Controller:
+        plant, _, K, (_, claim, bound) = solution
+        reached = _verified_values(plant, K, self.minimize, self.subject_to)
+        return Controller(
             K,
             "several objectives by LMIs",
-            gamma=reached[repr(minimize)],
+            gamma=reached[repr(self.minimize)],
             certificate=Certificate.of({"LMI optimum": claim, "LMI bound": bound})
             | Certificate.of(reached, route="the closed loop"),
             reached=reached,
         )
-        return with_left_out(answer, given)
-    raise CertificateError(
-        f"the LMIs claim {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
-        "bounds, add a little noise to each sensor, or raise back_off."
-    )
 
 
 def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most: int) -> None:

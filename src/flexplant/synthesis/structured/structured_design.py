@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple, TypeAlias
 
@@ -18,16 +19,11 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...seeds import MOST, Rng, generator
 from ...tolerances import SAME, TINY
-from ..controller import (
-    Controller,
-    certified_norm,
-    reached_norms,
-    required_stability,
-    with_left_out,
-)
+from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf, PeakGain
-from ..preparation import Prepared, posed, prepared, require_reach
+from ..pipeline import Design, Solution, designed
+from ..preparation import Prepared, posed, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .measured_objective import MeasuredObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
@@ -161,67 +157,93 @@ def design_structured(
             "synthesis.FixedOrder(2)."
         )
     starts, random = whole(starts, "starts", maximum=MOST), generator(rng)
-    evaluations = whole(evaluations, "evaluations")
-    problems = [prepared(one.system, one.u, one.y) for one in plants]
-    for problem in problems:
-        require_reach(problem)
-    family = structure.family(plants[0], problems[0])
-    objectives = _objectives(objective)
-    if not plants[0].dt:
-        _require_no_feedthrough(family, plants[0], objectives)
-    kind = _measure_word(objectives)
-    plain = kind == "H-infinity"
+    search = starts, random, whole(evaluations, "evaluations"), progress
+    design = _Structured(structure, _objectives(objective), moving, *search)
+    return designed(design, plants, plants[0])
 
-    def judging(order: int) -> _Judged:
-        return [
-            (judge, one.below or 1.0)
-            for plant in plants
-            for one in objectives
-            for judge in one.judges(plant, order)
-        ]
 
-    search = _StructureSearch(family, problems, evaluations, None if plain else judging)
-    with Progress(starts + _CONTINUED, "starts of the search", progress=progress) as bar:
-        found = search.best(starts, random, bar)
-    final = family.structure(found.x)
-    K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
-    K = K.replace(name="structured", units=plants[0].units)
-    closed = [lft(one.system, K) for one in plants]
-    claim = _end_norm(found)
-    each = [_verified_loop(*pair, objectives, claim) for pair in zip(plants, closed, strict=True)]
-    norms = [one["norm"] for one in each]
-    worst = int(np.argmax(norms))
-    if not abs(norms[worst] - claim) <= _AGREEMENT * claim:
-        raise CertificateError(
-            f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
-            f"{claim:.6g} by the search: {_blame(objectives)}."
+@dataclass(frozen=True)
+class _Structured(Design):
+    """The least norm that is found from several starts, by the parameters of a structure."""
+
+    structure: ControllerStructure
+    objectives: list[LoopObjective]
+    moving: PlantRange | None
+    starts: int
+    rng: np.random.Generator
+    evaluations: int
+    progress: bool | None
+    name = "structured"
+
+    def prepare(self, plant: list[AnyPlant]) -> _StructureSearch:
+        problems = [super(_Structured, self).prepare(one) for one in plant]
+        for problem in problems:
+            require_reach(problem)
+        family = self.structure.family(plant[0], problems[0])
+        if not plant[0].dt:
+            _require_no_feedthrough(family, plant[0], self.objectives)
+
+        def judging(order: int) -> _Judged:
+            return [
+                (judge, objective.below or 1.0)
+                for one in plant
+                for objective in self.objectives
+                for judge in objective.judges(one, order)
+            ]
+
+        given = None if _measure_word(self.objectives) == "H-infinity" else judging
+        return _StructureSearch(family, problems, self.evaluations, given)
+
+    def solve(self, problem: _StructureSearch) -> _End:
+        steps = self.starts + _CONTINUED
+        with Progress(steps, "starts of the search", progress=self.progress) as bar:
+            return problem.best(self.starts, self.rng, bar)
+
+    def restore(self, plant: list[AnyPlant], problem: _StructureSearch, found: _End) -> StateSpace:
+        one = plant[0]
+        K = as_system(problem.family.matrices(found.x), (one.y, one.u), one.dt)
+        return K.replace(name=self.name, units=one.units)
+
+    def certify(self, solution: Solution) -> Controller:
+        plants, search, K, found = solution
+        claim, kind = _end_norm(found), _measure_word(self.objectives)
+
+        def on(plant: AnyPlant, claim: float = np.inf) -> Certificate:
+            return _verified_loop(plant, lft(plant.system, K), self.objectives, claim)
+
+        each = [on(plant, claim) for plant in plants]
+        norms = [one["norm"] for one in each]
+        worst = int(np.argmax(norms))
+        if not abs(norms[worst] - claim) <= _AGREEMENT * claim:
+            raise CertificateError(
+                f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
+                f"{claim:.6g} by the search: {_blame(self.objectives)}."
+            )
+        radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
+        slope, decrease = decrease_left(search.pieces(found.x), radius)
+        certificate = each[worst] | {"slope": slope, "radius": radius}
+        certificate |= Certificate((Verified("decrease left", decrease, "a linear model", _SHORT),))
+        if self.moving is not None:
+            certificate |= self.moving.certified(lambda plant: on(plant)["norm"], norms)
+        elif len(plants) > 1:
+            certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
+        notes = search.notes
+        if decrease > _SHORT:
+            notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
+        final, loop = search.family.structure(found.x), lft(plants[worst].system, K)
+        reached = (
+            reached_norms(plants[worst], loop, responder(loop)) if kind == "H-infinity" else {}
         )
-    loop = closed[worst]
-    reached = reached_norms(plants[worst], loop, responder(loop)) if plain else {}
-    radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
-    slope, decrease = decrease_left(search.pieces(found.x), radius)
-    certificate = each[worst] | {"slope": slope, "radius": radius}
-    certificate |= Certificate((Verified("decrease left", decrease, "a linear model", _SHORT),))
-    if moving is not None:
-        certificate |= moving.certified(
-            lambda one: _verified_loop(one, lft(one.system, K), objectives, np.inf)["norm"], norms
+        return Controller(
+            K,
+            f"{kind} of structure {(self.structure if final is None else final)!r}",
+            gamma=norms[worst],
+            certificate=certificate,
+            reached=reached,
+            notes=notes,
+            structure=final,
+            tried=search.tried,
         )
-    elif len(plants) > 1:
-        certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
-    notes = search.notes
-    if decrease > _SHORT:
-        notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
-    answer = Controller(
-        K,
-        f"{kind} of structure {(structure if final is None else final)!r}",
-        gamma=norms[worst],
-        certificate=certificate,
-        reached=reached,
-        notes=notes,
-        structure=final,
-        tried=search.tried,
-    )
-    return with_left_out(answer, plants[0])
 
 
 def _blame(objectives: Sequence[LoopObjective]) -> str:
