@@ -249,7 +249,7 @@ def _four_blocks(g: StateSpace) -> StateSpace:
     p, m = g.D.shape
     seen = np.hstack([np.eye(p), g.D, g.D])
     moved = np.hstack([np.zeros((m, p + m)), np.eye(m)])
-    w, z = (inner_names((f"{k}{i}" for i in range(p + m)), g.inputs + g.outputs) for k in "wz")
+    w, z = (inner_names((f"{k}{i}" for i in range(p + m)), (*g.inputs, *g.outputs)) for k in "wz")
     return StateSpace(
         g.A,
         np.hstack([np.zeros((g.n_states, p)), g.B, g.B]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple, TypeAlias
 
@@ -30,7 +31,7 @@ from ...plant import AnyPlant, StandardPlant
 from ...plant.uncertainty.delta_blocks import FullBlock
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import ROUNDING
-from ..controller import Controller, SynthesisMethod, with_left_out
+from ..controller import Controller, SynthesisMethod
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import quick_answer
 from ..hinf.tolerated_modes import (
@@ -40,6 +41,7 @@ from ..hinf.tolerated_modes import (
     rebalanced,
     with_mode_channels,
 )
+from ..pipeline import Design, Solution, designed
 from ..preparation import prepared
 from .performance_bounds import performance_bound
 from .uncertain_loops import (
@@ -137,26 +139,84 @@ def design_mu(
     require_uncertain(uncertain)
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
+    given = w, z, method, most, states, progress
     if uncertain.is_of_frequencies:
-        answer = _by_mode_channels(uncertain, w, z, most, method, progress)
-        if answer is not None:
-            return with_left_out(answer, uncertain.plant)
-    steps = _filter_steps(uncertain, w, z, method, most, states)
-    best, found = _best_step(steps, most + 1, _SETTLED, progress)
-    if best is None:
-        raise SolverError("no step of the D-K iteration gave a controller. Report it.")
-    answer = Controller(
-        best.controller,
-        f"D-K iteration, {counted(len(found), 'step')}",
-        gamma=best.mu,
-        certificate=Certificate.of({"mu": best.mu, "at Hz": best.freq} | found, route=STEPS_OF_MU),
-    )
-    return with_left_out(answer, uncertain.plant)
+        with attempted(
+            "mode by mode", _NoStepError
+        ):  # the general way shows what one channel does not
+            return designed(_ModeIteration(*given), uncertain, uncertain.plant)
+    return designed(_DkIteration(*given), uncertain, uncertain.plant)
+
+
+class _NoStepError(SolverError):
+    """No step of an iteration gave a controller."""
+
+
+@dataclass(frozen=True)
+class _DkIteration(Design):
+    """H-infinity controllers for scaled Deltas, and scales for each controller, in turn."""
+
+    w: Any
+    z: Any
+    method: SynthesisMethod | None
+    most: int
+    order: int
+    progress: bool | None
+
+    def prepare(self, plant: UncertainPlant[Any]) -> UncertainPlant[Any]:
+        return plant  # each step prepares a problem of its own
+
+    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, dict[str, float]]:
+        steps = _filter_steps(problem, self.w, self.z, self.method, self.most, self.order)
+        return _best_step(steps, self.most + 1, _SETTLED, self.progress)
+
+    def restore(self, plant: UncertainPlant[Any], problem: Any, found: Any) -> StateSpace:
+        K: StateSpace = found[0].controller
+        return K
+
+    def certify(self, solution: Solution) -> Controller:
+        best, found = solution.found
+        figures = {"mu": best.mu, "at Hz": best.freq} | found
+        return Controller(
+            solution.K,
+            f"D-K iteration, {counted(len(found), 'step')}",
+            gamma=best.mu,
+            certificate=Certificate.of(figures, route=STEPS_OF_MU),
+        )
+
+
+class _ModeIteration(_DkIteration):
+    """The same with one channel a mode and constant scales."""
+
+    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, dict[str, float]]:
+        # step k solves the H-infinity problem of Deltas and weights divided by the mu of the step
+        # before: at a fixed point the norm is 1 and mu what it was divided by
+        weighted = _performance_plant(problem.plant, self.w, self.z)
+        try:
+            stated = mode_channels(weighted, problem)
+        except AssumptionError as error:  # no disturbance moves them: no D to begin
+            raise _NoStepError(str(error)) from error
+        steps = _mode_steps(weighted, stated, self.method, self.most)
+        best, found = _best_step(steps, self.most, _SETTLED_BY_MODES, self.progress)
+        if not np.isfinite(best.mu):
+            raise _NoStepError("the bound of one channel a mode shows no controller.")
+        return best, found
+
+    def certify(self, solution: Solution) -> Controller:
+        best, found = solution.found
+        ratio = _corner_ratio(solution.plant, best, self.w, self.z)
+        figures = {"mu": best.mu} | found | {"largest gain of machines over mu": ratio}
+        return Controller(
+            solution.K,
+            f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
+            gamma=best.mu,
+            certificate=Certificate.of(figures, route=STEPS_OF_MU),
+        )
 
 
 def _best_step(
     steps: Iterator[_DkStep], most: int, settled: float, progress: bool | None
-) -> tuple[_DkStep | None, dict[str, float]]:
+) -> tuple[_DkStep, dict[str, float]]:
     """Return the step of the smallest mu, and mu of each; they end where mu falls no further."""
     best: _DkStep | None = None
     found: dict[str, float] = {}
@@ -173,6 +233,8 @@ def _best_step(
         except FlexplantError:
             if best is None:
                 raise
+    if best is None:
+        raise _NoStepError("no step of the D-K iteration gave a controller. Report it.")
     return best, found
 
 
@@ -311,37 +373,6 @@ def inverse(g: StateSpace) -> StateSpace:
     """Return the inverse of a filter of one input and output with feedthrough."""
     d = 1.0 / g.D[0, 0]
     return g.replace(A=g.A - d * g.B @ g.C, B=d * g.B, C=-d * g.C, D=[[d]], blocks=None)
-
-
-def _by_mode_channels(
-    uncertain: UncertainPlant[Any],
-    w: Any,
-    z: Any,
-    most: int,
-    method: SynthesisMethod | None,
-    progress: bool | None,
-) -> Controller | None:
-    """Return the controller of the smallest mu over the steps; None where no step shows any."""
-    # step k solves the H-infinity problem of Deltas and weights divided by the mu of the step
-    # before: at a fixed point the norm is 1 and mu what it was divided by
-    plant = uncertain.plant
-    weighted = _performance_plant(plant, w, z)
-    stated = None
-    with attempted("mode by mode", AssumptionError):  # no disturbance moves them: no D to begin
-        stated = mode_channels(weighted, uncertain)
-    if stated is None:
-        return None
-    steps = _mode_steps(weighted, stated, method, most)
-    best, found = _best_step(steps, most, _SETTLED_BY_MODES, progress)
-    if best is None or not np.isfinite(best.mu):
-        return None
-    largest = {"largest gain of machines over mu": _corner_ratio(uncertain, best, w, z)}
-    return Controller(
-        best.controller,
-        f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
-        gamma=best.mu,
-        certificate=Certificate.of({"mu": best.mu} | found | largest, route=STEPS_OF_MU),
-    )
 
 
 def _mode_steps(
