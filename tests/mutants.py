@@ -25,7 +25,7 @@ SOURCE = TOP / "src" / "flexplant"
 #: module, right text, wrong text
 LINES = [
     ("structure/unit_systems.py", "self.mass / self.time, ", "self.mass, "),
-    ("lti/lyapunov.py", "if not residual <= RESIDUAL:", "if False:"),
+    ("lti/equations.py", "if not residual <= RESIDUAL:", "if False:"),
     ("lti/equations.py", "for term in (moved, bent, Q))) <= TYPED:", "for term in (Q,))) >= 0:"),
     ("lti/peaks.py", " + radius**3 * model.rest(centre, radius, 2)", ""),
     ("lti/peaks.py", "return centre[unsure[_largest(T0[unsure]) > level]], bound <= level",

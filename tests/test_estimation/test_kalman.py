@@ -20,7 +20,7 @@ from flexplant.errors import (
 )
 from flexplant.estimation import Filter, Smoother, design_kalman, kalman
 from flexplant.lti import StateSpace
-from flexplant.lti.lyapunov import difference_of
+from flexplant.lti.equations import difference_of
 from flexplant.lti.riccati import riccati_root
 from flexplant.modes import solve_modes
 from flexplant.placement import score_sensors

@@ -17,8 +17,16 @@ from ..errors import AssumptionError, CertificateError, ModelError, SolverError,
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.blocks_of_states import equal_matrices
-from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
-from ..lti.lyapunov import difference_of, dual_variances, solve_stein, stein_root
+from ..lti.equations import (
+    accumulated,
+    difference_of,
+    scale_of,
+    shifted_columns,
+    solve_stein,
+    stein,
+    sylvester,
+)
+from ..lti.lyapunov import dual_variances, stein_root
 from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System

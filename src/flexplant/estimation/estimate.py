@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IntArray, real_array
 from ..errors import LabelError, SolverError, counted, unknown_label, warn
 from ..lti.discretisation import Recursion
-from ..lti.equations import scale_of
-from ..lti.lyapunov import solve_stein
+from ..lti.equations import scale_of, solve_stein
 from ..parallel import PIECE, one_thread
 from ..store import Value
 from ..tolerances import TYPED

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import SolverError
-from ..lti.lyapunov import solve_stein, square_root
+from ..lti.equations import solve_stein, square_root
 from ..plant import AnyPlant
 from ..store import Value
 from .estimator_channels import poi_channels, sensors

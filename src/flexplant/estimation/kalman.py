@@ -10,7 +10,8 @@ import numpy as np
 from ..arrays import FloatArray
 from ..certificates import Certificate, Verified, stability_check
 from ..errors import CertificateError, ModelError, SolverError
-from ..lti.lyapunov import difference_of, dual_variances, solve_stein
+from ..lti.equations import difference_of, solve_stein
+from ..lti.lyapunov import dual_variances
 from ..lti.riccati import filter_dare, riccati_root
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace, System

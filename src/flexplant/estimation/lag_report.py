@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray, positive_array, whole
 from ..errors import AssumptionError, FlexplantError, aligned, require_known
-from ..lti.lyapunov import solve_stein
+from ..lti.equations import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant, Disturbance, standard_plant

@@ -11,8 +11,7 @@ from scipy.sparse import csgraph
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..lti.discretisation import Recursion
-from ..lti.equations import sylvester
-from ..lti.lyapunov import solve_stein
+from ..lti.equations import solve_stein, sylvester
 from ..tolerances import FOUR_DIGITS, RESIDUAL, ROUNDING, TYPED
 from .estimator_channels import Recorded
 from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root

@@ -22,13 +22,21 @@ from .diagram import (
     weighted_by_remainder,
 )
 from .line_weights import NARROW, PreparedLines, Rejected, mains_multiple
-from .model_error import NOISE, Disagreement, disagreement, outputs_disagree, strength, twin_poles
+from .model_error import (
+    NOISE,
+    Disagreement,
+    disagreement,
+    gain_due_of_pole,
+    outputs_disagree,
+    strength,
+    supported,
+    twin_poles,
+)
 from .pole_test import (
     UPPER,
     dropped,
     fewer_terms,
     gain_due_of_own_poles,
-    gain_due_of_pole,
     improved,
     merged,
     missed_poles,
@@ -36,7 +44,6 @@ from .pole_test import (
     relocated,
     shared,
     split_proposals,
-    supported,
     unexplained,
     unwindowed,
     warned,

@@ -1,4 +1,4 @@
-"""Model errors: outputs that disagree, and misfit that is smooth over frequency."""
+"""Noise or model error: outputs that disagree, smooth misfit, and poles that noise may explain."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
+from ..errors import SolverError
 from ..modes.matching import ALIKE, mac_matrix
-from ..tolerances import CERTAIN, MOST_STEPS, NEGLIGIBLE, TINY
-from .refine import PoleFit, scaled_inverse
+from ..tolerances import CERTAIN, CHANCE, MOST_STEPS, NEGLIGIBLE, TINY
+from .refine import Lines, PoleFit, pivoted, scaled_inverse
 
 #: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
 #: may be one resonance; one bandwidth where the weaker pole is the broader: the remainder of a
@@ -221,3 +222,65 @@ def random_effects(
     degrees = np.maximum(1.0, total**2 / np.sum(weight**2, axis=0) - 1.0)
     factor = np.where(extra > 0, stdtrit(degrees, 0.975) / 1.96, 1.0)
     return mean, np.sqrt(extra), factor / np.sqrt(total), weighted
+
+
+def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
+    """Remove, one by one, poles that noise may explain; SolverError when no pole remains."""
+    least = gain_due_of_pole(lines)
+    fit = pivoted(lines, poles, part)
+    kept, now = list(range(poles.size)), fit.cost
+    while len(kept) > 1:
+        rises = fit.rises(kept)
+        weakest = int(np.argmin(rises))
+        if rises[weakest] > least * max(1.0, now / lines.freedom(len(kept))):
+            break
+        kept.pop(weakest)
+        now += float(rises[weakest])
+    kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
+    if not kept:
+        raise SolverError(
+            f"no resonance between {lines.freq[0]:.4g} and {lines.freq[-1]:.4g} Hz exceeds the "
+            "noise: the poles of the diagram may be due to chance. Move or widen the "
+            "band, measure longer, or pick poles by hand with "
+            "identification.stabilisation_diagram(frf).select(freq=[...])."
+        )
+    return fit if len(kept) == poles.size else pivoted(lines, poles[kept], part[:, kept])
+
+
+def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int], k: int) -> bool:
+    """Return whether a pole narrower than the lines are apart is seen at more than two of them."""
+    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
+    if -poles[k].real > spacing:
+        return True
+    rest = [other for other in kept if other != k]
+    less, more = (PoleFit(lines, poles[some], part[:, some]).model for some in (rest, kept))
+    return corroborated(lines, less, more)
+
+
+def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
+    """Return whether lines other than the two with most gain confirm a pole."""
+    # by a chi-square test of four degrees of freedom, the pole and its size: a disturbance with a
+    # single frequency, or a variance that is too small there, changes other lines only by chance
+    before, after = (
+        np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
+        for model in (less, more)
+    )
+    gain = before - after
+    unit = max(1.0, float(np.sum(after)) / (2 * lines.data.size))
+    return float(np.sum(np.sort(gain)[:-2])) > unit * gain_due(lines, 4, CHANCE)
+
+
+def gain_due(lines: Lines, count: int, chance: float) -> float:
+    """Return the decrease of the cost by noise for additional parameters: a chi-square quantile."""
+    # correlated errors of neighbouring lines have `inflation` times the power of independent ones
+    from scipy.special import chdtri
+
+    return lines.inflation * float(chdtri(count, chance))
+
+
+def gain_due_of_pole(lines: Lines) -> float:
+    """Return the decrease of the cost that a pole anywhere in the band must reach."""
+    # its pole, shape and participation are 2 (n_out + n_in) numbers. A superfluous pole costs
+    # little; a missing pole biases its neighbours by up to the root of this
+    n_out, n_in, n_freq = lines.data.shape
+    return gain_due(lines, 2 * (n_out + n_in), CHANCE / n_freq)

@@ -7,7 +7,7 @@ import scipy.linalg as la
 
 from ..arrays import FloatArray, divisor
 from ..errors import ModelError, counted
-from ..lti.lyapunov import solve_lyapunov, solve_stein
+from ..lti.equations import solve_lyapunov, solve_stein
 from ..tolerances import NEGLIGIBLE, ROUNDING, TINY
 
 #: reached fraction of the wanted decay where several poles coincide, which rounding splits

@@ -65,6 +65,8 @@ from .conversions import descriptor as descriptor
 from .conversions import resampled as resampled
 from .delays import Delayed as Delayed
 from .discretisation import tustin as tustin
+from .equations import solve_lyapunov as solve_lyapunov
+from .equations import solve_stein as solve_stein
 from .filters import high_pass_filter as high_pass_filter
 from .filters import inverse_sensitivity as inverse_sensitivity
 from .filters import lead_lag_filter as lead_lag_filter
@@ -85,8 +87,6 @@ from .interconnection import parallel as parallel
 from .interconnection import series as series
 from .lyapunov import controllability_gramian as controllability_gramian
 from .lyapunov import observability_gramian as observability_gramian
-from .lyapunov import solve_lyapunov as solve_lyapunov
-from .lyapunov import solve_stein as solve_stein
 from .minimal_realisations import minimal as minimal
 from .modal import ModalForm as ModalForm
 from .modal import StableSplit as StableSplit

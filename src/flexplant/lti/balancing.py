@@ -11,8 +11,9 @@ from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..store import Value
 from ..tolerances import RANK
+from .equations import compressed
 from .interconnection import parallel, series
-from .lyapunov import compressed, controllability_factor, observability_factor
+from .lyapunov import controllability_factor, observability_factor
 from .modal import StableSplit, split_stable
 from .modal_map import obstacle
 from .norms import axis_peak, h2_norm, peak_gain

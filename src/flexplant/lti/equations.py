@@ -9,7 +9,8 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import ModelError, SolverError
-from ..tolerances import MOST_STEPS, PRECISION, SPLIT, TINY, TYPED
+from ..parallel import one_thread
+from ..tolerances import MOST_STEPS, PRECISION, RESIDUAL, SPLIT, TINY, TYPED
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
@@ -324,3 +325,131 @@ def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
 def symmetrised(X: FloatArray) -> FloatArray:
     """Return the symmetric part of a matrix."""
     return np.asarray(0.5 * (X + X.T))
+
+
+@one_thread()
+def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
+
+    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. With
+    the terms before cancellation ``T = |A| |X| |A'| + |Q|``, entry (i, j) of the residual is at
+    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        Spectral radius below one.
+    Q : (n, n) array
+        Symmetric.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
+
+    Raises
+    ------
+    SolverError
+        When A is not strictly stable, so that the series does not end, or the residual is too
+        large.
+
+    References
+    ----------
+    [Smith1968]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.solve_stein([[0.5]], [[3.0]]).round(9)  # x = x / 4 + 3
+    array([[4.]])
+    """
+    A, Q = _square_pair(A, Q)
+    if not A.size:
+        return Q
+    d = scale_of(accumulated(A, Q))
+    As, Qs = A * d / d[:, None], Q / d / d[:, None]
+    X = stein(As, Qs)
+    residual = np.abs(As @ X @ As.T + Qs - X)
+    terms = np.abs(As) @ np.abs(X) @ np.abs(As.T) + np.abs(Qs)
+    size = np.sqrt(terms.diagonal())
+    _check(float(np.max(residual * reciprocal(terms + np.outer(size, size)))), "X = A X A' + Q")
+    return X * d * d[:, None]
+
+
+@one_thread()
+def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of the Lyapunov equation ``A X + X A' + Q = 0``.
+
+    By Schur form (Bartels-Stewart) in scaled states, with one step of correction.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        All eigenvalues with negative real parts.
+    Q : (n, n) array
+        Symmetric.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
+
+    Raises
+    ------
+    ShapeError, ModelError, SolverError
+        As `solve_stein`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.solve_lyapunov([[-2.0]], [[4.0]]).round(9)  # -2 x - 2 x + 4 = 0
+    array([[1.]])
+    """
+    A, Q = _square_pair(A, Q)
+    if not A.size:
+        return Q
+    # balance A without Q: a chain of lags is solved to 1e-16 in these units, and to 1e-11 with Q
+    d = even_scale(A)
+    As, Qs = A * d / d[:, None], Q / d / d[:, None]
+    X = lyapunov(As, Qs)
+    size = 2 * float(np.linalg.norm(As) * np.linalg.norm(X))
+    _check(relative(As @ X + X @ As.T + Qs, size), "A X + X A' + Q = 0")
+    return X * d * d[:, None]
+
+
+def _square_pair(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    A = real_array(A, "A", (None, None))
+    return real_array(A, "A", (A.shape[0], A.shape[0])), symmetric(Q, "Q", A.shape[0])
+
+
+def _check(residual: float, equation: str) -> None:
+    if not residual <= RESIDUAL:
+        raise SolverError(
+            f"{equation}: the residual is {residual:.1e} of its terms, more than {RESIDUAL:.0e}. "
+            "A is too close to instability, or too badly conditioned, for double precision."
+        )
+
+
+def compressed(L: FloatArray) -> FloatArray:
+    """Return a factor with the same ``L L'`` and at most as many columns as rows."""
+    return triangular(L) if L.shape[1] > L.shape[0] else L
+
+
+def triangular(L: FloatArray) -> FloatArray:
+    """Return a lower triangular T with ``T T' = L L'``: exact for each row, whatever its size."""
+    return np.asarray(la.qr(L.T, mode="r")[0][: L.shape[0]].T)
+
+
+def square_root(X: FloatArray) -> FloatArray:
+    """Return L with ``L L' = X``, which is positive semidefinite apart from rounding."""
+    # by its eigenvectors, each row scaled to unit size before
+    size = divisor(np.sqrt(np.maximum(X.diagonal(), 0.0)))
+    values, vectors = np.linalg.eigh(symmetrised(X) / size / size[:, None])
+    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def difference_of(claim: FloatArray, truth: FloatArray) -> float:
+    """Return the largest relative difference of variances; without end where one is negative."""
+    if not np.all(claim >= 0) or not np.all(truth >= 0):
+        return np.inf
+    return float(np.max(np.abs(claim - truth) / divisor(truth), initial=0.0))

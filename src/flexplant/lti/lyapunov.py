@@ -1,4 +1,4 @@
-"""Stein and Lyapunov equations, and the Gramians that follow, also in factored form."""
+"""Gramians of systems, in full and in factored form, and what they need of Stein equations."""
 
 from __future__ import annotations
 
@@ -7,120 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, divisor, real_array
+from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import SolverError
 from ..parallel import one_thread
-from ..tolerances import MOST_STEPS, RESIDUAL, SETTLED
+from ..tolerances import MOST_STEPS, SETTLED
 from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
-from .equations import (
-    accumulated,
-    even_scale,
-    lyapunov,
-    reciprocal,
-    relative,
-    scale_of,
-    state_scale,
-    stein,
-    symmetric,
-    symmetrised,
-)
+from .equations import compressed, solve_lyapunov, solve_stein, state_scale, symmetrised, triangular
 from .modal_map import ModalMap
 from .statespace import StateSpace, System, as_statespace
-
-
-@one_thread()
-def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
-
-    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. With
-    the terms before cancellation ``T = |A| |X| |A'| + |Q|``, entry (i, j) of the residual is at
-    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``.
-
-    Parameters
-    ----------
-    A : (n, n) array
-        Spectral radius below one.
-    Q : (n, n) array
-        Symmetric.
-
-    Returns
-    -------
-    (n, n) array
-        Symmetric.
-
-    Raises
-    ------
-    SolverError
-        When A is not strictly stable, so that the series does not end, or the residual is too
-        large.
-
-    References
-    ----------
-    [Smith1968]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.lti.solve_stein([[0.5]], [[3.0]]).round(9)  # x = x / 4 + 3
-    array([[4.]])
-    """
-    A, Q = _square_pair(A, Q)
-    if not A.size:
-        return Q
-    d = scale_of(accumulated(A, Q))
-    As, Qs = A * d / d[:, None], Q / d / d[:, None]
-    X = stein(As, Qs)
-    residual = np.abs(As @ X @ As.T + Qs - X)
-    terms = np.abs(As) @ np.abs(X) @ np.abs(As.T) + np.abs(Qs)
-    size = np.sqrt(terms.diagonal())
-    _check(float(np.max(residual * reciprocal(terms + np.outer(size, size)))), "X = A X A' + Q")
-    return X * d * d[:, None]
-
-
-@one_thread()
-def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return X of the Lyapunov equation ``A X + X A' + Q = 0``.
-
-    By Schur form (Bartels-Stewart) in scaled states, with one step of correction.
-
-    Parameters
-    ----------
-    A : (n, n) array
-        All eigenvalues with negative real parts.
-    Q : (n, n) array
-        Symmetric.
-
-    Returns
-    -------
-    (n, n) array
-        Symmetric.
-
-    Raises
-    ------
-    ShapeError, ModelError, SolverError
-        As `solve_stein`.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.lti.solve_lyapunov([[-2.0]], [[4.0]]).round(9)  # -2 x - 2 x + 4 = 0
-    array([[1.]])
-    """
-    A, Q = _square_pair(A, Q)
-    if not A.size:
-        return Q
-    # balance A without Q: a chain of lags is solved to 1e-16 in these units, and to 1e-11 with Q
-    d = even_scale(A)
-    As, Qs = A * d / d[:, None], Q / d / d[:, None]
-    X = lyapunov(As, Qs)
-    size = 2 * float(np.linalg.norm(As) * np.linalg.norm(X))
-    _check(relative(As @ X + X @ As.T + Qs, size), "A X + X A' + Q = 0")
-    return X * d * d[:, None]
-
-
-def _square_pair(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    A = real_array(A, "A", (None, None))
-    return real_array(A, "A", (A.shape[0], A.shape[0])), symmetric(Q, "Q", A.shape[0])
 
 
 def controllability_gramian(sys: System) -> FloatArray:
@@ -226,14 +120,6 @@ def _modal_gramian(
     return symmetrised(padded[np.ix_(keep, keep)])
 
 
-def _check(residual: float, equation: str) -> None:
-    if not residual <= RESIDUAL:
-        raise SolverError(
-            f"{equation}: the residual is {residual:.1e} of its terms, more than {RESIDUAL:.0e}. "
-            "A is too close to instability, or too badly conditioned, for double precision."
-        )
-
-
 def controllability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``P = L L'``, the controllability Gramian of a stable system."""
     return _factor(g.A, g.B, g.C, g.dt)
@@ -250,16 +136,6 @@ def _factor(A: FloatArray, B: FloatArray, C: FloatArray, dt: float) -> FloatArra
     if dt:  # ``P = A P A' + B B'`` is that of the bilinear image
         A, B, *_ = bilinear_matrices((A, B, A[:0], B[:0]), 1.0)
     return d[:, None] * _hammarling(A, B)
-
-
-def compressed(L: FloatArray) -> FloatArray:
-    """Return a factor with the same ``L L'`` and at most as many columns as rows."""
-    return triangular(L) if L.shape[1] > L.shape[0] else L
-
-
-def triangular(L: FloatArray) -> FloatArray:
-    """Return a lower triangular T with ``T T' = L L'``: exact for each row, whatever its size."""
-    return np.asarray(la.qr(L.T, mode="r")[0][: L.shape[0]].T)
 
 
 def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -299,14 +175,6 @@ def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
     return compressed(np.hstack([L.real, L.imag]))
 
 
-def square_root(X: FloatArray) -> FloatArray:
-    """Return L with ``L L' = X``, which is positive semidefinite apart from rounding."""
-    # by its eigenvectors, each row scaled to unit size before
-    size = divisor(np.sqrt(np.maximum(X.diagonal(), 0.0)))
-    values, vectors = np.linalg.eigh(symmetrised(X) / size / size[:, None])
-    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
 @np.errstate(over="ignore", invalid="ignore")
 def stein_root(F: FloatArray, G: FloatArray) -> FloatArray:
     """Return L with ``L L'`` the sum of ``F^k G G' F'^k``, k = 0, 1, ..., by doubling."""
@@ -330,10 +198,3 @@ def dual_variances(F: FloatArray, G: FloatArray, rows: FloatArray, size: FloatAr
     size = divisor(size)
     F, G = F * size / size[:, None], G / size[:, None]
     return np.array([float(np.sum((stein_root(F.T, c[:, None]).T @ G) ** 2)) for c in rows * size])
-
-
-def difference_of(claim: FloatArray, truth: FloatArray) -> float:
-    """Return the largest relative difference of variances; without end where one is negative."""
-    if not np.all(claim >= 0) or not np.all(truth >= 0):
-        return np.inf
-    return float(np.max(np.abs(claim - truth) / divisor(truth), initial=0.0))

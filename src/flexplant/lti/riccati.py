@@ -36,8 +36,9 @@ from .equations import (
     state_scale,
     symmetric,
     symmetrised,
+    triangular,
 )
-from .lyapunov import stein_root, triangular
+from .lyapunov import stein_root
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,8 +17,7 @@ from ..store import rebuild
 from ..tolerances import CLOSE, SAME, TINY
 from ..words import check_names
 from .blocks_of_states import block_diagonal, block_eigenvalues, diagonal_blocks, uncoupled_run
-from .equations import state_scale
-from .lyapunov import compressed
+from .equations import compressed, state_scale
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -13,7 +13,7 @@ from ..arrays import FloatArray, positive
 from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
 from ..estimation.estimator_channels import sensors
-from ..lti.lyapunov import solve_stein, square_root
+from ..lti.equations import solve_stein, square_root
 from ..lti.riccati import control_dare
 from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace

@@ -16,8 +16,7 @@ import scipy.linalg as la
 from ..arrays import FloatArray, IntArray, divisor
 from ..errors import SolverError, attempted
 from ..estimation.filter_models import weigh
-from ..lti.equations import doubled, doubled_riccati, relative
-from ..lti.lyapunov import square_root
+from ..lti.equations import doubled, doubled_riccati, relative, square_root
 from ..lti.riccati import control_dare, riccati_root
 from ..store import Value
 from ..tolerances import RESIDUAL, SAME, SETTLED, TINY

@@ -17,8 +17,7 @@ import numpy as np
 from ..arrays import FloatArray, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, SolverError, counted, require_known
 from ..loop import ClosedLoop, ScheduledLoop
-from ..lti.equations import symmetrised
-from ..lti.lyapunov import solve_stein
+from ..lti.equations import solve_stein, symmetrised
 from ..lti.riccati import filter_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant

@@ -12,8 +12,8 @@ import scipy.linalg as la
 
 from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError
+from ...lti.equations import solve_lyapunov
 from ...lti.frequency_sweep import climbed_grid, local_maxima, resonance_grid
-from ...lti.lyapunov import solve_lyapunov
 from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
