@@ -81,14 +81,19 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
 
         None, what is empty, and words and flags that are the default are left out.
         """
-        shown = []
+        shown = ", ".join(f"{name}={text}" for name, text in self._stated().items())
+        return f"{type(self).__name__}({shown})"
+
+    def _stated(self) -> dict[str, str]:
+        """Return the text of each field that says something."""
+        shown = {}
         for field in fields(self):  # type: ignore[arg-type]
             value, unit = getattr(self, field.name), field.metadata.get("unit")
             usual = isinstance(value, bool | str) and value == field.default
             text = _field_text(value)
             if not usual and text not in ("None", "''", "[]", "{}"):
-                shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
-        return f"{type(self).__name__}({', '.join(shown)})"
+                shown[field.name] = f"{text}{' ' + unit if unit else ''}"
+        return shown
 
     if not TYPE_CHECKING:  # a type checker would take any attribute for known
 
@@ -113,8 +118,11 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         return sorted(n for n in public | set(self._fields()) if not n.startswith("_"))
 
     def _repr_html_(self) -> str:
-        """Return what notebooks show: the repr, laid out."""
-        return as_html(repr(self))
+        """Return what notebooks show: the repr, laid out, or a table of the fields."""
+        text, kind = repr(self), type(self).__name__
+        if text.startswith(f"{kind}("):
+            text = "\n  ".join([f"<{kind}>", *(f"{n}: {t}" for n, t in self._stated().items())])
+        return as_html(text)
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, str]:
         """Return what Jupyter shows: the repr, laid out, and the picture of kinds that have one."""

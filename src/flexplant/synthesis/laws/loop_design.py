@@ -54,7 +54,8 @@ class DesignedLoops(Value):
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
         lines = [f"<DesignedLoops of {axes}: {counted(self.system.n_states, 'state')}>"]
-        lines += [f"  {line}" for line in repr(self.report).splitlines()]
+        head, *axes_lines = repr(self.report).splitlines()
+        lines += [f"  {head[1:-1].removeprefix('LoopReport: ')}", *axes_lines]
         lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:
             lines.append(f"  with the truncated modes: {self.left_out.summary}")
