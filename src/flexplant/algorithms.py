@@ -98,7 +98,10 @@ shows of a unit of all axes. In these units the blocks are
 .. math:: \begin{bmatrix} W_S S & W_S P W_d \\ W_u K S & W_u K P W_d \end{bmatrix}
 
 with 1/W_S rising as f/f_c up to `peak`, W_u letting the efforts roll off from 6 f_c, and W_d =
-`disturbance` f0 at the actuators (a hundredth of it elsewhere, where actuators have noise). K P W_d
+`disturbance` f0 at the actuators (a hundredth of it elsewhere, where actuators have noise). Where
+the disturbances of w and the noise of actuators leave an axis at rest, every actuator gets a
+disturbance. Sensors of velocity (acceleration) do not show where the machine rests: W_S then has a
+high-pass of first (second) order at f_c. K P W_d
 is the complementary sensitivity T at u, and the weights of z are divided by
 ``peak disturbance effort``, so that gamma = 1 requires |T| < peak at u: with the default ratios
 this block decides, and gamma is how far the loop is from it. The controller lists what each block

@@ -9,6 +9,7 @@ from driven_kinds import table
 from flexplant.errors import LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response, high_pass_filter, low_pass_filter, tustin
 from flexplant.plant import StandardPlant, assemble_plant, standard_plant
+from judge import judged
 from stages import RATE, ports, some_modes
 
 FREQ = np.array([1.0, 50.0, 245.0, 700.0])
@@ -167,3 +168,39 @@ def test_disturbances_along_levers_have_sizes():
     found = fx.stage_weights(plant, 64.0)
     forces = [found.w[name] for name in found.w if name.startswith("air")]
     assert len(forces) == 4 and min(forces) > 0.0
+
+
+@pytest.mark.parametrize("rate", [0.0, RATE])
+def test_a_push_at_an_actuator_needs_no_noise(rate):
+    """A weight of `u1:disturbance` adds the channel: it moves what u1 moves, and no effort."""
+    plant = assemble_plant(some_modes(), ports())
+    plant = plant.discretized(rate, delay=1) if rate else plant
+    pushed = "u1:disturbance"
+    assert pushed not in plant.w
+    heavy = plant.weighted(w={pushed: 3.0})
+    assert heavy.w == (*plant.w, pushed)
+    gain = frequency_response(heavy.system, FREQ)
+    for name in (*heavy.z, *heavy.y):
+        wanted = 0.0 if name.endswith(":effort") else 3.0 * gain[name, "u1"]
+        np.testing.assert_allclose(gain[name, pushed], wanted + 0.0 * FREQ, rtol=1e-12)
+    # the channel follows the weights to another machine, and to another selection
+    assert pushed in heavy.around(plant).w and pushed not in heavy.select(u=["u2"]).w
+    with pytest.raises(LabelError, match="u9:disturbance"):
+        plant.weighted(w={"u9:disturbance": 1.0})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("noisy", [True, False])
+def test_tables_with_geophones_are_damped(seed, noisy):
+    """Velocities do not show where a table rests: gamma is near 1, not the stiffness it lacks."""
+    plant = table(np.random.default_rng([7000 + seed, 4]))
+    drawn = plant.assembled.ports
+    if not noisy:  # one push at the payload leaves axes at rest: disturbances at u are added
+        held = fx.Disturbance("pull", at="2:z", asd=0.01)
+        plant = plant.with_ports(drawn.replace(w=[held]))
+    weights = fx.stage_weights(plant, 8.0)
+    assert noisy or set(weights.w) > {f"{name}:disturbance" for name in plant.u}
+    law = fx.design_hinf(plant.weighted(weights))
+    assert law.gamma < 1.5
+    assert judged(plant, law).together > 0.4

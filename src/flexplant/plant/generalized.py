@@ -157,7 +157,8 @@ class GeneralizedPlant(PartitionedSystem):
             else:
                 z, w = map(dict, step)  # a selection may have taken channels away
                 kept = {name: weight for name, weight in z.items() if name in found.z}
-                found = weighted(found, kept, {n: own for n, own in w.items() if n in found.w})
+                known = {*found.w, *pushes(found)}
+                found = weighted(found, kept, {n: own for n, own in w.items() if n in known})
         return found  # type: ignore[no-any-return]
 
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
@@ -256,15 +257,16 @@ def both_weights(
 
 
 def weighted(plant: PartitionedSystem, z: Any, w: Any) -> GeneralizedPlant:
-    """Return ``W_z P W_w``; a weight None drops its channel."""
+    """Return ``W_z P W_w``; a weight None drops its channel, one of a push at u adds it."""
     z, w = _mapping(z, "z"), _mapping(w, "w")
-    for side, weights in (("z", z), ("w", w)):
-        require_known(f"channel of {side}", weights, getattr(plant, side))
+    added = [name for name in pushes(plant) if w.get(name) is not None]
+    require_known("channel of z", z, plant.z)
+    require_known("channel of w", w, [*plant.w, *pushes(plant)])
     keep_z = [name for name in plant.z if name not in z or z[name] is not None]
-    keep_w = [name for name in plant.w if name not in w or w[name] is not None]
+    keep_w = [name for name in (*plant.w, *added) if name not in w or w[name] is not None]
     if not keep_z or not keep_w:
         raise ModelError("all of z or w was left out: keep at least one channel of each.")
-    inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
+    inner = _pushed(plant.system, added).select([*keep_z, *plant.y], [*keep_w, *plant.u])
     before, after = (
         append(
             *(_weight(plant, side.get(name, 1.0), name) for name in kept), _identity(plant, rest)
@@ -277,6 +279,26 @@ def weighted(plant: PartitionedSystem, z: Any, w: Any) -> GeneralizedPlant:
         system.replace(name=plant.system.name), tuple(keep_w), plant.u, tuple(keep_z), plant.y, {},
         plant.machine, (*_steps(plant), step),
     )  # fmt: skip
+
+
+def pushes(plant: PartitionedSystem) -> dict[str, str]:
+    """Return the actuators of the disturbances `u1:disturbance` that are not channels of w."""
+    own = {f"{name}:disturbance": name for name in plant.u}
+    return {channel: name for channel, name in own.items() if channel not in plant.w}
+
+
+def _pushed(system: StateSpace, added: Sequence[str]) -> StateSpace:
+    """Return a system with disturbances that add to the commands of actuators."""
+    if not added:
+        return system
+    own = system.input_index([name.removesuffix(":disturbance") for name in added])
+    direct = system.D[:, own]
+    direct[[name.endswith(":effort") for name in system.outputs]] = 0.0  # an effort is a command
+    return system.replace(
+        B=np.hstack([system.B, system.B[:, own]]),
+        D=np.hstack([system.D, direct]),
+        inputs=[*system.inputs, *added],
+    )
 
 
 def _dropped(plant: PartitionedSystem, side: str, names: Sequence[str] | None) -> dict[str, None]:

@@ -131,7 +131,8 @@ class StandardPlant(Partition):
         z, w : mapping {name: weight}
             A weight is a number or a system with one input and one output, with the plant's dt or
             continuous (then it is sampled at the plant's rate by Tustin). None removes the channel;
-            channels that are not named are unchanged.
+            channels that are not named are unchanged. A weight of `u1:disturbance` of w adds this
+            disturbance at the actuator u1 if the actuator has no noise.
 
         Returns
         -------

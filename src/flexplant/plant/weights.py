@@ -11,12 +11,12 @@ import numpy as np
 from ..arrays import divisor, positive, whole
 from ..errors import AssumptionError, ModelError, require_known
 from ..lti.discretisation import tustin
-from ..lti.filters import inverse_sensitivity, lead_lag_filter
+from ..lti.filters import high_pass_filter, inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..store import Value
 from ..tolerances import SAME
-from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
+from .axes import DrivenAxes, apart, driven_axes, real_gain, resting_frequency
 from .building import at_rate
 from .port import DERIVATIVES
 from .rest_expansion import followed_at_rest
@@ -208,6 +208,9 @@ def stage_weights(
         )
     sizes = _Sizes.of(machine, driven_axes(machine, freq=crossing, poi=poi), 2.0 * np.pi * crossing)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
+    order = min(sensor.order for sensor in ports.y)
+    if order:  # velocities and accelerations do not show where the machine rests
+        sense = series(sense, high_pass_filter(crossing, order=order, gain=np.sqrt(2.0)))
     unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u relative to peak
     axes = {(p, axis): p.channel(axis) for p in ports.z for axis in p.axes}
     z: dict[str, Any] = {}
@@ -222,7 +225,7 @@ def stage_weights(
     for name, force in sizes.forces.items():
         rolloff = lead_lag_filter(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
         z[f"{name}:effort"] = _at_plant_rate(rolloff, plant)
-    noisy = [port.name for port in ports.u if port.asd > 0]
+    noisy = sizes.disturbed
     for port in ports.w:
         if port.added_to:
             w[port.name] = sensed * sizes.sensors[port.added_to]
@@ -256,6 +259,8 @@ class _Sizes:
     #: of actuators, and of disturbances that move the axes as much as these
     forces: Mapping[str, float]
     pushes: Mapping[str, float]
+    #: actuators at which a disturbance acts: those with noise, or all if w leaves an axis at rest
+    disturbed: tuple[str, ...]
 
     @classmethod
     def of(cls, plant: AnyPlant, driven: DrivenAxes, sigma: float) -> _Sizes:
@@ -277,6 +282,9 @@ class _Sizes:
         noises = np.maximum(noises, _IDLE * noises.max(initial=0.0))
         W = real_gain(plant.system, sigma, driven.channels, pushed) / held
         moved = np.linalg.norm(d[:, None] * W, axis=0) * np.sqrt(m / r)
+        noisy = tuple(port.name for port in ports.u if port.asd > 0)
+        own = real_gain(plant.system, sigma, driven.channels, noisy)
+        excited = apart(np.hstack([W, own]))
         equal = dict(zip(pushed, (1.0 / divisor(moved)).tolist(), strict=True))
         # accelerations of the floor are those of unit axes: of a rotation a unit over its arm
         units = plant.units
@@ -288,6 +296,7 @@ class _Sizes:
             dict(zip(sensors, noises.tolist(), strict=True)),
             dict(zip(plant.u, forces.tolist(), strict=True)),
             _capped(equal, dict(zip(plant.u, forces.tolist(), strict=True)), units, shaken),
+            noisy if excited else tuple(plant.u),
         )
 
     @property
