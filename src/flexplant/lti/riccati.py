@@ -397,17 +397,21 @@ def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
-    # the subspace method solves unstable modes without noise; doubling solves poles of 1e-12 times
-    # the fastest, which the Schur form of all states puts on the axis
-    refusals: list[Exception] = []
-    for way in (_by_doubling,) if problem.discrete else (_by_subspace, _by_doubling):
-        try:
-            return _solution(problem, *way(problem))
-        except (SolverError, OnAxisError, np.linalg.LinAlgError) as error:
-            refusals.append(error)
-    equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
-    reason = _defect(problem.scaled(_sizes(problem))) or refusals[0]
-    raise SolverError(f"{equation}: {reason}") from refusals[0]
+    # doubling misses unstable modes without noise; the Schur form of the Hamiltonian, which does
+    # not, puts poles of 1e-12 times the fastest on the axis
+    way = _by_doubling if problem.discrete or not _is_unstable(problem) else _by_subspace
+    try:
+        return _solution(problem, *way(problem))
+    except (SolverError, OnAxisError, np.linalg.LinAlgError) as error:
+        equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
+        reason = _defect(problem.scaled(_sizes(problem))) or error
+        raise SolverError(f"{equation}: {reason}") from error
+
+
+def _is_unstable(p: RiccatiProblem) -> bool:
+    """Return whether a pole of A lies beyond the stability limit by more than rounding."""
+    poles = np.asarray(la.eigvals(p.A), dtype=np.complex128)
+    return bool(np.max(_growth(p, poles)) > SPLIT * np.max(np.abs(poles)))
 
 
 def _solution(
