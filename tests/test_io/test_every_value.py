@@ -410,7 +410,10 @@ def test_goes_through_a_file(name, tmp_path):
     same(value, found, name)
     assert repr(found) == repr(value)
     in_notebook = "".join(ET.fromstring(value._repr_html_()).itertext())  # well-formed, complete
-    assert re.sub(r"\W", "", in_notebook) == re.sub(r"\W", "", repr(value))
+    text = repr(value)
+    if text.startswith(f"{name}("):  # in a table, fields that say nothing are left out
+        text = Value.__repr__(value)
+    assert re.sub(r"\W", "", in_notebook) == re.sub(r"\W", "", text)
     assert repr(value).count("\n") < 15 and not re.search(r"mappingproxy\(|array\(\[", repr(value))
     same(value, pickle.loads(pickle.dumps(value)), name)
 
