@@ -85,11 +85,9 @@ class Prepared(Value):
 
     @property
     def own_sizes(self) -> tuple[FloatArray, FloatArray]:
-        """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,)."""
-        # at the loop's speed; a channel that does nothing has the largest size
+        """What the plant does on each channel at the loop's speed: u in z (nu,), w in y (ny,)."""
         u = answers(self.A, self.B2, self.C1, self.D12, self.point)
-        y = answers(self.A.T, self.C2.T, self.B1.T, self.D21.T, self.point)
-        return _none_zero(u), _none_zero(y)
+        return u, answers(self.A.T, self.C2.T, self.B1.T, self.D21.T, self.point)
 
     @property
     def own_gain(self) -> float:
@@ -105,6 +103,28 @@ class Prepared(Value):
             D11=self.D11 / unit,
             D22=unit * self.D22,
             u_scale=unit * self.u_scale,
+        )
+
+    def with_unit_channels(
+        self, size_u: FloatArray | float = 0.0, size_y: FloatArray | float = 0.0
+    ) -> Prepared:
+        """Return the problem with ``D12 = [0; I]`` and ``D21 = [0, I]`` where they have full rank.
+
+        What is small next to a size of its channel counts as zero.
+        """
+        (z, u), (w, y) = normalised(self.D12, size_u), normalised(self.D21.T, size_y)
+        z, y = z.T, y.T
+        return self.replace(
+            B1=self.B1 @ w,
+            B2=self.B2 @ u,
+            C1=z @ self.C1,
+            C2=y @ self.C2,
+            D11=z @ self.D11 @ w,
+            D12=z @ self.D12 @ u,
+            D21=y @ self.D21 @ w,
+            D22=y @ self.D22 @ u,
+            u_scale=self.u_scale @ u,
+            y_scale=y @ self.y_scale,
         )
 
     def frequency(self, omega: float) -> float:
@@ -169,41 +189,19 @@ def prepared(
     else:
         P, point = image, POINT
         A, B, C = timed(P.A, P.B, P.C, speed)
-    D12, D21 = P.D[:p1, m1:], P.D[p1:, :m1]
-    z_turn, u_scale = normalised(D12, answers(A, B[:, m1:], C[:p1], D12, point))
-    w_turn, y_scale_t = normalised(D21.T, answers(A.T, C[p1:].T, B[:, :m1].T, D21.T, point))
-    y_scale = y_scale_t.T
+    B1, B2, C1, C2 = B[:, :m1], B[:, m1:], C[:p1], C[p1:]
+    D11, D12, D21, D22 = P.D[:p1, :m1], P.D[:p1, m1:], P.D[p1:, :m1], P.D[p1:, m1:]
+    scales, names = (np.eye(len(u)), np.eye(len(y))), (tuple(u), tuple(y))
+    plain = Prepared(
+        A, B1, B2, C1, C2, D11, D12, D21, D22, *scales, speed, dt, *names, departure, direct, point
+    )
+    found = plain.with_unit_channels(*plain.own_sizes)
     # balanced with z and u in the unit of what w does to z, so that its unit does not matter
-    unit = own_gain(A, B[:, :m1], C[:p1], P.D[:p1, :m1], point)
-    units = np.where(np.arange(B.shape[1]) < m1, 1.0, unit)
-    rows = np.where(np.arange(len(C)) < p1, unit, 1.0)[:, None]
-    A, B, C = balanced(
-        A,
-        np.hstack([B[:, :m1] @ w_turn, B[:, m1:] @ u_scale]) * units,
-        np.vstack([z_turn.T @ C[:p1], y_scale @ C[p1:]]) / rows,
-        point,
-    )
-    B, C = B / units, C * rows
-    return Prepared(
-        A,
-        B[:, :m1],
-        B[:, m1:],
-        C[:p1],
-        C[p1:],
-        z_turn.T @ P.D[:p1, :m1] @ w_turn,
-        z_turn.T @ D12 @ u_scale,
-        y_scale @ D21 @ w_turn,
-        y_scale @ P.D[p1:, m1:] @ u_scale,
-        u_scale,
-        y_scale,
-        speed,
-        dt,
-        tuple(u),
-        tuple(y),
-        departure,
-        direct,
-        point,
-    )
+    unit = plain.own_gain
+    sized = found.measured_in(unit)
+    B, C = np.hstack([sized.B1, sized.B2]), np.vstack([sized.C1, sized.C2])
+    A, B, C = balanced(A, B, C, point)
+    return found.replace(A=A, B1=B[:, :m1], B2=B[:, m1:] / unit, C1=C[:p1] * unit, C2=C[p1:])
 
 
 #: ratio of A to its poles above which a failure is attributed to badly scaled coordinates
@@ -227,10 +225,6 @@ def _with_image(
     """Return a plant in other coordinates, and its continuous image when it is sampled."""
     P = P.replace(A=A, B=B, C=C, blocks=None)
     return P, bilinear(P, 1.0 / P.dt) if P.dt else P
-
-
-def _none_zero(sizes: FloatArray) -> FloatArray:
-    return np.asarray(np.where(sizes > 0.0, sizes, np.max(sizes, initial=0.0) or 1.0))
 
 
 #: relative to the size of A: poles with real parts above this are not stable

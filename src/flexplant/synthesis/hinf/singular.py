@@ -9,15 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import ComplexArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
+from ...lti.blocks_of_states import Matrices
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared
-from ..scaling import FELT, THIRD, answers, normalised
+from ..scaling import FELT, THIRD, answers
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
@@ -161,37 +162,28 @@ class Regularised:
     def __init__(self, problem: Prepared, level: float, modes: bool = False) -> None:
         self.given, self.level = problem, level
         nu, ny = problem.B2.shape[1], problem.C2.shape[0]
-        size_u, size_y = problem.own_sizes
+        # a channel that does nothing has the largest size
+        size_u, size_y = (
+            np.where(own > 0.0, own, np.max(own, initial=0.0) or 1.0) for own in problem.own_sizes
+        )
         gain = level * problem.own_gain
         drive = (gain * problem.B2 / size_u)[:, : nu * modes]
         sight = (gain * problem.C2 / size_y[:, None])[: ny * modes]
         n, mu, my = problem.A.shape[0], drive.shape[1], len(sight)
-        B1 = np.hstack([problem.B1, drive, np.zeros((n, ny))])
-        C1 = np.vstack([problem.C1, sight, np.zeros((nu, n))])
-        D12 = np.vstack([problem.D12, np.zeros((my, nu)), level * np.diag(size_u)])
-        D21 = np.hstack([problem.D21, np.zeros((ny, mu)), level * np.diag(size_y)])
-        D11 = la.block_diag(problem.D11, np.zeros((my + nu, mu + ny)))
-        z_turn, self._u = normalised(D12)
-        w_turn, y_scale = normalised(D21.T)
-        self._y = y_scale.T
         self.problem = problem.replace(
-            B1=B1 @ w_turn,
-            B2=problem.B2 @ self._u,
-            C1=z_turn.T @ C1,
-            C2=self._y @ problem.C2,
-            D11=z_turn.T @ D11 @ w_turn,
-            D12=z_turn.T @ D12 @ self._u,
-            D21=self._y @ D21 @ w_turn,
-            D22=self._y @ problem.D22 @ self._u,
-            u_scale=problem.u_scale @ self._u,
-            y_scale=self._y @ problem.y_scale,
-        )
+            B1=np.hstack([problem.B1, drive, np.zeros((n, ny))]),
+            C1=np.vstack([problem.C1, sight, np.zeros((nu, n))]),
+            D11=la.block_diag(problem.D11, np.zeros((my + nu, mu + ny))),
+            D12=np.vstack([problem.D12, np.zeros((my, nu)), level * np.diag(size_u)]),
+            D21=np.hstack([problem.D21, np.zeros((ny, mu)), level * np.diag(size_y)]),
+            u_scale=np.eye(nu),
+            y_scale=np.eye(ny),
+        ).with_unit_channels()
 
-    def restored(
-        self, K: SolvedController
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def restored(self, K: SolvedController) -> Matrices:
         """Return A, B, C, D of a controller of this problem, in the channels of the one given."""
-        return K.A, K.B @ self._y, self._u @ K.C, self._u @ K.D @ self._y
+        u, y = self.problem.u_scale, self.problem.y_scale
+        return K.A, K.B @ y, u @ K.C, u @ K.D @ y
 
 
 class _Found(NamedTuple):
