@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.optimize
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
@@ -251,6 +250,8 @@ def opposing_part(idle: FloatArray, forces: FloatArray) -> FloatArray:
     It is a sum of idle forces (m, k) that has the sign of the force, and at most its size, in each
     actuator: an actuator that carries a load alone pushes against none.
     """
+    from scipy.optimize import linprog
+
     size = np.abs(forces)
     if not idle.shape[1] or not np.any(size):
         return np.zeros_like(forces)
@@ -258,7 +259,7 @@ def opposing_part(idle: FloatArray, forces: FloatArray) -> FloatArray:
     signed = np.sign(forces)[:, None] * basis
     limits = np.concatenate([size / size.max(), np.zeros(size.size)])
     still = basis[size == 0.0]
-    best = scipy.optimize.linprog(
+    best = linprog(
         -signed.sum(axis=0), np.vstack([signed, -signed]), limits,
         still, np.zeros(len(still)), bounds=(None, None),
     )  # fmt: skip

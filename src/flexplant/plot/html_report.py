@@ -71,7 +71,7 @@ _PARAMETERS = 6
 Picture = tuple[str, Callable[[], Any]]
 
 
-def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
+def room_sections(design: Designed, gallery: Gallery) -> Iterator[Chapter]:
     """Yield the sections of all values but loops and verdicts, each value under its room."""
     shown = {
         name: value
@@ -92,7 +92,7 @@ def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
             yield Chapter(heading, "".join(parts))
 
 
-def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str:
+def _value_lines(name: str, value: Any, design: Designed, gallery: Gallery) -> str:
     """Return a value: its name, its repr, tables and pictures."""
     own = value._repr_html_()
     parts = [f"<h3>{escape(name)}</h3>", own]
@@ -121,7 +121,7 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
     return "".join(parts)
 
 
-def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
+def _pictures(name: str, value: Any, design: Designed) -> list[Picture]:
     """Return captions and functions that draw a value."""
     if isinstance(value, Response):
         over: list[Picture] = [(f"{name}: errors over time", partial(response, value))]
@@ -217,7 +217,7 @@ def _place_text(at: Any) -> str:
     return at if isinstance(at, str) else f"({', '.join(f'{x:g}' for x in at)})"
 
 
-def certificates(design: Design) -> Chapter | None:
+def certificates(design: Designed) -> Chapter | None:
     """Return the section of all checks."""
     rows = [
         [name, check.what.replace("_", " "), *check.row[1:3], _VERDICTS[check.holds], check.route]
@@ -258,7 +258,7 @@ def _checks_of(value: Any) -> Iterator[Verified]:
 Tile = tuple[str, str, str, str]
 
 
-def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
+def result(design: Designed, gallery: Gallery, channel: str | None) -> Chapter | None:
     """Return the section of the main results, for the first loop; None without a loop."""
     loops = design.of(ClosedLoop)
     if not loops:
@@ -312,7 +312,7 @@ def _main(loop: ClosedLoop, channel: str | None) -> str:
     return channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
 
 
-def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
+def loops_section(design: Designed, gallery: Gallery, channel: str | None) -> Chapter | None:
     """Return the section of margins, loop by loop, and of sensitivities; None without a loop."""
     loops = design.of(ClosedLoop)
     if not loops:
@@ -424,7 +424,7 @@ def _margin_table(loop: ClosedLoop) -> str:
 Kind = TypeVar("Kind")
 
 
-class Design:
+class Designed:
     """Named values in the given order."""
 
     def __init__(self, parts: Sequence[Any]) -> None:
@@ -512,7 +512,7 @@ def report(
     >>> "filter" in file.read_text(encoding="utf-8")
     True
     """
-    design, gallery = Design(parts), Gallery()
+    design, gallery = Designed(parts), Gallery()
     runs = design.of(Response).items()
     noisy = {name: run.seed for name, run in runs if run.seed is not None}
     with Progress(len(design.named) + 2, "report", even=False) as bar:

@@ -105,7 +105,8 @@ def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
         # [A - s I, B2; C1, D12] loses rank at poles of A, or of A without what D12 can hide: its
         # least singular value on the limit of stability is at most the distance to that pole then
         inner = A - B @ np.linalg.pinv(D) @ C
-        for s, distance in (*_limit(p, la.eigvals(A)), *_limit(p, la.eigvals(inner))):
+        spectra = [np.asarray(la.eigvals(M), dtype=np.complex128) for M in (A, inner)]
+        for s, distance in (point for poles in spectra for point in _limit(p, poles)):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
             if la.svdvals(pencil)[-1] <= max(distance, shown):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
