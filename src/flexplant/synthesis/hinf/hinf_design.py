@@ -212,7 +212,7 @@ class HinfDesign(Design):
         )
 
 
-class _Opened(NamedTuple):
+class _WithDeltas(NamedTuple):
     """A plant with channels for its modes, and gamma before they were scaled in closed loop."""
 
     plant: AnyPlant
@@ -228,20 +228,20 @@ class TolerantDesign(Design):
     uncertain: UncertainPlant[Any]
     damped_below: float = 0.0
 
-    def prepare(self, plant: AnyPlant) -> _Opened:
+    def prepare(self, plant: AnyPlant) -> _WithDeltas:
         """Return the plant with channels, their scales evened out in closed loop."""
         channels = mode_channels(plant, self.uncertain, self.damped_below)
         opened = with_mode_channels(plant, channels)
         # by a whole search: scales of a quick one jump with the weights, and designs with them
         first = solved(self.design, opened)
         channels = rebalanced(channels, opened, first.K)
-        return _Opened(with_mode_channels(plant, channels), channels, first.found.gamma)
+        return _WithDeltas(with_mode_channels(plant, channels), channels, first.found.gamma)
 
-    def solve(self, problem: _Opened) -> Solution:
+    def solve(self, problem: _WithDeltas) -> Solution:
         """Return the solution on the plant with channels."""
         return solved(self.design, problem.plant)
 
-    def restore(self, plant: AnyPlant, problem: _Opened, found: Solution) -> StateSpace:
+    def restore(self, plant: AnyPlant, problem: _WithDeltas, found: Solution) -> StateSpace:
         """Return its controller."""
         return found.K
 
