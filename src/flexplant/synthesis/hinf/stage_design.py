@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import FloatArray, positive
-from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ...arrays import positive
+from ...errors import InfeasibleError, ModelError, SolverError
 from ...loop import ClosedLoop, close_loop
 from ...loop.machine_figures import axis_bandwidths
 from ...loop.other_machines import BEYOND, mode_tolerances
@@ -23,8 +24,8 @@ from ...plant.uncertainty.frequencies import Frequencies
 from ...plant.uncertainty.mode_delta import DampingDelta
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...updating.residuals.modal_residuals import USUAL
-from ..controller import Controller, with_left_out
-from ..pipeline import Solution, solved, verified
+from ..controller import Controller
+from ..pipeline import Design, Solution, designed, solved, verified
 from .hinf_design import HinfDesign, TolerantDesign
 from .hinf_riccati import Riccati
 
@@ -121,51 +122,95 @@ def design_stage(
     known = given.uncertainty
     stated = known is not None and any(isinstance(kind, Frequencies) for kind in known.kinds)
     uncertain = given.uncertain(frequency=0.005) if known is None else known
-    task = _StageTask(uncertain, stated, positive(margin, "margin"), poi, disturbance, effort)
-    with Progress(_MOST, "bandwidths", progress=progress, even=False) as bar:
-        if bandwidth is not None:
-            task.reaches(positive(bandwidth, "bandwidth"))
-        else:
-            task.search(bar)
-    return with_left_out(task.answer(), uncertain.plant)
+    margin = positive(margin, "margin")
+    wanted = None if bandwidth is None else positive(bandwidth, "bandwidth")
+    if margin >= 1.0:
+        raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
+    if not uncertain.frequencies:
+        raise ModelError(
+            f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
+            "plant.uncertain(frequency=0.005)."
+        )
+    weights = partial(
+        stage_weights, uncertain.nominal, poi=poi, disturbance=disturbance, effort=effort
+    )
+    own = uncertain.plant
+    errors = reference_errors(own, poi=poi) if own.assembled.ports.references else None
+    task = _StageTask(uncertain, stated, margin, weights, errors, wanted, progress)
+    return designed(task, own, own)
 
 
-class _StageTask:
+@dataclass(eq=False)
+class _StageTask(Design):
     """The designs of rising bandwidths and their results."""
 
-    def __init__(
-        self,
-        uncertain: UncertainPlant[Any],
-        stated: bool,
-        margin: float,
-        poi: str | None,
-        disturbance: float | None,
-        effort: float | None,
-    ) -> None:
-        if margin >= 1.0:
-            raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
-        self.uncertain, self.stated, self.margin = uncertain, stated, margin
-        #: those of a bandwidth [Hz]
-        self.weights = partial(
-            stage_weights, uncertain.nominal, poi=poi, disturbance=disturbance, effort=effort
-        )
-        self.ranges = uncertain.frequencies
-        if not self.ranges:
-            raise ModelError(
-                f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
-                "plant.uncertain(frequency=0.005)."
-            )
-        self.plant: AnyPlant = uncertain.plant
+    uncertain: UncertainPlant[Any]
+    stated: bool
+    margin: float
+    #: those of a bandwidth [Hz]
+    weights: Callable[[float], Any]
+    #: inputs of the controller; None: the sensors themselves, without references
+    errors: StateSpace | None
+    #: where |S| crosses 1 [Hz]; None: as high as it can
+    wanted: float | None
+    progress: bool | None
+
+    def __post_init__(self) -> None:
+        self.ranges, self.plant = self.uncertain.frequencies, self.uncertain.plant
         #: with the truncated modes: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
-        #: inputs of the controller: the sensors themselves without references
-        followed = self.plant.assembled.ports.references
-        self.errors = reference_errors(self.plant, poi=poi) if followed else None
-        self.through = self.plant if self.errors is None else self.plant.through(self.errors)
+        pairs = self.plant.assembled.realisation.pairs[np.array(sorted(self.ranges)) - 1]
+        #: the uncertain frequencies [Hz], in the order of the modes
+        self.frequencies = natural(pairs)[0] / (2.0 * np.pi)
+        #: the highest bandwidth [Hz] whose weights can be sampled
+        self.highest = _OF_RATE / self.plant.dt if self.plant.dt else np.inf
         self.tried: dict[float, float] = {}
         #: what was tried, by the bandwidth of the loop [Hz], and why it does not hold
         self.causes: list[str] = []
         self.best: _StageTry | None = None
+
+    def prepare(self, plant: AnyPlant) -> AnyPlant:
+        """Return the plant from efforts to errors: each bandwidth poses a problem of its own."""
+        return plant if self.errors is None else plant.through(self.errors)
+
+    def solve(self, problem: AnyPlant) -> _StageTry:
+        """Return the design of the largest bandwidth that holds."""
+        self.through = problem
+        with Progress(_MOST, "bandwidths", progress=self.progress, even=False) as bar:
+            if self.wanted is None:
+                self.search(bar)
+            elif self.errors is None:
+                self.holds(self.wanted / _CROSSES)
+            else:
+                self._kept(self.wanted / _CROSSES, self._moved, self.wanted)
+        if self.best is None:
+            off, causes = 100.0 * max(self.ranges.values()), dict.fromkeys(self.causes)
+            raise InfeasibleError(
+                f"no loop keeps the modulus margin {self.margin:g} on the plant, and "
+                f"{_KEPT * self.margin:.3g} with any one modal frequency off (by up to {off:.2g} "
+                f"%) and on {_DRAWS} machines drawn. Tried for |S| crossing 1 at "
+                f"{'; '.join(causes)}. State how well the frequencies and dampings are known, "
+                "plant.uncertain(...), lower margin=, ask for another bandwidth=, or move the "
+                "actuators."
+            )
+        return self.best
+
+    def restore(self, plant: AnyPlant, problem: AnyPlant, found: _StageTry) -> StateSpace:
+        """Return the controller from the sensors and the reference."""
+        return self._block(found.solution.K)
+
+    def certify(self, solution: Solution) -> Controller:
+        """Return the controller with the checks of its weighted loop, and what was tried."""
+        best: _StageTry = solution.found
+        answer = verified(best.design, best.solution)
+        drawn = {f"least modulus margin of {_DRAWS} machines drawn": best.drawn}
+        return answer.replace(
+            system=solution.K,
+            method="H-infinity of a stage",
+            certificate=answer.certificate | drawn | {"weights for Hz": best.bandwidth},
+            tried={f"{f:.4g} Hz": margin for f, margin in self.tried.items()},
+            reached={},
+        )
 
     @cached_property
     def machines(self) -> list[AnyPlant]:
@@ -180,29 +225,22 @@ class _StageTask:
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
-        design = partial(self._designed, bandwidth)
-        return self._kept(bandwidth, design, _CROSSES * bandwidth)
+        return self._kept(bandwidth, partial(self._designed, bandwidth), _CROSSES * bandwidth)
 
-    def reaches(self, wanted: float) -> bool:
-        """Design a loop whose |S| crosses 1 at a bandwidth, and return whether it holds."""
-        if self.errors is None:
-            return self.holds(wanted / _CROSSES)
-        return self._kept(wanted / _CROSSES, partial(self._moved, wanted), wanted)
-
-    def _kept(
-        self, bandwidth: float, design: Callable[[float], _StageTry | FlexplantError], asked: float
-    ) -> bool:
+    def _kept(self, bandwidth: float, design: Callable[[float], _StageTry], asked: float) -> bool:
         """Keep the first design that holds, of those that damp more and more modes."""
         damped = None
         for factor in _DAMPED:
             below = factor * bandwidth
-            now = int(np.count_nonzero(self._frequencies < below))
+            now = int(np.count_nonzero(self.frequencies < below))
             if now == damped:
                 break
-            damped, one = now, design(below)
-            if isinstance(one, FlexplantError):
+            damped = now
+            try:
+                one = design(below)
+            except (SolverError, InfeasibleError) as error:  # more damped modes may serve
                 self.tried.setdefault(bandwidth, 0.0)
-                self.causes.append(f"{asked:.4g} Hz: {one}")
+                self.causes.append(f"{asked:.4g} Hz: {error}")
                 continue
             self.tried.setdefault(one.bandwidth, 0.0)
             margin, drawn, cause = self._judged(one.solution.K)
@@ -217,14 +255,19 @@ class _StageTask:
                 return True
         return False
 
-    def _moved(self, wanted: float, below: float) -> _StageTry | FlexplantError:
-        """Return a design whose |S| crosses 1 at a bandwidth, the slowest weights that have it."""
-        at, ends = wanted, [0.0, np.inf]  # of weights that are too slow, and too fast
+    def _designed(self, bandwidth: float, below: float) -> _StageTry:
+        """Return a controller that is not verified yet."""
+        weighted = self.through.weighted(self.weights(bandwidth))
+        design = TolerantDesign(HinfDesign(Riccati(progress=False)), self.uncertain, below)
+        return _StageTry(bandwidth, design, solved(design, weighted))
+
+    def _moved(self, below: float) -> _StageTry:
+        """Return the design of the slowest weights with which |S| crosses 1 where it is wanted."""
+        wanted = at = float(self.wanted or 0.0)
+        ends = [0.0, np.inf]  # of weights that are too slow, and too fast
         known: list[tuple[float, float]] = []
         for _ in range(_DESIGNS):
             one = self._designed(at, below)
-            if isinstance(one, FlexplantError):
-                return one
             reached = self._crossing(one.solution.K)
             if abs(reached / wanted - 1.0) <= _REACHED:
                 return one
@@ -234,22 +277,13 @@ class _StageTask:
                 break
             at = min(_next(known, wanted, ends), self.highest)
         tried = ", ".join(f"{there:.4g} Hz" for _, there in known)
-        return InfeasibleError(f"|S| crosses 1 at {tried} instead")
+        raise InfeasibleError(f"|S| crosses 1 at {tried} instead")
 
     def _crossing(self, system: StateSpace) -> float:
         """Return where |S| of the slowest axis that is followed crosses 1 [Hz]."""
         reached = axis_bandwidths(self._loop(system))
         followed = () if self.errors is None else self.errors.inputs
         return min(hertz for ref, hertz in reached.items() if ref in followed)
-
-    def _designed(self, bandwidth: float, below: float) -> _StageTry | FlexplantError:
-        """Return a controller that is not verified yet, or the error of the design."""
-        weighted = self.through.weighted(self.weights(bandwidth))
-        design = TolerantDesign(HinfDesign(Riccati(progress=False)), self.uncertain, below)
-        try:
-            return _StageTry(bandwidth, design, solved(design, weighted))
-        except (SolverError, InfeasibleError) as error:  # other weights or dampings may serve
-            return error
 
     def _judged(self, system: StateSpace) -> tuple[float, float, str]:
         """Return the modulus margin, the least one with modes off, and both in words."""
@@ -289,7 +323,8 @@ class _StageTask:
 
     def search(self, bar: Progress) -> None:
         """Try rising bandwidths until one fails, or falling ones until one holds; then between."""
-        now = self._first()
+        # the first bandwidth is of the first mode of uncertain frequency
+        now = min(_FIRST * float(self.frequencies[0]) / _CROSSES, self.highest)
         up = self.holds(now)
         for _ in range(_MOST):
             bar.advance()
@@ -303,48 +338,6 @@ class _StageTask:
         for _ in range(_HALVINGS):
             middle = float(np.sqrt(low * high))
             low, high = (middle, high) if self.holds(middle) else (low, middle)
-
-    @property
-    def highest(self) -> float:
-        """The highest bandwidth [Hz] whose weights can be sampled."""
-        return _OF_RATE / self.plant.dt if self.plant.dt else np.inf
-
-    def _first(self) -> float:
-        """Return a bandwidth [Hz] of the weights from the first mode of uncertain frequency."""
-        return min(_FIRST * float(self._frequencies[0]) / _CROSSES, self.highest)
-
-    @property
-    def _frequencies(self) -> FloatArray:
-        """The uncertain frequencies [Hz], in the order of the modes."""
-        pairs = self.plant.assembled.realisation.pairs[np.array(sorted(self.ranges)) - 1]
-        return natural(pairs)[0] / (2.0 * np.pi)
-
-    def answer(self) -> Controller:
-        """Return the best controller, with what was tried."""
-        tried = {f"{f:.4g} Hz": margin for f, margin in self.tried.items()}
-        if self.best is None:
-            off, causes = 100.0 * max(self.ranges.values()), dict.fromkeys(self.causes)
-            raise InfeasibleError(
-                f"no loop keeps the modulus margin {self.margin:g} on the plant, and "
-                f"{_KEPT * self.margin:.3g} with any one modal frequency off (by up to {off:.2g} "
-                f"%) and on {_DRAWS} machines drawn. Tried for |S| crossing 1 at "
-                f"{'; '.join(causes)}. State how well the frequencies and dampings are known, "
-                "plant.uncertain(...), lower margin=, ask for another bandwidth=, or move the "
-                "actuators."
-            )
-        best = self.best
-        found = verified(best.design, best.solution)
-        certificate = found.certificate | {
-            f"least modulus margin of {_DRAWS} machines drawn": best.drawn,
-            "weights for Hz": best.bandwidth,
-        }
-        return found.replace(
-            system=self._block(found.system),
-            method="H-infinity of a stage",
-            certificate=certificate,
-            tried=tried,
-            reached={},
-        )
 
 
 def _next(known: Sequence[tuple[float, float]], wanted: float, ends: Sequence[float]) -> float:
