@@ -40,7 +40,7 @@ from .scaling import (
 )
 
 #: departure from normal above which modal coordinates are taken; the condition of their
-#: eigenvectors may be as many times larger
+#: eigenvectors may be as many times larger, and from there on a failure is attributed to it
 _MIXED, _CONDITION = 5.0, 1e3
 
 
@@ -204,13 +204,9 @@ def prepared(
     return found.replace(A=A, B1=B[:, :m1], B2=B[:, m1:] / unit, C1=C[:p1] * unit, C2=C[p1:])
 
 
-#: ratio of A to its poles above which a failure is attributed to badly scaled coordinates
-MIXED = 1e3
-
-
 def badly_scaled(problem: Prepared) -> str:
     """Return that the plant was given in bad coordinates, in words; empty where it was not."""
-    if problem.departure < MIXED:
+    if problem.departure < _CONDITION:
         return ""
     return (
         f"the coordinates of the plant's states are badly conditioned: A is "

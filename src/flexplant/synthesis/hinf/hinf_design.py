@@ -25,8 +25,7 @@ from ..controller import (
     reached_norms,
 )
 from ..pipeline import Design, Solution, designed, solved, verified
-from ..preparation import MIXED, Prepared, badly_scaled, posed
-from ..scaling import departure_from_normal
+from ..preparation import Prepared, badly_scaled, posed
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
 from .moved_design import PlantRange, over_positions
@@ -35,8 +34,6 @@ from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, 
 
 #: in the certificate: the upper bound of real mu of all uncertain frequencies together
 TOLERATED = "all frequencies at once"
-#: ratio of gamma to its lower bound up to which bad coordinates may have been harmless
-_CLOSE = 1.06
 #: relative change of gamma by one rounding of the plant above which no controller is given, and the
 #: number of draws of it; the loop is examined where its norm by two routes differs by more
 _SENSITIVE, _DRAWS, _FELT = 2e-4, 3, 1e-5
@@ -198,7 +195,6 @@ class HinfDesign(Design):
         if badly_scaled(problem) or abs(gamma - found.gamma) > _FELT * gamma:
             _require_resolved(plant.system, K)
         lower = raised_bound(problem, gamma, max(found.lower, pointwise_bound(problem)))
-        _require_known(problem, gamma, lower)
         name = type(self.method).__name__
         return Controller(
             K,
@@ -260,16 +256,6 @@ class TolerantDesign(Design):
                 *answer.notes,
                 f"gamma is with a channel for each of {counted(len(channels), 'mode')}",
             ),
-        )
-
-
-def _require_known(problem: Prepared, gamma: float, lower: float) -> None:
-    """Raise SolverError when rounding in the given coordinates may have made another plant."""
-    bad = gamma > _CLOSE * lower or departure_from_normal(problem.A, 1.0) > MIXED
-    if bad and badly_scaled(problem):
-        raise SolverError(
-            f"a controller with gamma {gamma:.4g} was found, the lower bound is {lower:.4g}, and "
-            "both hang on rounding."
         )
 
 
