@@ -44,5 +44,5 @@ def test_between_two_places_matrices_are_linear():
     one = StateSpace([[-1.0]], [[1.0]], [[2.0]], [[0.0]])
     two = StateSpace([[-3.0]], [[5.0]], [[4.0]], [[8.0]])
     plants = [StandardPlant.from_statespace(g, u=g.inputs, y=g.outputs) for g in (one, two)]
-    found = PlantRange.of({4.0: plants[1], 0.0: plants[0]}).at(1.0).system
-    assert [getattr(found, m).item() for m in "ABCD"] == [-1.5, 2.0, 2.5, 2.0]
+    found = PlantRange.of({4.0: plants[1], 0.0: plants[0]}).between[2.0].system
+    assert [getattr(found, m).item() for m in "ABCD"] == [-2.0, 3.0, 3.0, 4.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,15 +27,13 @@ from ..pipeline import Design, solved, verified
 from ..preparation import prepared
 from .lower_bound import pointwise_bound
 
-#: size of the channels relative to the whole motion, at the start of the search: they are for
-#: complex deltas, which cover more than a real position
+#: size of the channels relative to the whole motion: they are for complex deltas, which cover more
+#: than a real position
 _SIZE = 0.1
-#: halvings or doublings of a size or a scale, while they help
+#: halvings or doublings of a scale, while they help
 _STEPS = 4
-#: what the progress bar counts, and the largest number: single plants, then the search
-_DESIGNS, _MOST = "designs over the positions", 5 + 4 * _STEPS
-#: rows and columns that change by less, relative to the largest, do not move
-_STILL = 1e-9
+#: what the progress bar counts
+_DESIGNS = "designs over the positions"
 
 
 @dataclass(frozen=True)
@@ -57,31 +56,21 @@ class PlantRange:
         first = found.plants[0]
         for x, one in zip(places, found.plants, strict=True):
             same = all(getattr(one, side) == getattr(first, side) for side in "wuzy")
+            same &= one.system.n_states == first.system.n_states
             if not same or not np.isclose(one.dt, first.dt, rtol=SAME, atol=0.0):
                 raise ModelError(
-                    f"the plant at {x:g} has other channels or another rate than that at "
-                    f"{places[0]:g}: no controller could move from one to the other. Assemble all "
-                    "with the same names and rate."
-                )
-            if one.system.n_states != first.system.n_states:
-                raise ModelError(
-                    f"the plant at {x:g} has {one.system.n_states} states, that at {places[0]:g} "
-                    f"has {first.system.n_states}: where only ports move the model is one. "
-                    "Assemble all of the same modes."
+                    f"the plant at {x:g} has other channels or another rate or number of states "
+                    f"({one.system.n_states}) than that at {places[0]:g} "
+                    f"({first.system.n_states}): no controller could move from one to the other. "
+                    "Assemble all of the same modes, with the same names and rate."
                 )
         return found
 
-    def at(self, x: float) -> AnyPlant:
-        """Return the plant at a position, its matrices linear between those given."""
-        known = np.flatnonzero(self.places == x)
-        if known.size:
-            return self.plants[int(known[0])]
-        i = int(np.clip(np.searchsorted(self.places, x) - 1, 0, len(self.places) - 2))
-        (before, after), (a, b) = self.places[i : i + 2], [p.system for p in self.plants[i : i + 2]]
-        part = (x - before) / (after - before)
-        mixed = {m: (1.0 - part) * getattr(a, m) + part * getattr(b, m) for m in "ABCD"}
-        sides = {side: getattr(self.plants[0], side) for side in "wuzy"}
-        return StandardPlant.from_statespace(a.replace(**mixed, blocks=None), **sides)
+    @property
+    def between(self) -> dict[float, AnyPlant]:
+        """The plants half way between neighbours, their matrices linear between those given."""
+        middles = 0.5 * (self.places[1:] + self.places[:-1])
+        return dict(zip(middles.tolist(), map(_mean, pairwise(self.plants)), strict=True))
 
     def certified(
         self, norm_of: Callable[[AnyPlant], float], norms: Sequence[float]
@@ -90,38 +79,37 @@ class PlantRange:
         found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
         found["worst position"] = float(self.places[int(np.argmax(norms))])
         worst = (0.0, np.nan)
-        for x in self.middles.tolist():
+        for x, plant in self.between.items():
             try:
-                worst = max(worst, (norm_of(self.at(x)), x))
+                worst = max(worst, (norm_of(plant), x))
             except CertificateError as error:
                 raise CertificateError(
                     f"at {x:.6g}, between the positions designed for: {error} Give plants at more "
                     "positions."
                 ) from error
-        if self.middles.size:
+        if np.isfinite(worst[1]):
             found |= {"norm between positions": worst[0], "worst position between": worst[1]}
         return Certificate.of(found, route="the loop closed at each position")
 
-    @property
-    def middles(self) -> FloatArray:
-        """The positions half way between those given."""
-        return np.asarray(0.5 * (self.places[1:] + self.places[:-1]))
+
+def _mean(plants: Sequence[AnyPlant]) -> AnyPlant:
+    """Return the plant with the mean matrices of several."""
+    first = plants[0]
+    mixed = {m: np.mean([getattr(one.system, m) for one in plants], axis=0) for m in "ABCD"}
+    sides = {side: getattr(first, side) for side in "wuzy"}
+    return StandardPlant.from_statespace(first.system.replace(**mixed, blocks=None), **sides)
 
 
 def over_positions(moving: PlantRange, design: Design, progress: bool | None = None) -> Controller:
     """Return the controller whose worst norm over the positions is least of those tried."""
-    # tried are the mean plant and those at the ends and in the middle, one by one; then the mean
-    # plant with a channel for each row and column that moves, `y = (C + delta dC) x` and `x+ = ...
-    # + (B + delta dB) u`, whose size and scale are searched
+    # tried are the mean plant, then the mean plant with a channel for each row and column that
+    # moves, `y = (C + delta dC) x` and `x+ = ... + (B + delta dB) u`, whose scale is searched
     search, motion = _Search(moving, design), _MotionChannels(moving)
-    with Progress(_MOST, _DESIGNS, progress=progress, even=False):
+    with Progress(2 + 2 * _STEPS, _DESIGNS, progress=progress, even=False):
         first = search.tried_with("the mean plant", motion.mean)
-        last = len(moving.plants) - 1
-        for i in sorted({0, len(moving.plants) // 2, last}):
-            search.tried_with(f"the plant at {moving.places[i]:.4g}", moving.plants[i])
         if motion.scales.size and first is not None:
             motion.even(first.system)
-            search.over_channels(motion)
+            search.over_scales(motion)
         return search.answer()
 
 
@@ -133,44 +121,31 @@ class _Search:
         self.tried: dict[str, float] = {}
         self.best: Controller | None = None
 
-    @property
-    def least(self) -> float:
-        """The smallest worst norm so far."""
-        return min(self.tried.values(), default=np.inf)
-
     def tried_with(self, name: str, plant: AnyPlant) -> Controller | None:
         """Design for a plant, judge, and keep what is best."""
-        found, worst = None, np.inf
-        with attempted(f"the design for {name}"):  # another plant may serve all positions
+        found, worst, least = None, np.inf, min(self.tried.values(), default=np.inf)
+        with attempted(f"the design for {name}"):  # another scale may serve
             found = verified(self.design, solved(self.design, plant))
-            worst = _worst_norm(self.moving, found.system, self.least)
-            if worst < self.least:
+            worst = _worst_norm(self.moving, found.system, least)
+            if worst < least:
                 self.best = found
         self.tried[name] = worst
         tick(_DESIGNS)
         return found
 
-    def over_channels(self, motion: _MotionChannels) -> None:
-        """Halve or double the scale of the channels, then their size, while that helps."""
-        point = (1.0, _SIZE)
-        value = self._at(motion, point)
-        for axis in ((1, 0), (0, 1)):
-            for factor in (0.5, 2.0):
-                start = point
-                for _ in range(_STEPS):
-                    new = point[0] * factor ** axis[0], point[1] * factor ** axis[1]
-                    reached = self._at(motion, new)
-                    if not reached < value:
-                        break
-                    point, value = new, reached
-                if point != start:
+    def over_scales(self, motion: _MotionChannels) -> None:
+        """Halve or double the scale of the channels while that helps."""
+        for factor in (0.5, 2.0):
+            scale, value = 1.0, np.inf
+            for _ in range(_STEPS):
+                name = f"scale {scale:g} of the motion"
+                if name not in self.tried:
+                    self.tried_with(name, motion.channels(scale))
+                if not self.tried[name] < value:
                     break
-
-    def _at(self, motion: _MotionChannels, point: tuple[float, float]) -> float:
-        name = f"motion of {point[1]:g}, scale {point[0]:g}"
-        if name not in self.tried:
-            self.tried_with(name, motion.channels(*point))
-        return self.tried[name]
+                scale, value = scale * factor, self.tried[name]
+            if scale != factor:
+                break
 
     def answer(self) -> Controller:
         """Return the best, with the norms of all positions."""
@@ -201,13 +176,9 @@ class _MotionChannels:
     """How rows and columns of the plant change over the range, and channels for it."""
 
     def __init__(self, moving: PlantRange) -> None:
-        first, systems = moving.plants[0], [one.system for one in moving.plants]
-        mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}
+        systems = [one.system for one in moving.plants]
         #: the plant with the mean matrices
-        self.mean = StandardPlant.from_statespace(
-            systems[0].replace(**mixed, blocks=None),
-            **{side: getattr(first, side) for side in "wuzy"},
-        )
+        self.mean = _mean(moving.plants)
         x = moving.places - 0.5 * (moving.places[0] + moving.places[-1])
         x = x / (np.abs(x).max() or 1.0)
         g = self.mean.system
@@ -221,15 +192,15 @@ class _MotionChannels:
         self.dC, self.dB = dC[self.rows], dB[:, self.columns]
         self.scales = np.ones(self.rows.size + self.columns.size)
 
-    def channels(self, scale: float, size: float) -> AnyPlant:
+    def channels(self, scale: float = 1.0) -> AnyPlant:
         """Return the mean plant with a disturbance and an output for each row and column."""
         g, r, c, own = self.mean.system, self.rows.size, self.columns.size, self.mean
         D, n, k = scale * self.scales, g.n_states, r + c
         left, right = np.zeros((n + len(g.outputs), k)), np.zeros((k, n + len(g.inputs)))
         left[n + self.rows, np.arange(r)] = D[:r]
         left[:n, r:] = self.dB * D[r:]
-        right[:r, :n] = size * self.dC / D[:r, None]
-        right[r + np.arange(c), n + self.columns] = size / D[r:]
+        right[:r, :n] = _SIZE * self.dC / D[:r, None]
+        right[r + np.arange(c), n + self.columns] = _SIZE / D[r:]
         names = [f"moves{i}" for i in range(1, k + 1)]
         w, z = ([f"{name}:{side}" for name in names] for side in "wz")
         return StandardPlant.from_statespace(
@@ -240,7 +211,7 @@ class _MotionChannels:
     def even(self, K: StateSpace) -> None:
         """Scale each channel so that, in closed loop, w reaches it as it reaches z."""
         k = self.scales.size
-        loop = lft(self.channels(1.0, 1.0).system, K)
+        loop = lft(self.channels().system, K)
         freq = resonance_grid(loop.poles(), loop.dt, points=300)
         T = frequency_response(loop, freq).data
         out = np.linalg.norm(T[k:, :k], axis=0).max(axis=1)
@@ -252,7 +223,7 @@ class _MotionChannels:
 def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
     """Return which rows change at all, each relative to its own size."""
     size = np.abs(change).max(axis=1, initial=0.0)
-    return np.flatnonzero(size > _STILL * np.abs(rows).max(axis=1, initial=0.0))
+    return np.flatnonzero(size > SAME * np.abs(rows).max(axis=1, initial=0.0))
 
 
 def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
@@ -261,7 +232,7 @@ def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
     Infinite where a loop is not stable.
     """
     order = sorted(range(len(moving.plants)), key=lambda i: -abs(2 * i - len(moving.plants) + 1))
-    plants = [moving.plants[i] for i in order] + [moving.at(x) for x in moving.middles.tolist()]
+    plants = [moving.plants[i] for i in order] + [*moving.between.values()]
     worst = 0.0
     for one in plants:
         try:
