@@ -167,7 +167,8 @@ class _Site:
         from latex2mathml.converter import convert
 
         mark = f"formula{len(self.formulas)}x"
-        self.formulas[mark] = convert(" ".join(latex.split()), display=display)
+        parts = " ".join(latex.split()).split(r"\qquad")  # separate, so that a line may end there
+        self.formulas[mark] = " &emsp; ".join(convert(part, display="inline") for part in parts)
         if display == "block":
             self.formulas[mark] = f'<div class="formula">{self.formulas[mark]}</div>'
         return mark
