@@ -244,14 +244,28 @@ def stable_subspace(
     unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
     scale = np.concatenate([d, unit / d])
     balanced = np.block([[A, -G], [-Q, -A.T]]) * scale / scale[:, None]
-    triangle, vectors, count = la.schur(balanced, sort="lhp")
-    values = la.eigvals(triangle)
+    values, vectors, count = _stable_first(balanced)
     on_axis = np.abs(values.real) <= _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
     if count != d.size or np.any(on_axis):
         near = np.argsort(np.abs(values.real))[:2]
         raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
     top, bottom = np.split(vectors[:, : d.size] * scale[:, None], 2)
     return symmetrised(np.linalg.solve(top.T, bottom.T).T)
+
+
+def _stable_first(H: FloatArray) -> tuple[ComplexArray, FloatArray, int]:
+    """Return eigenvalues and Schur vectors, the stable ones first, and their number."""
+    # LAPACK's gees: SciPy's schur keeps the eigenvalues to itself
+    gees: Any = la.get_lapack_funcs("gees", (H,))
+
+    def stable(real: float, _: float) -> bool:
+        return real < 0.0
+
+    size = int(gees(stable, H, lwork=-1)[-2][0])
+    _, count, real, imag, vectors, _, info = gees(stable, H, lwork=size, sort_t=1)
+    if info > 0:
+        raise la.LinAlgError("the eigenvalues of a Hamiltonian matrix do not converge.")
+    return real + 1j * imag, vectors, count
 
 
 #: shifts of the Cayley transform relative to the mean speed of the closed loop, tried in turn until

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..arrays import ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import LabelError, ModelError, ShapeError, require_known, short
 from ..tolerances import ROUNDING
 from ..words import inner_names, instance, name_list
@@ -171,8 +171,7 @@ def lft(P: System, K: System) -> StateSpace:
     """
     plant, controller = as_statespace(P), as_statespace(K)
     y, u = plant.output_index(controller.inputs), plant.input_index(controller.outputs)
-    z = np.setdiff1d(np.arange(len(plant.outputs)), y)
-    w = np.setdiff1d(np.arange(len(plant.inputs)), u)
+    z, w = _others(len(plant.outputs), y), _others(len(plant.inputs), u)
     D22, DK = plant.D[np.ix_(y, u)], controller.D
     B1, B2, C1, C2 = plant.B[:, w], plant.B[:, u], plant.C[z], plant.C[y]
     D11, D12, D21 = plant.D[np.ix_(z, w)], plant.D[np.ix_(z, u)], plant.D[np.ix_(y, w)]
@@ -194,6 +193,13 @@ def lft(P: System, K: System) -> StateSpace:
         name=plant.name,
         units=plant.units,
     )
+
+
+def _others(count: int, chosen: IntArray) -> IntArray:
+    """Return the numbers below a count that are not chosen."""
+    left = np.ones(count, dtype=bool)
+    left[chosen] = False
+    return np.flatnonzero(left)
 
 
 def loop_poles(g: StateSpace, K: StateSpace) -> ComplexArray:

@@ -21,7 +21,7 @@ from .lyapunov import (
 )
 from .modal_map import obstacle
 from .peaks import Residues, proved_peak, residues
-from .response_solvers import points, responder
+from .response_solvers import Responder, points, responder
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -151,7 +151,8 @@ def _peak_gain(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[f
     problem = obstacle(g, axis_only=axis_only, known=poles)
     if problem:
         return float("inf"), problem.freq
-    return _proved(g, model) or level_set_peak(g, SETTLED, bar)
+    respond = None if model is None or g.dt or g.blocks is not None else model.responses
+    return _proved(g, model) or level_set_peak(g, SETTLED, bar, respond)
 
 
 def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None:
@@ -252,15 +253,17 @@ def _trace_of_factor(C: FloatArray, L: FloatArray) -> tuple[float, float]:
     return float(np.sum((C @ L) ** 2)), float(np.sum(deviation**2))
 
 
-def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[float, float]:
+def level_set_peak(
+    g: StateSpace, tolerance: float, bar: Progress, respond: Responder | None = None
+) -> tuple[float, float]:
     """Return the largest gain and its frequency [Hz] of a system without poles on the axis."""
     # from the midpoints between crossings of its level, until no crossing remains at (1 +
     # tolerance) times it
     top = 0.5 / g.dt if g.dt else np.inf
-    respond = responder(g)
+    answer = respond or responder(g)
 
     def find(freq: FloatArray) -> FloatArray:
-        return largest_gains(respond(freq))
+        return largest_gains(answer(freq))
 
     gain, freq = _swept_peak(g, find, top)
     if not gain:

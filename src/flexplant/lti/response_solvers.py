@@ -7,7 +7,6 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph
 
 from ..arrays import CACHED, COLUMNS, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
@@ -243,9 +242,8 @@ def dense_solver(g: Part) -> tuple[Solver, int, int]:
     Parts that share no state, such as the axes of a servo, each with its own channels; those of one
     A, as axes of one law have, together.
     """
-    count, owner = csgraph.connected_components(g.A != 0, directed=False)
     alike: dict[bytes, list[IntArray]] = {}
-    for own in (np.flatnonzero(owner == i) for i in range(count)):
+    for own in _separate_states(g.A):
         alike.setdefault(g.A[np.ix_(own, own)].tobytes(), []).append(own)
     solvers: list[tuple[_Gains, _Channels]] = []
     sizes = max(MODAL_CHUNK, 64 * len(g.A)), PARTS
@@ -271,6 +269,24 @@ def dense_solver(g: Part) -> tuple[Solver, int, int]:
         return False
 
     return add, *sizes
+
+
+def _separate_states(A: FloatArray) -> list[IntArray]:
+    """Return the sets of states that do not act on each other."""
+    # by reach, which takes two or three steps in a full A: a general graph library takes longer
+    # than the poles of a small one
+    acts = A != 0
+    acts |= acts.T
+    left, parts = np.ones(len(A), dtype=bool), []
+    while left.any():
+        own = np.zeros(len(A), dtype=bool)
+        front: Sequence[int] | IntArray = [int(np.argmax(left))]
+        while len(front):
+            own[front] = True
+            front = np.flatnonzero(acts[front].any(axis=0) & ~own)
+        parts.append(np.flatnonzero(own))
+        left &= ~own
+    return parts
 
 
 def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gains | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ class Prepared(Value):
     #: point at the loop's speed: e^(j pi/4), or its image in z for a problem that stays sampled
     point: complex = POINT
 
-    @property
+    @cached_property
     def system(self) -> StateSpace:
         """The scaled problem as one system, inputs w1.., u and outputs z1.., y."""
         w = inner_names((f"w{i}" for i in range(1, self.B1.shape[1] + 1)), self.u)

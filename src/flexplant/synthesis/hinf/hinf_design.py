@@ -27,7 +27,7 @@ from ..controller import (
 from ..pipeline import Design, Solution, designed, solved, verified
 from ..preparation import Prepared, badly_scaled, posed
 from .hinf_riccati import Riccati
-from .lower_bound import pointwise_bound, raised_bound
+from .lower_bound import raised_bound
 from .moved_design import PlantRange, over_positions
 from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
@@ -194,7 +194,7 @@ class HinfDesign(Design):
         # the loops of the method and of the plant are equal: they differ by the effect of rounding
         if badly_scaled(problem) or abs(gamma - found.gamma) > _FELT * gamma:
             _require_resolved(plant.system, K)
-        lower = raised_bound(problem, gamma, max(found.lower, pointwise_bound(problem)))
+        lower = raised_bound(problem, gamma, found.lower)
         name = type(self.method).__name__
         return Controller(
             K,

@@ -15,6 +15,7 @@ from ...lti.equations import OnAxisError
 from ...lti.frequency_sweep import largest_gains
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
+from ...lti.peaks import residues
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
@@ -22,7 +23,7 @@ from ...store import Value, checked
 from ...tolerances import ROUNDING, SETTLED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
-from .lower_bound import are_coupled, both_sides
+from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
 from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks, require_shown
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
@@ -32,8 +33,9 @@ from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks,
 _REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
-#: most steps of the bisection
-_BISECTION = 60
+#: most steps of a search, secants between two bisections, and by how many times a step that rises
+#: from a bound is wider than the last
+_STEPS, _SECANTS, _WIDER = 60, 3, 8.0
 #: sensitivity at infinite frequency below which a central controller is taken for one of infinite
 #: gain
 _INFINITE = 1e-3
@@ -125,27 +127,79 @@ class Riccati(Value):
         )
 
     def _searched(self, problem: Prepared, _: float) -> tuple[float, float]:
-        """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
+        """Return the smallest gamma that was reached below 1, and the largest refuted one."""
         # reached: what the equations promise of a step is seen at the resonances of its loop
-        high = 1.0
-        low = tried = min(high, max(one.direct for one in both_sides(problem)))
-        with Progress(
-            _BISECTION, "steps of the bisection", progress=self.progress, even=False
-        ) as bar:
-            for _ in range(_BISECTION):
-                if high <= tried * (1.0 + self.tolerance) or high < SETTLED:
+        bracket = _Bracket(min(1.0, pointwise_bound(problem)), self.tolerance)
+        with Progress(_STEPS, "steps of the search", progress=self.progress, even=False) as bar:
+            for _ in range(_STEPS):
+                if bracket.is_closed:
                     break
-                middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
-                K, refuted = _attempt(problem, middle)
+                gamma = bracket.next_gamma()
+                attempt = _attempt(problem, gamma)
                 bar.advance()
-                gain = np.inf if K is None else resonance_gain(problem, K)
-                if gain <= middle * (1.0 + _SLACK):
-                    high = middle
-                    continue
-                high, tried = min(high, gain), middle  # rounding costs some of what is promised
-                if refuted:
-                    low = middle
-        return high, low
+                K = attempt.controller
+                bracket.narrow(gamma, attempt, np.inf if K is None else resonance_gain(problem, K))
+        return bracket.high, bracket.low
+
+
+class _Bracket:
+    """The smallest gamma reached below 1, the largest one that failed, and what is between them."""
+
+    def __init__(self, low: float, tolerance: float) -> None:
+        #: the largest gamma refuted, the largest one that failed, and the smallest one reached
+        self.low, self.failed, self.high = low, low, 1.0
+        self.tolerance, self.step = tolerance, 0.5 * tolerance
+        #: the last two gammas, with their rooms where these are known
+        self.known: list[tuple[float, FloatArray]] = []
+        #: number of secants since the bracket was last halved, and its width then
+        self.secants, self.width = 0, np.inf
+        #: whether no attempt has had rooms yet
+        self.blind = True
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the bracket is narrow enough, or gamma as good as zero."""
+        return self.high <= self.failed * (1.0 + self.tolerance) or self.high < SETTLED
+
+    def next_gamma(self) -> float:
+        """Return the gamma to try next."""
+        low = max(self.failed, 1e-2 * self.high)
+        middle = float(np.sqrt(low * self.high))
+        if self.blind:  # the limit is often next to the bound: steps that become wider
+            return min(middle, low * (1.0 + self.step))
+        width = float(np.log(self.high / low))
+        if width < 0.5 * self.width:
+            self.secants, self.width = 0, width
+        if len(self.known) < 2 or self.secants == _SECANTS or width < 2.0 * self.tolerance:
+            self.secants = 0
+            return middle
+        self.secants += 1
+        # rooms are nearly linear in t = gamma^-2
+        (g1, one), (g2, two) = self.known
+        t1, t2 = g1**-2, g2**-2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = (two - one) / (t2 - t1)
+            roots = t2 - two / slope
+        t = float(np.min(roots[slope < 0.0], initial=low**-2))
+        root = t**-0.5 if t > 0.0 else self.high
+        # beyond it on the side of the farther end
+        aside = 1.0 + 0.25 * self.tolerance
+        aim = root * aside if root < middle else root / aside
+        inner = 1.0 + 0.5 * self.tolerance
+        return float(np.clip(aim, low * inner, self.high / inner))
+
+    def narrow(self, gamma: float, attempt: _Attempt, gain: float) -> None:
+        """Take in what an attempt found, and the gain of its loop."""
+        self.step *= _WIDER
+        self.blind = self.blind and attempt.rooms is None
+        self.known = [*self.known[-1:], (gamma, attempt.rooms)] if attempt.rooms is not None else []
+        if gain <= gamma * (1.0 + _SLACK):
+            self.high = gamma
+            return
+        # rounding costs some of what is promised
+        self.high, self.failed = min(self.high, gain), gamma
+        if attempt.refuted:
+            self.low = gamma
 
 
 def back_off_controller(
@@ -238,14 +292,16 @@ def _loop_norm(problem: Prepared, controller: StateSpace) -> float:
 def resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     """Return the largest gain of the loop at its resonances: quick, at most its norm."""
     loop = lft(problem.system, controller)
+    through = float(np.linalg.norm(loop.D, 2))
     if not loop.n_states:
-        return float(np.linalg.norm(loop.D, 2))
-    poles = loop.poles()
+        return through
+    model, poles = residues(loop)
+    poles = loop.poles() if poles is None else poles
     if poles.real.max() >= 0:
         return np.inf
     freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
-    gains = largest_gains(responses(loop, freq))
-    return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
+    gains = responses(loop, freq) if model is None else model.responses(freq)
+    return max(float(largest_gains(gains).max()), through)
 
 
 class _Attempt(NamedTuple):
@@ -253,6 +309,8 @@ class _Attempt(NamedTuple):
 
     controller: StateSpace | None
     refuted: bool = False
+    #: what X, Y and both together leave until their limit, 0 there; infinite where unknown
+    rooms: FloatArray | None = None
 
 
 def _attempt(problem: Prepared, gamma: float) -> _Attempt:
@@ -260,13 +318,31 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     # refuted means proved, not that the numerics failed: X or Y is indefinite, or rho(X Y) >
     # gamma^2
     known, dual = both_sides(problem)
+    rooms, solutions = np.full(3, np.inf), []
     try:
-        (X, F), (Y, Ht) = known.solution(gamma), dual.solution(gamma)
-        if known.refutes(X, F) or dual.refutes(Y, Ht) or are_coupled(X, Y, gamma):
-            return _Attempt(None, True)
-        return _Attempt(central(problem, gamma, X, F, Y, Ht.T))
+        for i, side in enumerate((known, dual)):
+            X, F = side.solution(gamma)
+            values, vectors = la.eigh(X)
+            rooms[i] = _room(values)
+            if side.refutes(X, F, values, vectors):
+                return _Attempt(None, True, rooms)
+            solutions.append((X, F))
+        (X, F), (Y, Ht) = solutions
+        values = coupling(X, Y)
+        rooms[2] = _room(values) - gamma**-2
+        if values.max(initial=0.0) > gamma**2 * (1.0 + INACCURATE):
+            return _Attempt(None, True, rooms)
+        return _Attempt(central(problem, gamma, X, F, Y, Ht.T), rooms=rooms)
     except (la.LinAlgError, OnAxisError, FlexplantError):  # near the least gamma one of them fails
         return _Attempt(None)
+
+
+def _room(values: FloatArray) -> float:
+    """Return one over the eigenvalue that ends a solution: smooth in gamma, 0 at the limit."""
+    # the largest one becomes infinite at the limit and returns from the negative side beyond
+    least, most = np.min(values, initial=0.0), np.max(values, initial=0.0)
+    one = float(least if least < -INACCURATE * most else most)
+    return 1.0 / one if abs(one) > ROUNDING else np.inf
 
 
 def central(

@@ -26,7 +26,9 @@ _CLOSE = 0.0525
 
 def raised_bound(problem: Prepared, gamma: float, known: float, close: float = _CLOSE) -> float:
     """Return a known lower bound on what controllers reach, raised where it is far from gamma."""
-    # by the zeros on the imaginary axis, then by the Riccati equations
+    # by single frequencies, the zeros on the imaginary axis, and the Riccati equations, in turn
+    if known * (1.0 + close) < gamma:
+        known = max(known, pointwise_bound(problem))
     if known * (1.0 + close) < gamma:
         known = max(known, zero_bound(problem))
     if known * (1.0 + close) < gamma:
@@ -95,7 +97,7 @@ def _perp_norms(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) ->
     if M.shape[1] <= M.shape[2]:
         return np.zeros(M.shape[0])
     part = _adjoint(np.linalg.svd(M)[0][:, :, M.shape[2] :]) @ Pzw
-    return np.asarray(np.linalg.norm(part, 2, axis=(1, 2)))
+    return np.asarray(np.linalg.svd(part, compute_uv=False)[:, 0])
 
 
 def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
@@ -104,7 +106,7 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
 
 #: relative: errors of X and Y (their residuals are 1e-6), by which eigenvalues of X may be negative
 #: and rho(X Y) may exceed gamma^2; rounding of the terms of their equations
-_INACCURATE, _ROUNDED = 1e-5, 1e-14
+INACCURATE, _ROUNDED = 1e-5, 1e-14
 #: gamma is tried just below the value after a back-off of 5 %, then with squares of this fraction
 #: until one is refuted; then intervals are halved to a relative width
 _PART, _SQUARES, _WIDTH = 0.951, 8, 1e-3
@@ -136,7 +138,8 @@ class FullInformation(NamedTuple):
         D12 has full rank.
         """
         D, m1 = np.hstack([self.D11, self.D12]), self.D11.shape[1]
-        R = D.T @ D - la.block_diag(gamma**2 * np.eye(m1), np.zeros((len(D.T) - m1,) * 2))
+        R = D.T @ D
+        R[np.arange(m1), np.arange(m1)] -= gamma**2
         B = np.hstack([self.B1, self.B2])
         return stabilising(self.A, B, self.C.T @ self.C, R, self.C.T @ D)
 
@@ -150,14 +153,13 @@ class FullInformation(NamedTuple):
         if gamma <= self.direct:
             return None
         X, F = self.solution(gamma)
-        return None if self.refutes(X, F) else np.asarray(self.T @ X @ self.T.T)
+        return None if self.refutes(X, F, *la.eigh(X)) else np.asarray(self.T @ X @ self.T.T)
 
-    def refutes(self, X: FloatArray, F: FloatArray) -> bool:
+    def refutes(
+        self, X: FloatArray, F: FloatArray, values: FloatArray, vectors: FloatArray
+    ) -> bool:
         """Return whether a solution with its gain has a negative eigenvalue beyond rounding."""
-        if not X.size:
-            return False
-        values, vectors = la.eigh(X)
-        if values[0] >= -_INACCURATE * max(values[-1], -values[0]):
+        if not X.size or values[0] >= -INACCURATE * max(values[-1], -values[0]):
             return False
         # a residual of the equation moves X by the residual divided by twice the slowest decay
         x = vectors[:, 0]
@@ -233,10 +235,9 @@ def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
         values.append(X)
     if len(values) < 2:
         return False
-    return are_coupled(values[0], values[1], gamma)
+    return bool(coupling(*values).max(initial=0.0) > gamma**2 * (1.0 + INACCURATE))
 
 
-def are_coupled(X: FloatArray, Y: FloatArray, gamma: float) -> bool:
-    """Return whether rho(X Y) is above gamma^2, as far as X and Y are accurate."""
-    rho = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
-    return rho > gamma**2 * (1.0 + _INACCURATE)
+def coupling(X: FloatArray, Y: FloatArray) -> FloatArray:
+    """Return the eigenvalues of X Y, real where X or Y is semidefinite."""
+    return np.asarray(la.eigvals(X @ Y).real)

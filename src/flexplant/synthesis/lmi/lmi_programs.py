@@ -20,7 +20,7 @@ from ...store import Value, checked
 from ...tolerances import RANK, TINY
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
-from ..hinf.lower_bound import both_sides, pointwise_bound, raised_bound
+from ..hinf.lower_bound import both_sides, raised_bound
 from ..hinf.singular import Regularised
 from ..preparation import Prepared, beyond_rounding
 from ..scaling import FELT
@@ -335,7 +335,7 @@ class Lmi(Value):
                 "gamma has no minimum: the infimum is 0. u cancels w in z, at no cost. Weight the "
                 "efforts in z, or give the sensors noise in w."
             )
-        low = raised_bound(problem, high, pointwise_bound(problem), 0.0)
+        low = raised_bound(problem, high, 0.0, 0.0)
         if not high <= low * (1.0 + _GAP):
             raise SolverError(
                 f"the LMIs give a smallest gamma of {unit * high:.4g}, no proof excludes more than "
