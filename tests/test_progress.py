@@ -55,7 +55,7 @@ WORK = {
     "update, iterations": lambda: fx.update(rom, unknowns, [fx.Eigenvalues(poles)], starts=20),
     "parts of the record": lambda: fx.identification.identify_output_only(
         noise, rate=1e3, band=(20.0, 200.0), orders=range(4, 12, 2)),
-    "steps of the bisection": lambda: fx.design_hinf(weighted, fx.Riccati()),
+    "steps of the search": lambda: fx.design_hinf(weighted, fx.Riccati()),
 }
 def tried(work):
     try:

@@ -193,13 +193,15 @@ class _Bracket:
         self.step *= _WIDER
         self.blind = self.blind and attempt.rooms is None
         self.known = [*self.known[-1:], (gamma, attempt.rooms)] if attempt.rooms is not None else []
-        if gain <= gamma * (1.0 + _SLACK):
-            self.high = gamma
-            return
         # rounding costs some of what is promised
+        if gain <= max(gamma * (1.0 + _SLACK), np.sqrt(gamma * self.high)):
+            self.high = max(gamma, gain)
+            return
         self.high, self.failed = min(self.high, gain), gamma
         if attempt.refuted:
             self.low = gamma
+        else:  # by rounding, which secants do not see
+            self.known = []
 
 
 def back_off_controller(
