@@ -168,7 +168,7 @@ class _Site:
 
         mark = f"formula{len(self.formulas)}x"
         parts = " ".join(latex.split()).split(r"\qquad")  # separate, so that a line may end there
-        self.formulas[mark] = " &emsp; ".join(convert(part, display="inline") for part in parts)
+        self.formulas[mark] = " &emsp; ".join(convert(part, display=display) for part in parts)
         if display == "block":
             self.formulas[mark] = f'<div class="formula">{self.formulas[mark]}</div>'
         return mark
