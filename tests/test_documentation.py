@@ -87,7 +87,8 @@ def test_what_pdoc_does_not_read_is_put_in_its_words():
 def test_formulas_are_mathml_in_the_page():
     pytest.importorskip("latex2mathml")
     site = _Site()
-    text = "A\n\n    .. math:: \\frac{a}{b} +\n        c_1\n\n    B, $x^2$\n\n$$y = 1, \\qquad z = 2$$\n"
+    text = "A\n\n    .. math:: \\frac{a}{b} +\n        c_1\n\n    B, $x^2$\n\n"
+    text += "$$y = 1, \\qquad z = 2$$\n"
     page = site.finished("", site.markdown(text))
     formulas = re.findall(r"<math.*?</math>", page)
     assert [ET.fromstring(one).get("display") for one in formulas] == [
