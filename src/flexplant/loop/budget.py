@@ -60,8 +60,8 @@ class ErrorBudget(Value):
     certificate : Certificate
         Relative differences of the variance computed in other ways.
     interval : str
-        Where the rms lies on the machines that are known of the plant, or what is missing for that;
-        empty where none are known.
+        Interval of the rms on the machines that agree with the measurement, or the reason
+        why it does not exist; empty where no machines are known.
 
     Examples
     --------

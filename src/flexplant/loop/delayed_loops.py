@@ -43,7 +43,8 @@ class DelayedLoop(Value):
     Raises
     ------
     ModelError
-        When neither has a delay, or their product differentiates: no loop has that.
+        When neither has a delay, or when their product differentiates, which no real loop
+        does.
 
     References
     ----------
@@ -218,8 +219,9 @@ class DelayedLoop(Value):
     def margins(self) -> dict[str, tuple[float, float]]:
         """Least gain, phase and delay margins of a loop of one channel, each with its frequency.
 
-        ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``; gain margins below 1
-        are those of a loop that is only stable above a gain. What does not exist is infinite.
+        ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``; a gain margin
+        below 1 is that of a loop that becomes unstable when its gain falls. Margins that do
+        not exist are infinite.
         """
         if len(self.gain.inputs) != 1 or len(self.gain.outputs) != 1:
             raise ModelError(

@@ -17,7 +17,7 @@ NOT_MEASURED = "not judged on a measurement"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OnMeasurement(Value):
-    """What a measured response of the machine says of a loop: no model is in it.
+    """Stability and margin of a loop on a measured response of the machine, without a model.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ class LoopMargins(Value):
     modulus_margin : float
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
-        Frequency of the modulus margin.
+        Frequency at which the modulus margin occurs.
     gain_freq, phase_freq : float [Hz]
         Frequencies of the smaller gain margin and of the phase margin; NaN without them.
     phases : tuple of float [deg]
@@ -377,7 +377,8 @@ class LoopComparison(Value):
     unjudged : sequence of str
         Loops whose plants have no evaluation model.
     intervals : mapping {name: str}
-        Of loops whose machines are known: where margin and bandwidth lie, or what is missing.
+        Intervals of margin and bandwidth of each loop whose machines are known, or the
+        reason why they do not exist.
     """
 
     rows: Mapping[str, LoopFigures]

@@ -29,14 +29,14 @@ _MANY = 24
 class Exchange(Search):
     """Greedy choice, then exchanges of one candidate at a time; again from other starts.
 
-    Each start ends where no single exchange helps. Of many exchanges only those are scored that a
-    lower bound does not exclude, where the criterion has one.
+    Each start ends where no single exchange helps. Where the criterion has a lower bound, only
+    the exchanges that it does not exclude are scored.
 
     Parameters
     ----------
     starts : int
-        The greedy one and `starts - 1` random ones. Where the criterion has a relaxation the choice
-        of the largest relaxed weights is one more.
+        Number of starts: one is greedy, the others are random. Where the criterion has a
+        relaxation, the choice of the largest relaxed weights is one more start.
 
     Examples
     --------
@@ -252,8 +252,9 @@ class BranchAndBound(Search):
     Parameters
     ----------
     gap : float
-        It ends when no choice can be better by more than this fraction of the value (a variance: of
-        its root about half as much); 0 for the optimum.
+        Relative gap at which the search ends: no choice is better by more than this
+        fraction of the value (for a variance, the rms is better by at most about half of
+        it). 0 finds the optimum.
     branches : int
         Largest number of branches to open; the search then ends with the gap that was reached and a
         warning; 0 leaves the exchanges at the start and the bound of the relaxation.

@@ -173,8 +173,8 @@ class ClosedLoopH2(MotionAndEffort):
 
         J = tr(S W) + tr(F' (effort^2 I + B' S B) F P)
 
-    More sensors or actuators never make it larger. `PoiLqr` is its part without any error of the
-    estimate, `PoiVariance` that without any limit of control: it is above both.
+    More sensors or actuators never make it larger. It is never below `PoiLqr`, which assumes
+    that the state is known, nor below `PoiVariance`, which assumes unlimited control.
 
     Parameters
     ----------
@@ -227,9 +227,10 @@ class ClosedLoopH2(MotionAndEffort):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the candidates alone; all else is computed once.
 
-        A delay of d whole samples costs what cannot be done meanwhile, and the control acts on the
-        state predicted d samples ahead, P_d. A fraction of a sample, filters and delays of ports:
-        the plant is made anew for each choice.
+        With a delay of d whole samples the control acts on the state predicted d samples
+        ahead, and the motion in these samples is added to the cost. With a fractional
+        delay, or ports with filters or delays, the plant is assembled again for each
+        choice.
         """
         if plant.delay % 1.0 or not plain(plant, candidates):
             return super().scorer(plant, candidates)

@@ -342,10 +342,11 @@ class Excluded(Constraint):
 class OffPoi(Constraint):
     """No candidate on a POI: what is there cannot be measured.
 
-    Sensors are never placed on the point of a POI, but for those that the plant has. A radius keeps
-    all off the whole die; a negative one allows all places. A POI that is relative to another body,
-    ``at={"tip:x": 1, "frame:x": -1}``, is where its positive weights are, or at the others if the
-    plant's own relative sensors touch only the positive ones: others may measure against the frame.
+    Sensors are never placed at a POI, except those that the plant already has there. A radius
+    excludes the whole die; a negative radius allows all places. A relative POI, ``at={"tip:x":
+    1, "frame:x": -1}``, lies at its points of positive weight. It lies at the other points if
+    the plant's own relative sensors touch only the positive ones. The reference points are not
+    excluded: other sensors may measure against the frame.
 
     Parameters
     ----------
@@ -409,9 +410,9 @@ class ZoneLimits(Constraint):
         check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the count inside between its check_limits, or x_i <= 0 outside."""
-        inside = places.inside(_zone_list(self.zones))
-        if self.at_least is None and self.at_most is None:
+        """Return the limits on the number inside, or x_i <= 0 outside.""" inside =
+        places.inside(_zone_list(self.zones)) if self.at_least is None and self.at_most is
+        None:
             return LinearRows.closed(inside == 0)
         return LinearRows.counted(inside, self.at_least, self.at_most)
 
@@ -427,8 +428,9 @@ class MinimumDistance(Constraint):
     Parameters
     ----------
     distance : float [m]
-        Between the nearest points of the two. Two that measure against the same place may share
-        it: points of negative weight have no distance from each other.
+        Distance between the nearest points of two candidates. Two candidates may measure
+        against the same reference: distances between points of negative weight do not
+        count.
 
     Examples
     --------

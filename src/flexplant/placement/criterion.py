@@ -148,7 +148,8 @@ class Criterion(Value):
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the interval of its root over that of another plant, machine by machine.
+        """Return the interval of the ratio of its root to that of another plant, machine by
+        machine.
 
         It is empty where the plant's machines are not known, or the criterion has no such root.
         """

@@ -175,11 +175,12 @@ class Placement(Value):
     value : float
         Value of the criterion.
     bound : float
-        No choice of as many candidates is better than this: the value itself when the optimum is
-        proven (by every subset, or by branch and bound); else by convex relaxation, for mean
-        squares (`PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, what wraps them)
-        where no port has a filter or delay, and for log det; for other sums the value of all
-        candidates together; minus infinity for a callable.
+        Lower bound for every choice of the same number of candidates: the value itself when
+        the optimum is proven (by every subset, or by branch and bound); else by convex
+        relaxation, for mean squares (`PoiVariance` of the plant's own modes, `PoiLqr`,
+        `ClosedLoopH2`, what wraps them) where no port has a filter or delay, and for log
+        det; for other sums the value of all candidates together; minus infinity for a
+        callable.
     evaluations : int
         Choices that were scored.
     history : tuple of tuples of float
@@ -191,7 +192,7 @@ class Placement(Value):
     side : {"y", "u", "yu"}
         Whether they are sensors, actuators, or both.
     stopped : str
-        Why the search ended before it had proven what it should; empty when it did not.
+        Reason why the search ended early; empty if it was completed.
     unit : str
         Unit of the square root of the value, where it is a mean square of a motion.
     unjudged : str
@@ -200,8 +201,9 @@ class Placement(Value):
         Sensors or actuators of the plant that were not among the candidates: none of them is part
         of the choice, and the value is that without them.
     interval : str
-        Error over that with the plant's own sensors on 95 % of the plant's machines, or what is
-        missing for this interval; empty where no machines are known.
+        Ratio of the error to that with the plant's own sensors on 95 % of the plant's
+        machines, or the reason why this interval does not exist; empty where no machines
+        are known.
 
     Examples
     --------

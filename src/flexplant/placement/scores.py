@@ -37,7 +37,7 @@ class Scores(Value):
     reasons : sequence of str
         Why a layout is infeasible; empty when it is not.
     order : (n,) array of int
-        Where each layout stood in the list that was given.
+        Index of each layout in the given list.
     criterion : str
         What was scored.
     candidates : sequence of Sensor or Actuator
@@ -49,8 +49,9 @@ class Scores(Value):
     unjudged : str
         What is said of such motions where the plant has no evaluation model.
     interval : str
-        Error of the best layout over that of the next one on 95 % of the plant's machines, or what
-        is missing for this interval; empty where no machines are known.
+        Ratio of the error of the best layout to that of the next one on 95 % of the plant's
+        machines, or the reason why this interval does not exist; empty where no machines
+        are known.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -312,7 +313,7 @@ def device_worth(
     Parameters
     ----------
     plant : StandardPlant
-        Sampled; that of the placement, or another one of the machine.
+        Sampled plant of the placement, or another plant of the same machine.
     placement : Placement
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
@@ -417,8 +418,8 @@ def sensor_map(
     direction, quantity : str
         Direction and quantity that it measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
-        a POI is, unless OffPoi(-1) is among them.
+        As for `place_sensors`: points at which a further sensor violates one are left out,
+        as are points on a POI unless OffPoi(-1) is among the constraints.
 
     Returns
     -------

@@ -70,19 +70,20 @@ def place_sensors(
         Sampled, assembled from a structure. Its own sensors are used where they are candidates;
         the answer names those that are not (`Placement.left_out`).
     candidates : sequence of Sensor
-        Each may be chosen once; a name stands for one of the plant's own.
+        Candidates, each chosen at most once; a name means a sensor of the plant.
     count : int
-        How many are chosen, `required` included.
+        Number of sensors to choose, `required` included.
     criterion : PoiVariance or callable, optional
         Function of a plant that returns a float, smaller is better; by default `PoiVariance()`.
     required : sequence of str
         Candidates that any choice includes.
     constraints : sequence of Constraint, optional
-        What every choice satisfies: Excluded, OffPoi, ZoneLimits, MinimumDistance,
-        Among, Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
+        Constraints on every choice: Excluded, OffPoi, ZoneLimits, MinimumDistance,
+        CountLimits, JointGroups, Budget. No sensor is placed on a POI unless OffPoi(-1) is
+        among them.
     method : Search, optional
-        Exchange, BranchAndBound, Exhaustive or ByRows. By default every subset is tried if
-        there are at most 1500, otherwise `Exchange()`.
+        Exchange, BranchAndBound, Exhaustive, Screened or RowSelection. By default every
+        subset is tried if there are at most 1500, otherwise `Exchange()`.
     executor : concurrent.futures.Executor, optional
         Works on starts, chunks of subsets or branches; the result is the same to the bit. When a
         process of a pool dies, its part is done once more.
@@ -387,7 +388,7 @@ class ParetoCurve(Value):
     placements : sequence of Placement
         The best that was found for each.
     bounds : (n,) array
-        No choice of that count (within that budget) is better.
+        Lower bounds for every choice of that count (or within that budget).
     by_cost : bool
         Whether amounts are budgets.
     """

@@ -337,8 +337,8 @@ class OverPositions(Several):
     criterion, measure
         As for `OverMachines`, over the positions.
     points : int or mapping {name: int or array}
-        How many values of each position are taken over its range, or which [m or rad]. Between
-        them nothing is known: compare with more of them.
+        Number of values of each position over its range, or the values [m or rad]. Nothing
+        is known between them: compare with more values.
 
     Raises
     ------
@@ -416,7 +416,8 @@ class LossScores(Scorer):
 class DeviceLoss(Wrapping):
     """The worst or the mean of a criterion after the loss of any one device.
 
-    Infinite where the others do not suffice: choose one more than the least number.
+    It is infinite where the remaining devices do not suffice: choose at least one more than the
+    least number.
 
     Parameters
     ----------
