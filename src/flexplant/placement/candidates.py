@@ -139,8 +139,8 @@ class Places:
         if len(self.points) < self.total:
             raise ModelError(
                 "the plant was made elsewhere, and where its sensors and actuators are is not "
-                "known: constraints on places have no meaning. Use JointGroups, CountLimits or Budget, "
-                "which go by names, or leave candidates out of the list."
+                "known: constraints on places have no meaning. Use JointGroups, CountLimits or "
+                "Budget, which go by names, or leave candidates out of the list."
             )
 
 

@@ -343,10 +343,10 @@ class OffPoi(Constraint):
     """No candidate on a POI: what is there cannot be measured.
 
     Sensors are never placed at a POI, except those that the plant already has there. A radius
-    excludes the whole die; a negative radius allows all places. A relative POI, ``at={"tip:x":
-    1, "frame:x": -1}``, lies at its points of positive weight. It lies at the other points if
-    the plant's own relative sensors touch only the positive ones. The reference points are not
-    excluded: other sensors may measure against the frame.
+    excludes the whole die; a negative radius allows all places. A relative POI such as
+    ``at={"tip:x": 1, "frame:x": -1}`` lies at its points of positive weight. It lies at the other
+    points if the plant's own relative sensors touch only the positive ones. The reference points
+    are not excluded: other sensors may measure against the frame.
 
     Parameters
     ----------
@@ -410,9 +410,9 @@ class ZoneLimits(Constraint):
         check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the limits on the number inside, or x_i <= 0 outside.""" inside =
-        places.inside(_zone_list(self.zones)) if self.at_least is None and self.at_most is
-        None:
+        """Return the limits on the number inside, or x_i <= 0 outside."""
+        inside = places.inside(_zone_list(self.zones))
+        if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)
         return LinearRows.counted(inside, self.at_least, self.at_most)
 

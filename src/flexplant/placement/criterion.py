@@ -148,8 +148,7 @@ class Criterion(Value):
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the interval of the ratio of its root to that of another plant, machine by
-        machine.
+        """Return the interval of the ratio of its root to that of another plant, by machine.
 
         It is empty where the plant's machines are not known, or the criterion has no such root.
         """
