@@ -137,11 +137,14 @@ def _error(reference, names):
 
 
 def inverse_error(plant, feedforward, freq):
-    """Return max |P F - 1| of one reference: derivatives of a sine through gains and plant."""
-    g, f = plant.system, feedforward
+    """Return max |P F - 1| of one reference: derivatives of a sine through block and plant."""
+    g, f, block = plant.system, feedforward, feedforward.system
     u = [g.inputs.index(name) for name in f.actuators]
     poi = g.outputs.index(_error(f.reference, plant.z))
     s = 2j * np.pi * freq
     P = gain(g.A, g.B[:, u], -g.C[[poi]], -g.D[[poi]][:, u], np.exp(s * g.dt))
-    forces = f.T @ (f.gains[0] @ np.array([s**m for m in range(5)]))
-    return float(np.max(np.abs(np.einsum("fi,if->f", P[:, 0], forces) - 1.0)))
+    terms = ("velocity", "acceleration", "jerk", "snap")
+    orders = [0 if n == f.reference else 1 + terms.index(n.split(":")[-1]) for n in block.inputs]
+    forces = gain(block.A, block.B, block.C, block.D, np.exp(s * g.dt))
+    forces = np.einsum("fik,fk->fi", forces, s[:, None] ** np.array(orders))
+    return float(np.max(np.abs(np.einsum("fi,fi->f", P[:, 0], forces) - 1.0)))

@@ -105,6 +105,7 @@ def made():
     yield error_map(loop, CORNERS, duration=0.02)
     forward = fx.design_feedforward(sampled)
     yield from (forward, LearnedFeedforward(forward, np.ones(2), np.ones((2, 3, 5))))
+    yield fx.plant.SlowZeros(np.array([-1.0 + 5.0j]), np.array([[1.0j]]), 1e-3)
     yield from (fx.Specification(noise=1e-6), fx.Specification(noise=1e-6).check(loop))
     yield from (fx.simulation.Saturation(1.0, rate=10.0), fx.simulation.Quantiser(1e-9))
     yield from (fx.simulation.Hysteresis(0.1), fx.simulation.Dropout(0.01))

@@ -20,6 +20,7 @@ from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
 from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
+from ..plant.slow_zeros import SlowZeros, slow_zeros
 from ..store import Value
 from ..tolerances import SAME
 from ..words import instance, name_list
@@ -41,10 +42,10 @@ _LEFT = 0.2
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Feedforward(Value):
-    """Forces proportional to a set-point and its derivatives; a block for `close_loop`.
+    """Forces of a set-point and its derivatives; a block for `close_loop`.
 
-    ``u = T sum_m gains[m] d^m r / dt^m``, T from a total force of each axis to the actuators. Made
-    by `design_feedforward`.
+    ``u = T sum_m gains[m] d^m r / dt^m``, T from a total force of each axis to the actuators, and
+    what slow zeros of the plant add to it. Made by `design_feedforward`.
 
     Parameters
     ----------
@@ -60,6 +61,9 @@ class Feedforward(Value):
         places.
     dt : float [s]
         Sampling time of the plant.
+    zeros : SlowZeros, optional
+        Filters of the highest derivative that invert zeros as slow as moves, such as those of a
+        frame on isolators. They are zero at rest.
     """
 
     reference: str
@@ -68,6 +72,7 @@ class Feedforward(Value):
     actuators: tuple[str, ...]
     gains: FloatArray
     dt: float
+    zeros: SlowZeros | None = None
 
     def __repr__(self) -> str:
         places = f", {counted(len(self.gains), 'place')}" if len(self.gains) > 1 else ""
@@ -76,11 +81,16 @@ class Feedforward(Value):
         for axis, row in zip(self.axes, self.gains[0], strict=True):
             shown = "  ".join(f"{t} {g:.4g}" for t, g in zip(TERMS, row, strict=True) if g)
             lines.append(f"  {axis}: {shown or 'nothing'}")
+        if self.zeros is not None:
+            slow = ", ".join(f"{f:.4g}" for f in self.zeros.freq)
+            lines.append(f"  and the inverse of zeros at {slow} Hz")
         return "\n".join(lines)
 
     @property
     def system(self) -> StateSpace:
-        """The block: static, from the reference and its derivatives to the actuators.
+        """The block from the reference and its derivatives to the actuators.
+
+        It is static, or has two states for each of the slow zeros.
 
         Raises
         ------
@@ -94,12 +104,21 @@ class Feedforward(Value):
                 "forces(move, time) to "
                 "simulate as references."
             )
-        used = [m for m in range(5) if np.any(self.gains[0, :, m])] or [2]
+        used = [m for m in range(5) if np.any(self.gains[0, :, m])] or [self._highest]
         names = [self.reference if m == 0 else f"{self.reference}:{TERMS[m]}" for m in used]
+        named: dict[str, Any] = {"inputs": names, "outputs": self.actuators, "name": "feedforward"}
         D = self.T @ self.gains[0][:, used]
-        return StateSpace(
-            [], [], [], D, self.dt, inputs=names, outputs=self.actuators, name="feedforward"
-        )
+        if self.zeros is None:
+            return StateSpace([], [], [], D, self.dt, **named)
+        A, B, C, direct = self.zeros.filters(used[-1])
+        D[:, -1:] += self.T @ direct
+        B = np.hstack([np.zeros((len(B), len(used) - 1)), B])
+        return StateSpace(A, B, self.T @ C, D, self.dt, **named)
+
+    @property
+    def _highest(self) -> int:
+        """The order of the highest derivative with a gain, which drives the filters."""
+        return max((m for m in range(5) if np.any(self.gains[:, :, m])), default=2)
 
     def up_to(self, term: str) -> Feedforward:
         """Return the feedforward without the derivatives above position, velocity, ... or snap."""
@@ -111,13 +130,17 @@ class Feedforward(Value):
         """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
 
         If the gains depend on the place, the number of times must equal that of the places. A
-        set-point of an order below that of the highest gain is refused.
+        set-point of an order below that of the highest gain is refused. Filters of slow zeros have
+        a past: the times are then the samples of the plant, from rest on.
         """
-        _check_order(move, self.gains)
+        _check_order(move, self._highest)
         t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))
         signals = np.array(move.at(t))
         gains = np.broadcast_to(self.gains, (t.size, *self.gains.shape[1:]))
-        u = np.einsum("tam,mt->ta", gains, signals) @ self.T.T
+        u = np.einsum("tam,mt->ta", gains, signals)
+        if self.zeros is not None:
+            u = u + self.zeros.run(signals[self._highest], t, self._highest)
+        u = u @ self.T.T
         return {force_name(name): u[:, i] for i, name in enumerate(self.actuators)}
 
 
@@ -138,9 +161,15 @@ def design_feedforward(
     the negative compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
     are stiffness and damping. The coefficients are Cauchy integrals on the largest circle around
     zero on which two radii agree and inside which the expansion equals the inverse; a zero of P (a
-    mass on a spring near the POI) lies outside. All axes that the actuators move independently
-    (`flexplant.plant.driven_axes`) are treated together, including the forces that keep the axes
-    without a reference at rest.
+    mass on a spring near the POI) lies outside.
+
+    The frame of a machine on isolators gives P zeros within the band, beyond which an expansion at
+    rest is wrong. Of a sampled plant stable zeros below a hundredth of the rate are inverted
+    exactly, by filters of the highest derivative that are zero at rest (`zeros`); a warning names
+    unstable ones. Filters depend on the past, so that gains along places have none.
+
+    All axes that the actuators move independently (`flexplant.plant.driven_axes`) are treated
+    together, including the forces that keep the axes without a reference at rest.
 
     In a loop the gains minimise, by least squares, its error ``G_u F + G_r - 1``, with G_u and G_r
     the responses of the POI to forces and reference in closed loop: where sensors and POI move
@@ -185,7 +214,8 @@ def design_feedforward(
     Warns
     -----
     FlexplantWarning
-        When the remaining error of the loop is a fifth or more; when a move exceeds a Saturation.
+        When the remaining error of the loop is a fifth or more; when a move exceeds a Saturation;
+        when the inverse of a plant has a slow unstable pole.
 
     References
     ----------
@@ -214,8 +244,10 @@ def design_feedforward(
     elif elements is not None:
         raise ModelError("elements are compared with a move: pass design_feedforward(loop, "
                          "move=move, elements=...).")  # fmt: skip
-    gains = at_rest(axes.inverse(_forced(plant, ()), along), plant.dt, axes.axes)
-    if loop is not None and (loop.blocks or move is not None):
+    closed = loop is not None and bool(loop.blocks or move is not None)
+    zeros = axes.slow_zeros(plant, closed) if along is None else None
+    gains = at_rest(axes.inverse(_forced(plant, ()), along, zeros), plant.dt, axes.axes)
+    if loop is not None and closed:
         last = highest if move is None else min(highest, move.order)
         # a force proportional to the position would remain after the move of a free machine
         first = 0 if move is not None or np.any(gains[..., 0]) else 1
@@ -223,9 +255,9 @@ def design_feedforward(
         freq, size = _moved_size(loop, name, poi.derived(axis, "error"), move)
         moved = axes.moved(_forced(plant, loop.blocks), along)
         gains = np.zeros_like(gains)
-        gains[:, :, orders] = _least(moved, freq, size, axes.wanted, orders)
+        gains[:, :, orders], zeros = _least(moved, freq, size, axes.wanted, orders, zeros)
     gains[:, :, highest + 1 :] = 0.0
-    return Feedforward(name, axes.axes, axes.T, tuple(plant.u), gains, plant.dt)
+    return Feedforward(name, axes.axes, axes.T, tuple(plant.u), gains, plant.dt, zeros)
 
 
 def known_forces(plant: StandardPlant) -> StateSpace:
@@ -329,13 +361,29 @@ class _Tracking(NamedTuple):
 
         return found
 
-    def inverse(self, forced: ClosedLoop, along: npt.ArrayLike | None) -> OfS:
-        """Return the function of s that gives F (p, r) of a loop at p places."""
+    def slow_zeros(self, plant: StandardPlant, closed: bool) -> SlowZeros | None:
+        """Return the slow zeros that the forces invert; warn of unstable ones without a loop."""
+        found, unstable = slow_zeros(plant, self.T, self.axes, self.wanted)
+        if unstable.size and not closed:
+            listed = ", ".join(f"{f:.4g}" for f in unstable)
+            warn(
+                f"the inverse of the plant for {self.name} has unstable poles at {listed} Hz, so "
+                "that forces of derivatives follow moves well below these frequencies only. Use "
+                "simulation.inverse_forces, which acts ahead of the set-point, or put sensors, "
+                "POI and actuators closer together."
+            )
+        return found
+
+    def inverse(
+        self, forced: ClosedLoop, along: npt.ArrayLike | None, zeros: SlowZeros | None
+    ) -> OfS:
+        """Return the function of s of F (p, r) of a loop at p places, less its slow zeros."""
         moved = self.moved(forced, along)
 
         def found(s: complex) -> ComplexArray:
             both = moved(s)
-            return solved(both[:, :, :-1], self.wanted - both[:, :, -1:], self.axes)[..., 0]
+            F = solved(both[:, :, :-1], self.wanted - both[:, :, -1:], self.axes)[..., 0]
+            return F if zeros is None else F - zeros.at(s)
 
         return found
 
@@ -363,13 +411,20 @@ def _moved_size(
 
 
 def _least(
-    moved: OfS, freq: FloatArray, size: FloatArray, wanted: FloatArray, orders: IntArray
-) -> FloatArray:
-    """Return the gains (p, r, orders) of the least errors of a loop, weighted by frequency."""
-    s = 2j * np.pi * freq
+    moved: OfS,
+    freq: FloatArray,
+    size: FloatArray,
+    wanted: FloatArray,
+    orders: IntArray,
+    zeros: SlowZeros | None,
+) -> tuple[FloatArray, SlowZeros | None]:
+    """Return gains (p, r, orders) and slow zeros of the least errors of a loop, by frequency."""
+    s: ComplexArray = np.asarray(2j * np.pi * freq)
     weight = size * np.sqrt(freq)  # of equal ratios of frequencies
     both = np.array([moved(complex(one)) for one in s]) * weight[:, None, None, None]
     powers = s[:, None] ** orders
+    if zeros is not None:
+        powers = np.hstack([powers, zeros.responses(s, int(orders[-1]))])
     found = []
     for p in range(both.shape[1]):
         effects = np.einsum("fij,fm->fijm", both[:, p, :, :-1], powers)
@@ -387,8 +442,12 @@ def _least(
                 "reference_errors(plant, order=4), make a slower move (move=...), lower the "
                 "bandwidth, or use simulation.inverse_forces."
             )
-        found.append((gains / unit).reshape(wanted.shape[0], orders.size))
-    return np.array(found)
+        found.append((gains / unit).reshape(wanted.shape[0], -1))
+    gains = np.array(found)
+    if zeros is not None:
+        real, imag = np.split(gains[0, :, orders.size :], 2, axis=1)
+        zeros = zeros.replace(residues=real + 1j * imag)
+    return gains[:, :, : orders.size], zeros
 
 
 def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
@@ -412,9 +471,8 @@ def term_numbers(terms: Any) -> list[int]:
     return [_term_index(term) for term in listed]
 
 
-def _check_order(move: Any, gains: FloatArray) -> None:
+def _check_order(move: Any, highest: int) -> None:
     instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
-    highest = max((m for m in range(5) if np.any(gains[:, :, m])), default=0)
     if move.order < highest:
         raise ModelError(
             f"the feedforward uses the {TERMS[highest]}, but {move!r} is of order {move.order}, "

@@ -1,0 +1,161 @@
+"""Slow zeros of a plant: oscillating poles of its inverse, which no expansion at rest contains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg as la
+
+from ..arrays import ComplexArray, FloatArray, complex_array, divisor
+from ..errors import ModelError
+from ..store import Value, checked
+from ..tolerances import MISSED, NEGLIGIBLE, PRECISION, SPLIT
+from .axes import complex_gain, resting_frequency, usual_frequency
+from .partitioned import Partition
+from .port import DERIVATIVES
+
+#: times that the rows and columns of the pencil are brought to one size
+_SWEEPS = 5
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SlowZeros(Value):
+    """Poles of the inverse of a plant, ``F(s) = sum_i c_i / (s - p_i) + ...``, that are slow.
+
+    Beyond ``k_0 + ... + k_m s^m`` of the expansion at rest they add ``s^m`` times a filter that is
+    zero at rest: ``sum_i c_i / p_i^(m + 1) s / (s - p_i)``.
+
+    Parameters
+    ----------
+    poles : (k,) complex array [rad/s]
+        Upper half plane; each counts with its conjugate.
+    residues : (r, k) complex array
+        c_i of the force of each axis.
+    dt : float [s]
+        Sampling time; the filters then use ``(z - 1) / dt`` in place of s.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.ball_screw()
+    >>> fx.design_feedforward(plant).zeros
+    <SlowZeros 13.1 Hz>
+    """
+
+    poles: ComplexArray = field(metadata=checked(complex_array, unit="rad/s", shape=(None,)))
+    residues: ComplexArray = field(metadata=checked(complex_array, shape=(None, "poles")))
+    dt: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"<SlowZeros {', '.join(f'{f:.3g}' for f in self.freq)} Hz>"
+
+    @property
+    def freq(self) -> FloatArray:
+        """The frequencies [Hz], in order."""
+        return np.sort(np.abs(self.poles)) / (2.0 * np.pi)
+
+    @property
+    def _rates(self) -> ComplexArray:
+        """The poles as ``(z - 1) / dt``; s where the plant is continuous."""
+        rates = np.expm1(self.poles * self.dt) / self.dt if self.dt else self.poles
+        return np.asarray(rates, dtype=np.complex128)
+
+    def _gains(self, order: int) -> ComplexArray:
+        """Return the gain (k,) of a filter of a derivative for a residue of 1."""
+        return np.asarray(np.exp(self.poles * self.dt) / (self.poles**order * self._rates))
+
+    def responses(self, s: ComplexArray, order: int) -> ComplexArray:
+        """Return what real and imaginary parts of residues add (n, 2 k) at any s [rad/s]."""
+        at = np.asarray(s)[:, None]
+        rate = np.expm1(at * self.dt) / self.dt if self.dt else at
+        gains, rates = self._gains(order), self._rates
+        one = gains * rate / (rate - rates)
+        other = gains.conj() * rate / (rate - rates.conj())
+        return np.asarray(at**order * np.hstack([one + other, 1j * (one - other)]))
+
+    def at(self, s: complex) -> ComplexArray:
+        """Return what they add (r,) to an expansion of order 4 at any s [rad/s]."""
+        parts = np.hstack([self.residues.real, self.residues.imag])
+        return np.asarray(parts @ self.responses(np.array([s]), len(DERIVATIVES))[0])
+
+    def filters(self, order: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A, B, C, D from a derivative of the set-point to the forces of axes."""
+        gains, rates = self.residues * self._gains(order), self._rates
+        A = la.block_diag(*(np.array([[p.real, -p.imag], [p.imag, p.real]]) for p in rates))
+        B = np.tile([[1.0], [0.0]], (rates.size, 1))
+        driven = 2.0 * gains * rates
+        C = np.stack([driven.real, -driven.imag], axis=-1).reshape(len(gains), -1)
+        D = 2.0 * gains.real.sum(axis=1)[:, None]
+        return (np.eye(len(A)) + self.dt * A, self.dt * B, C, D) if self.dt else (A, B, C, D)
+
+    def run(self, driving: FloatArray, time: FloatArray, order: int) -> FloatArray:
+        """Return the forces of axes (n_time, r) to a derivative of the set-point at samples."""
+        from scipy.signal import dlsim
+
+        if not self.dt or not np.allclose(np.diff(time), self.dt, rtol=SPLIT):
+            raise ModelError(
+                f"the filters of {self!r} have a past: give the times of samples of a sampled "
+                "plant, np.arange(n) * plant.dt, or close the loop with feedforward.system."
+            )
+        return np.asarray(dlsim((*self.filters(order), self.dt), driving)[1])
+
+
+def slow_zeros(
+    plant: Partition, T: FloatArray, axes: Sequence[str], wanted: FloatArray
+) -> tuple[SlowZeros | None, FloatArray]:
+    """Return the slow stable poles of the inverse ``(G T)^-1 wanted``, and unstable ones [Hz].
+
+    Slow is below the usual bandwidth of the plant (`driven_axes`), which a continuous plant does
+    not tell: its filters would be those of all its modes. Poles that hardly change the
+    forces, even at their own frequency, those without damping and stable real ones are left out.
+    """
+    if not plant.dt:
+        return None, np.zeros(0)
+    poles, residues = _poles_of_inverse(plant, T, axes, wanted)
+    speed, last = np.abs(poles), 2.0 * np.pi * usual_frequency(plant)
+    inside = (poles.imag >= 0.0) & (speed < last)
+    inside &= speed > 2.0 * np.pi * resting_frequency(plant)
+    inside &= np.abs(poles.real) > MISSED * speed
+    felt = []
+    for i in np.flatnonzero(inside):
+        G = complex_gain(plant.system, 1j * speed[i], axes, plant.u) @ T
+        force = np.abs(np.linalg.solve(G, wanted)[:, 0])
+        part = np.abs(residues[:, i] / poles[i].real)
+        if np.any(part > NEGLIGIBLE * np.max(force)):
+            felt.append(i)
+    chosen = np.array(felt, dtype=int)
+    stable = chosen[(poles[chosen].real < 0.0) & (poles[chosen].imag > 0.0)]
+    unstable = np.sort(speed[chosen[poles[chosen].real > 0.0]]) / (2.0 * np.pi)
+    if not stable.size:
+        return None, unstable
+    return SlowZeros(poles[stable], residues[:, stable], plant.dt), unstable
+
+
+def _poles_of_inverse(
+    plant: Partition, T: FloatArray, axes: Sequence[str], wanted: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the finite poles [rad/s] of ``(G T)^-1 wanted``, and their residues (r, k)."""
+    # [A - p I, B T; C, D T] x = 0 has the residue -x_u (y_u . wanted) / (y . E x), y from the left
+    g, dt = plant.system, plant.dt
+    n, rows, columns = g.n_states, g.output_index(list(axes)), g.input_index(list(plant.u))
+    A, B = (g.A - np.eye(n)) / dt, g.B / dt
+    pencil = np.block([[A, B[:, columns] @ T], [g.C[rows], g.D[np.ix_(rows, columns)] @ T]])
+    E = np.zeros_like(pencil)
+    E[:n, :n] = np.eye(n)
+    left, right = np.ones(len(E)), np.ones(len(E))
+    for _ in range(_SWEEPS):
+        size = np.abs(left[:, None] * pencil * right)
+        left = left / np.sqrt(divisor(size.max(axis=1)))
+        right = right / np.sqrt(divisor(np.abs(left[:, None] * pencil * right).max(axis=0)))
+    both = left[:, None] * pencil * right, left[:, None] * E * right
+    values, y, x = la.eig(*both, left=True, right=True, homogeneous_eigvals=True)
+    finite = np.abs(values[1]) > PRECISION * np.abs(values[0])
+    rates = values[0, finite] / values[1, finite]
+    x, y = right[:, None] * x[:, finite], left[:, None] * y[:, finite].conj()
+    size = np.einsum("ij,ij->j", y, E @ x)
+    residues = -x[n:] * (y[n:].T @ wanted)[:, 0] / np.where(size == 0.0, np.inf, size)
+    turned = 1.0 + dt * rates
+    turned = np.where(turned == 0.0, PRECISION, turned)
+    return np.asarray(np.log(turned) / dt), np.asarray(residues / turned)
