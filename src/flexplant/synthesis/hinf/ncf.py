@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -15,13 +15,13 @@ from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
 from ...lti.discretisation import bilinear, tustin
 from ...lti.equations import OnAxisError, balanced_matrix, mean_speed
-from ...lti.frequency import Frf, frequency_response
+from ...lti.frequency import frequency_response
 from ...lti.interconnection import lft, series
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import AnyPlant
-from ...tolerances import TINY
+from ...tolerances import FOUR_DIGITS, TINY
 from ...words import inner_names
 from ..controller import Controller, required_stability
 from ..pipeline import Design, Solution, designed
@@ -30,16 +30,12 @@ from .lower_bound import both_sides
 
 #: corner of the integral action of the recipe, relative to the bandwidth
 _INTEGRAL = 0.1
-#: claim and margin, and the smallest gamma by two computations, agree to this
-AGREEMENT = 1e-4
 #: why a loop that solves its Riccati equations is not stable in rounding
 _HIDDEN = (
     "A mode that is undamped, integrating or unstable is nearly hidden by the shaping (a zero of "
     "`before` or `after` next to its pole), or hardly reached or seen. Move that zero, or add an "
     "actuator or a sensor."
 )
-#: smallest gamma of a shaped plant above which its bandwidth is out of reach
-_LARGEST_GAMMA = 1e3
 
 
 @one_thread()
@@ -104,7 +100,6 @@ def design_ncf(
     >>> round(fx.synthesis.ncf_margin(plant, controller), 2)
     0.35
     """
-    require_model(plant)
     G = plant.Gyu if isinstance(plant, AnyPlant) else as_statespace(plant)
     back_off = positive(back_off, "back_off")
     first = as_statespace(np.eye(len(G.inputs)) if before is None else before)
@@ -132,15 +127,6 @@ class _Shaped(NamedTuple):
     system: StateSpace
 
 
-class _Robust(NamedTuple):
-    """The controller of a shaped plant, its gamma, and the smallest gamma by two routes."""
-
-    K: StateSpace
-    gamma: float
-    least: float
-    other: float
-
-
 @dataclass(frozen=True)
 class _LoopShaping(Design):
     """The central controller of the normalised coprime factors, at a distance from the least."""
@@ -158,11 +144,35 @@ class _LoopShaping(Design):
         poles = np.linalg.eigvals(balanced_matrix(hamiltonian)).astype(complex)
         return prepared(_four_blocks(g), g.inputs, g.outputs, speed=mean_speed(poles))
 
-    def solve(self, problem: Prepared) -> _Robust:
-        return _robust(problem, self.back_off)
+    def solve(self, problem: Prepared) -> tuple[StateSpace, float, float, float]:
+        # the controller of the shaped plant, its gamma, and the smallest gamma by two routes
+        p = problem
+        control, estimate = both_sides(p)
+        try:
+            (X, F), (Z, Ht) = control.least_squares(), estimate.least_squares()
+        except (OnAxisError, SolverError, la.LinAlgError) as error:
+            raise AssumptionError(
+                f"no normalised coprime factors of the shaped plant were found: {error}"
+            ) from error
+        # X and Z do not depend on the units of u and y, F and H do
+        B, C = p.B2 @ np.linalg.inv(p.u_scale), np.linalg.solve(p.y_scale, p.C2)
+        D = np.linalg.solve(p.y_scale, np.linalg.solve(p.u_scale.T, p.D22.T).T)
+        F, H = p.u_scale @ F, Ht.T @ p.y_scale
+        least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
+        gamma = (1.0 + self.back_off) * least
+        L = (1.0 - gamma**2) * np.eye(len(X)) + X @ Z
+        gain: FloatArray = np.asarray(gamma**2 * np.linalg.solve(L.T, Z @ C.T), dtype=float)
+        plain = p.replace(u_scale=np.eye(len(p.u)), y_scale=np.eye(len(p.y)), D22=0 * p.D22)
+        K = plain.restored(p.A + B @ F + gain @ (C + D @ F), gain, B.T @ X, -D.T)
+        # of the normalised left coprime factors [N, M]; their feedthrough does not matter
+        root = la.cholesky(np.eye(len(D)) + D @ D.T, lower=True)
+        drive, sight = np.hstack([B + H @ D, H]), la.solve_triangular(root, C, lower=True)
+        factors = StateSpace(p.A + H @ C, drive, sight, np.zeros((len(sight), drive.shape[1])))
+        other = float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))
+        return K, gamma, least, other
 
-    def restore(self, plant: _Shaped, problem: Prepared, found: _Robust) -> StateSpace:
-        K, G = series(series(plant.after, found.K), plant.before), plant.given
+    def restore(self, plant: _Shaped, problem: Prepared, found: Any) -> StateSpace:
+        K, G = series(series(plant.after, found[0]), plant.before), plant.given
         return K.replace(inputs=G.outputs, outputs=G.inputs, name=self.name, units=G.units)
 
     def certify(self, solution: Solution) -> Controller:
@@ -170,24 +180,20 @@ class _LoopShaping(Design):
         loop = lft(_four_blocks(plant.system), K)
         stable, margin = required_stability(loop, _HIDDEN), 1.0 / peak_gain(loop)[0]
         required_stability(lft(_four_blocks(plant.given), whole), _HIDDEN)
-        if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
-            cause = (
-                "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
-                "size 1, and leave out states that are hardly reached or seen"
-                if least < _LARGEST_GAMMA
-                else "no controller has more than a tiny margin. The delay or the resonances allow "
-                "no loop of that bandwidth: lower it"
-            )
+        if not abs(other - least) <= FOUR_DIGITS * least or not margin * gamma >= 1.0 - FOUR_DIGITS:
             raise CertificateError(
                 f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} "
                 f"was claimed, the smallest gamma is {least:.6g} by the Riccati equations and "
-                f"{other:.6g} by the Hankel norm of the factors: {cause}."
+                f"{other:.6g} by the Hankel norm of the factors: the shaped plant is too badly "
+                "conditioned to trust. Lower the bandwidth where a delay or resonances allow none "
+                "so high, bring the gains at u and y to size 1, or leave out states hardly "
+                "reached or seen."
             )
-        limit = (1.0 - AGREEMENT) / gamma
+        limit = (1.0 - FOUR_DIGITS) / gamma
         found = (
             Verified("margin", margin, "gain of four blocks", limit, at_least=True),
             Verified(
-                "smallest gamma", other, "Hankel norm of the factors", least * (1 + AGREEMENT)
+                "smallest gamma", other, "Hankel norm of the factors", least * (1 + FOUR_DIGITS)
             ),
             stability_check(stable, plant.system.dt),
             Verified("modulus margin", modulus_margin((plant.given, whole))),
@@ -259,42 +265,6 @@ def _four_blocks(g: StateSpace) -> StateSpace:
         inputs=[*w, *g.inputs],
         outputs=[*z, *g.outputs],
     )
-
-
-def _robust(p: Prepared, back_off: float) -> _Robust:
-    """Return the controller of the shaped plant."""
-    control, estimate = both_sides(p)
-    try:
-        (X, F), (Z, Ht) = control.least_squares(), estimate.least_squares()
-    except (OnAxisError, SolverError, la.LinAlgError) as error:
-        raise AssumptionError(
-            f"no normalised coprime factors of the shaped plant were found: {error}"
-        ) from error
-    # X and Z do not depend on the units of u and y, F and H do
-    B, C = p.B2 @ np.linalg.inv(p.u_scale), np.linalg.solve(p.y_scale, p.C2)
-    D = np.linalg.solve(p.y_scale, np.linalg.solve(p.u_scale.T, p.D22.T).T)
-    F, H = p.u_scale @ F, Ht.T @ p.y_scale
-    least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
-    gamma = (1.0 + back_off) * least
-    L = (1.0 - gamma**2) * np.eye(len(X)) + X @ Z
-    gain: FloatArray = np.asarray(gamma**2 * np.linalg.solve(L.T, Z @ C.T), dtype=float)
-    plain = p.replace(u_scale=np.eye(len(p.u)), y_scale=np.eye(len(p.y)), D22=0 * p.D22)
-    K = plain.restored(p.A + B @ F + gain @ (C + D @ F), gain, B.T @ X, -D.T)
-    # of the normalised left coprime factors [N, M]; their feedthrough does not matter
-    root = la.cholesky(np.eye(len(D)) + D @ D.T, lower=True)
-    drive, sight = np.hstack([B + H @ D, H]), la.solve_triangular(root, C, lower=True)
-    factors = StateSpace(p.A + H @ C, drive, sight, np.zeros((len(sight), drive.shape[1])))
-    other = float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))
-    return _Robust(K, gamma, least, other)
-
-
-def require_model(plant: object) -> None:
-    """Refuse a measured plant."""
-    if isinstance(plant, Frf) or hasattr(plant, "frdata"):
-        raise ModelError(
-            "the plant is a frequency response: loop shaping needs a model. Identify one, or tune "
-            "laws on the Frf by tune_loops."
-        )
 
 
 def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
