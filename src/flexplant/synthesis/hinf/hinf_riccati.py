@@ -20,39 +20,30 @@ from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...store import Value, checked
-from ...tolerances import ROUNDING, SETTLED
+from ...tolerances import MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
-from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks, require_shown
+from .singular import lacking, made_regular, require_ranks, require_shown
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
 #: gains stay finite where D12 and D21 have full rank, so that 1 % is kept with the tolerance, and
 #: with what is added for undamped modes or to tiny efforts; they grow without bound where the ranks
 #: are missing
 _REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
-#: relative width at which the bisection of a step of a search stops
-_QUICK = 0.005
-#: most steps of a search, secants between two bisections, and by how many times a step that rises
-#: from a bound is wider than the last
-_STEPS, _SECANTS, _WIDER = 60, 3, 8.0
-#: sensitivity at infinite frequency below which a central controller is taken for one of infinite
-#: gain
-_INFINITE = 1e-3
+#: secants between two bisections of a search, and by how many times a step that rises from a bound
+#: is wider than the last
+_SECANTS, _WIDER = 3, 8.0
 #: relative: by how much rounding may put a gain above its gamma; a sensitivity at infinite
 #: frequency that is taken for zero
 _SLACK = 1e-6
 #: by how much a norm may exceed its gamma, relative to the distance from the smallest one. Of a lag
 #: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
 _MISSED = 0.1
-#: least distance that counts as one
-_LEAST = 1e-3
 
 #: a search in a regular problem, scaled by the norm of its loop of least quadratic cost, and by
 #: which: the smallest gamma that is reached, and the largest that is refuted
 Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
-#: the norm of the loop of a problem with a controller
-NormOf: TypeAlias = Callable[[Prepared, StateSpace], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +121,8 @@ class Riccati(Value):
         """Return the smallest gamma that was reached below 1, and the largest refuted one."""
         # reached: what the equations promise of a step is seen at the resonances of its loop
         bracket = _Bracket(min(1.0, pointwise_bound(problem)), self.tolerance)
-        with Progress(_STEPS, "steps of the search", progress=self.progress, even=False) as bar:
-            for _ in range(_STEPS):
+        with Progress(MOST_STEPS, "steps of the search", progress=self.progress, even=False) as bar:
+            for _ in range(MOST_STEPS):
                 if bracket.is_closed:
                     break
                 gamma = bracket.next_gamma()
@@ -219,9 +210,9 @@ def back_off_controller(
 
 
 def regular_controller(
-    problem: Prepared, search: Search, back_off: float | None, norm_of: NormOf | None = None
+    problem: Prepared, search: Search, back_off: float | None
 ) -> SolvedController:
-    """Return the controller of a regular problem, accepted by some norm of its loop."""
+    """Return the controller of a regular problem, accepted by the norm of its loop."""
     # the least quadratic cost stabilises: its norm is the unit in which a search looks for less
     try:
         least = h2_controller(problem)
@@ -235,43 +226,28 @@ def regular_controller(
         )
     if not unit:  # w reaches nothing in z
         return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
-    scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
+    scaled = problem.measured_in(unit)
     high, low = search(scaled, unit)
-    K, norm = _accepted(scaled, high, _REGULAR if back_off is None else back_off, norm_of)
+    K, norm = _accepted(scaled, high, _REGULAR if back_off is None else back_off)
     if K is None:  # a gamma of the problem itself is below what is reached with much added to it
         K = least.replace(C=least.C / unit)
-        norm = norm_of(scaled, K)
+        norm = _loop_norm(scaled, K)
     _require_finite_gain(scaled, K, unit * norm)
     return SolvedController(K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm))
 
 
-def _accepted(
-    problem: Prepared, high: float, step: float, norm_of: NormOf
-) -> tuple[StateSpace | None, float]:
+def _accepted(problem: Prepared, high: float, step: float) -> tuple[StateSpace | None, float]:
     """Return the backed-off controller with the norm of its loop."""
     # next to the optimum rounding puts norms above their gammas, and a controller that misses by
     # much of its distance hangs on rounding: the distance grows until the norm holds
     while step < 1.0:
         controller = _attempt(problem, high * (1.0 + step)).controller
         if controller is not None:
-            norm = norm_of(problem, controller)
-            if norm <= high * (1.0 + step + _MISSED * max(step, _LEAST)):
+            norm = _loop_norm(problem, controller)
+            if norm <= high * (1.0 + step + _MISSED * max(step, NEGLIGIBLE)):
                 return controller, norm
-        step = max(2.0 * step, _LEAST)
+        step = max(2.0 * step, NEGLIGIBLE)
     return None, 1.0
-
-
-def quick_answer(problem: Prepared) -> SolvedController:
-    """Return a controller near the smallest gamma, not verified: for the steps of a search."""
-    # where ranks are missing with the most noise and effort that `made_regular` adds; gains are
-    # seen at resonances alone
-    quick = Riccati(tolerance=_QUICK, progress=False)
-    lack = lacking(problem)
-    if not lack.words:
-        return regular_controller(problem, quick._searched, None, resonance_gain)
-    regular = Regularised(problem, LEVELS[0], bool(lack.modes))
-    found = regular_controller(regular.problem, quick._searched, _SINGULAR, resonance_gain)
-    return SolvedController(*regular.restored(found), found.gamma, 0.0)
 
 
 def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:
@@ -388,7 +364,7 @@ def central(
 def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     """Return Q, zero or of norm 1/2, that lifts the small singular values of M + left Q right."""
     U, sizes, Vt = la.svd(M)
-    small = sizes < _INFINITE
+    small = sizes < NEGLIGIBLE  # of the sensitivity at infinite frequency: taken for zero
     pull = left.T @ U[:, small] @ Vt[small] @ right.T
     W, gains, Xt = la.svd(pull, full_matrices=False)
     reached = gains > ROUNDING * np.max(gains, initial=0.0)

@@ -32,8 +32,8 @@ from ...plant.uncertainty.delta_blocks import FullBlock
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod
-from ..hinf.hinf_design import design_hinf
-from ..hinf.hinf_riccati import quick_answer
+from ..hinf.hinf_design import HinfDesign, design_hinf
+from ..hinf.hinf_riccati import Riccati
 from ..hinf.tolerated_modes import (
     ModeChannel,
     ModeLoop,
@@ -41,8 +41,7 @@ from ..hinf.tolerated_modes import (
     rebalanced,
     with_mode_channels,
 )
-from ..pipeline import Design, Solution, designed
-from ..preparation import prepared
+from ..pipeline import Design, Solution, designed, solved
 from .performance_bounds import performance_bound
 from .uncertain_loops import (
     UncertainLoop,
@@ -406,9 +405,8 @@ def _dk_iteration(
     scale = np.ones(len(g.outputs))
     scale[g.output_index(weighted.z)] = 1.0 / level
     system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
-    problem = prepared(system, plant.u, plant.y)
-    found = quick_answer(problem) if method is None else method.solve(problem)
-    K = problem.restored(found.A, found.B, found.C, found.D).replace(name="mu", units=plant.units)
+    design = HinfDesign(Riccati(progress=False) if method is None else method)
+    K = solved(design, plant.replace(system=system)).K.replace(name="mu")
     if not lft(system, K).is_stable:
         raise SolverError("the controller does not stabilise in rounding.")
     again = rebalanced(channels, with_mode_channels(weighted, channels), K)
