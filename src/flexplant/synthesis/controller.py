@@ -29,6 +29,7 @@ from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..store import Value, checked
+from ..tolerances import NEGLIGIBLE
 from .preparation import Prepared
 
 
@@ -135,8 +136,6 @@ class SynthesisMethod(Protocol):
         """Return a controller of the prepared problem."""
 
 
-#: the two norms agree to this relative accuracy, and so does the claimed value
-AGREEMENT = 1e-3
 #: half-widths around a resonance where the gain is computed as well, for peaks that no other search
 #: finds
 _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
@@ -168,22 +167,21 @@ def certified_norm(loop: StateSpace, claim: float, respond: Responder | None = N
             "mode damping."
         )
     swept = swept_norm(loop, respond)
-    if not abs(norm - swept) <= AGREEMENT * norm:
+    if not abs(norm - swept) <= NEGLIGIBLE * norm:
         raise CertificateError(
             f"two routes to the norm disagree: {norm:.6g} with proof, {swept:.6g} by a sweep. "
             "The loop is too badly conditioned to trust; loosen the weights."
         )
-    if norm > claim * (1.0 + AGREEMENT):
+    near = 1.0 + NEGLIGIBLE
+    if norm > near * claim:
         raise CertificateError(
             f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
             "the controller is refused."
         )
     return Certificate(
         (
-            Verified(
-                "norm", norm, "Hamiltonian eigenvalues of the closed loop", claim * (1 + AGREEMENT)
-            ),
-            Verified("swept norm", swept, "a refined sweep over frequency", norm * (1 + AGREEMENT)),
+            Verified("norm", norm, "Hamiltonian eigenvalues of the closed loop", near * claim),
+            Verified("swept norm", swept, "a refined sweep over frequency", near * norm),
             stability_check(least, loop.dt),
             Verified("claim", claim, "the method"),
         )

@@ -12,11 +12,7 @@ from ..errors import AssumptionError, ModelError, counted, some_names
 from ..lti.conversions import even_factors
 from ..lti.riccati import RiccatiSolution, control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..tolerances import RANK
-
-#: the placed poles may differ from the requested ones by this fraction of the largest: poles of
-#: multiplicity m are found to the m-th root of the rounding
-_PLACED = 1e-3
+from ..tolerances import NEGLIGIBLE, RANK
 
 
 def lqr(
@@ -305,7 +301,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
         ) from error
     found = np.linalg.eigvals(g.A - g.B @ gain)
     away = max((float(np.min(np.abs(found - pole))) for pole in asked), default=0.0)
-    if away > _PLACED * float(np.max(np.abs(asked), initial=0.0)):
+    if away > NEGLIGIBLE * float(np.max(np.abs(asked), initial=0.0)):
         raise ModelError(
             f"a pole came {away:.2g} from its place: no input, or hardly one, reaches its mode. "
             "fx.minimal(sys) shows which states are reached."

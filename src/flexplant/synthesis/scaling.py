@@ -11,12 +11,10 @@ from ..lti.equations import bordered_scale, state_scale
 from ..lti.modal_map import eigenvalues_with_error
 from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace
-from ..tolerances import SAME, TINY
+from ..tolerances import NEGLIGIBLE, SAME, TINY
 
 #: point at which answers are taken, in the unit of the loop's speed: away from resonances
 POINT = complex(np.exp(0.25j * np.pi))
-#: fraction of its terms that an answer has at least: what they cancel to may be rounding
-_HIDDEN = 1e-3
 #: effort or noise that is smaller, relative to the plant's own response at the loop's speed, has no
 #: effect there: this amount is added where it is missing
 FELT = 1e-3
@@ -67,9 +65,7 @@ def timed(
     return balanced(A / speed, B / root, C / root, POINT)
 
 
-def answers(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex, hidden: float = _HIDDEN
-) -> FloatArray:
+def answers(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> FloatArray:
     """Return the sizes (m,) of ``C (s I - A)^-1 B + D`` by column, at least a part of its terms."""
     # what u moves and z does not show has no size there but rounding
     try:
@@ -77,7 +73,7 @@ def answers(
     except np.linalg.LinAlgError:  # a pole at s
         states = np.asarray(B, dtype=np.complex128)
     terms = np.linalg.norm(np.abs(C) @ np.abs(states) + np.abs(D), axis=0)
-    return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), hidden * terms))
+    return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), NEGLIGIBLE * terms))
 
 
 def own_gain(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> float:

@@ -21,7 +21,7 @@ from ...lti.minimal_realisations import minimal
 from ...lti.modal import modal_form
 from ...lti.modal_map import eigenvalues_with_error
 from ...lti.statespace import StateSpace, as_statespace
-from ...tolerances import RANK, ROUNDING
+from ...tolerances import RANK, ROUNDING, TYPED
 
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
 LANES = 4
@@ -263,10 +263,6 @@ def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray], most:
     return float(np.max(gap / divisor(np.maximum(size, least)), initial=0.0))
 
 
-#: largest difference of the responses, relative to the largest gain of a channel
-_AGREEMENT = 1e-6
-
-
 def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArray]:
     """Return each channel of a sampled controller as second-order sections.
 
@@ -336,7 +332,7 @@ def _sections(g: StateSpace) -> FloatArray:
         while late and not row[2]:
             row[:3], late = [0.0, *row[:2]], late - 1
     off = float(np.abs(_sections_response(sections, back) - wanted).max()) / size
-    if not off <= _AGREEMENT:
+    if not off <= TYPED:
         exact = float(np.abs(gain * shape - wanted).max()) / size
         raise CertificateError(
             f"the sections of {g.outputs[0]!r} from {g.inputs[0]!r} differ from it by {off:.1e} of "
@@ -363,7 +359,7 @@ def _sections_response(sections: FloatArray, back: ComplexArray) -> ComplexArray
 
 def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
     """Return why sections differ, and what helps: the product of their factors differs less."""
-    if exact > _AGREEMENT:
+    if exact > TYPED:
         return (
             "with this number of states, rounding makes poles and zeros meaningless. Reduce the "
             "controller first "

@@ -15,7 +15,7 @@ from ...lti.blocks_of_states import Matrices
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING
+from ...tolerances import NEGLIGIBLE, ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared
 from ..scaling import FELT, THIRD, answers
@@ -27,8 +27,6 @@ ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
 LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
-#: relative: what a level may cost in gamma, compared with a tenth of it
-_COST = 1e-3
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
 #: and by so much in all
@@ -198,7 +196,7 @@ class _Found(NamedTuple):
 
     def settles(self, finer: _Found) -> bool:
         """Return whether a tenth of what is added gains next to nothing."""
-        return self.gamma <= finer.gamma * (1.0 + _COST)
+        return self.gamma <= finer.gamma * (1.0 + NEGLIGIBLE)
 
 
 def made_regular(

@@ -17,7 +17,7 @@ from ...lti.equations import OnAxisError
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...parallel import interruptible
 from ...store import Value, checked
-from ...tolerances import RANK, TINY
+from ...tolerances import FOUR_DIGITS, RANK, TINY, TYPED
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
 from ..hinf.lower_bound import both_sides, raised_bound
@@ -33,8 +33,6 @@ Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 NULL = 1e-10
 #: settings of the solver's tolerances
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
-#: largest violation of an LMI, relative to its largest eigenvalue
-VIOLATION = 1e-6
 
 
 class Plant(NamedTuple):
@@ -184,9 +182,7 @@ def changed_back(p: Plant, X: FloatArray, Y: FloatArray, changed: Matrices) -> M
     return p.speed * A, root * B / p.y_size, root * C / u_size, D / p.y_size / u_size
 
 
-def solve_program(
-    problem: Any, settings: dict[str, float], *, violation: float = VIOLATION
-) -> None:
+def solve_program(problem: Any, settings: dict[str, float], *, violation: float = TYPED) -> None:
     """Solve a semidefinite program; its LMIs are checked by their eigenvalues afterwards."""
     # a point at which the solver stopped early counts too, where it satisfies them
     data, chain, inverse = problem.get_problem_data("CLARABEL", solver_opts={})
@@ -232,8 +228,6 @@ def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
 #: largest relative distance of a program's gamma from its lower bound; and how far above the bound
 #: the controller's own distance begins at most: with that, 0.5 %, it makes 1 %
 _GAP, _NEAR = 2e-2, 5e-3
-#: gamma, relative to the norm of the loop of least quadratic cost, that is taken for zero
-_NOTHING = 1e-4
 #: regularisation of Clarabel's equations: X and Y of smallest gammas are nearly singular, and its
 #: own 1e-8 leaves these gammas up to 4 % too large; 1e-11 fails on one plant in a hundred
 _REGULARISATION = 1e-10
@@ -330,7 +324,7 @@ class Lmi(Value):
         settings["static_regularization_constant"] = _REGULARISATION
         solve_program(cp.Problem(goal, constraints), settings)
         high = float(gamma.value)
-        if high < _NOTHING:
+        if high < FOUR_DIGITS:
             raise InfeasibleError(
                 "gamma has no minimum: the infimum is 0. u cancels w in z, at no cost. Weight the "
                 "efforts in z, or give the sensors noise in w."

@@ -17,8 +17,8 @@ from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...tolerances import TINY
-from ..controller import AGREEMENT, Controller
+from ...tolerances import NEGLIGIBLE, TINY
+from ..controller import Controller
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
@@ -257,14 +257,12 @@ def _verified_values(
             continue
         w, z = spec.chosen(plant)
         value = spec.measured(closed.select(z, w))
-        if spec.below is not None and not value <= spec.below * (1.0 + AGREEMENT):
+        if spec.below is not None and not value <= spec.below * (1.0 + NEGLIGIBLE):
             raise CertificateError(f"{spec!r} is {value:.6g} in the closed loop.")
         reached[repr(spec)] = value
     return reached
 
 
-#: relative: bounds so close to the least value are left to the search
-_NEAR = 1e-3
 #: part of an H2 norm, found with noise or effort added, that no controller reaches either
 _CERTAIN = 0.5
 
@@ -288,7 +286,7 @@ def require_reachable(plant: AnyPlant, subject_to: Sequence[Any]) -> None:
         # a singular H2 problem has an infimum, which noise and effort added miss by a few per cent
         proved = best.lower is not None
         least = best.lower if best.lower is not None else _CERTAIN * gamma
-        if least <= spec.below * (1.0 + _NEAR):
+        if least <= spec.below * (1.0 + NEGLIGIBLE):
             continue
         freq = peak_gain(lft(alone.system, best.system))[1]
         raise InfeasibleError(

@@ -18,7 +18,7 @@ from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
-from ...tolerances import TINY
+from ...tolerances import TINY, TYPED
 from ..preparation import less_feedthrough
 from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
 from ..structured.measured_objective import MeasuredObjective
@@ -404,8 +404,6 @@ def within(speed: float) -> PoleDisc:
 _MOST = 0.9
 #: units in which the optimum is sought
 _UNITS = 7
-#: tolerance of the solver: gap and residuals, relative
-_ACCURACY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -517,8 +515,8 @@ class ObjectivePrograms:
     def _solve(self, program: Any) -> None:
         """Solve a program."""
         # every claim is verified with the closed loop: a small violation does no harm
-        settings = dict.fromkeys(TOLERANCES, _ACCURACY)
-        solve_program(program, settings, violation=10.0 * _ACCURACY)
+        settings = dict.fromkeys(TOLERANCES, TYPED)
+        solve_program(program, settings, violation=10.0 * TYPED)
 
     def _guess(self) -> float:
         """Return the open gain of what is minimised, away from its poles."""

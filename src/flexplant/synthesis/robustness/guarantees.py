@@ -22,6 +22,7 @@ from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
 from ...store import Value, checked
+from ...tolerances import NEGLIGIBLE
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, crossing_multiple, destabilising, smallest_with_block
 from .mu_bounds import INTERVALS, Cover, Covered, sought
@@ -33,8 +34,6 @@ from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 _RESOLVED = 0.05
 #: starts of a search at each frequency
 _STARTS = 3
-#: the worst machine is shown this much beyond its edge of stability
-_BEYOND = 1e-3
 #: largest multiple of an uncertainty that the quick bound tries
 _REACH = 2.0
 #: frequencies that start a search for the largest gain, rounds over all real Deltas
@@ -231,7 +230,7 @@ def _worst_machine(
     if worst is None:
         return {}, None, 0.0
     values: dict[str, float] = {}
-    for beyond in (0.0, _BEYOND, 10 * _BEYOND, 50 * _BEYOND):
+    for beyond in (0.0, NEGLIGIBLE, 10 * NEGLIGIBLE, 50 * NEGLIGIBLE):
         size = worst.size * (1.0 + beyond)
         values = loop.deltas(worst.found, size)
         try:

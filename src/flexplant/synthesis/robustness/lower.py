@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
-from ...tolerances import SPLIT, TINY
+from ...tolerances import FOUR_DIGITS, SPLIT, TINY
 from .power_starts import power_iterations
 from .uncertainty_blocks import (
     Perturbation,
@@ -25,7 +25,6 @@ from .uncertainty_blocks import (
 
 #: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
 _MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
-_FINE = 1e-4
 #: phases of complex blocks that are tried
 _PHASES = 25
 #: random starts at each frequency
@@ -65,7 +64,7 @@ def smallest_multiple(
     if not np.isfinite(unstable):
         return None
     stable = max(stable, 0.99 * least)
-    while unstable - stable > _FINE * unstable:
+    while unstable - stable > FOUR_DIGITS * unstable:
         middle = 0.5 * (stable + unstable)
         if _abscissa(M, delta, middle)[0] >= 0:
             unstable = middle

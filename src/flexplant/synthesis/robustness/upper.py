@@ -11,7 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ...arrays import ComplexArray, FloatArray, IntArray
-from ...tolerances import TINY
+from ...tolerances import RESIDUAL, TINY
 from .uncertainty_blocks import Scalings, osborne
 
 #: Newton decrement at which a centre is left; steps for one
@@ -26,8 +26,6 @@ _LEVELS, _SETTLED = 200, 2e-3
 #: Im M, where D of the blocks are similar; a larger G lowers a bound by up to a few percent, but
 #: its scalings hold on shorter intervals only
 WIDE, FREE = 1.0, 30.0
-#: a level this far below the size of M is zero
-_ZERO = 1e-10
 
 
 class Certified(NamedTuple):
@@ -68,14 +66,14 @@ def upper_level(
         return _skewed(W, scalings, x, reached, enough)
     x = x / np.sum(scalings.start * x)
     best = Certified(max(reached, 0.0), x)
-    level = 1.5 * max(reached, _ZERO * size)
+    level = 1.5 * max(reached, RESIDUAL * size)
     for _ in range(_LEVELS):
         if best.level <= enough:
             return best
         x = centred(W, scalings, x, level, widest=widest)
         reached = reached_level(W, scalings, x)
-        if reached <= _ZERO * size:
-            return Certified(_ZERO * size, x)
+        if reached <= RESIDUAL * size:
+            return Certified(RESIDUAL * size, x)
         if reached < best.level:
             best = Certified(reached, x)
         if level - reached <= _SETTLED * level:

@@ -18,7 +18,7 @@ from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
-from ...tolerances import ROUNDING, TINY
+from ...tolerances import CLOSE, NEGLIGIBLE, ROUNDING, TINY
 from ..preparation import Prepared, prepared
 from .nonsmooth import Pieces
 
@@ -29,11 +29,6 @@ DECAY = 1e-7
 _POINTS, _REFINEMENTS, _PART = 60, 2, 0.5
 #: singular values of one frequency that count
 _SINGULAR = 3
-#: relative: singular values as close as this are taken as apart by it (the gradient of the other
-#: is in the model too)
-_APART = 1e-2
-#: relative: a frequency is that of a peak where the parabola there rises no further
-_PEAK = 1e-3
 
 
 class Matrices(NamedTuple):
@@ -209,14 +204,14 @@ class Closed(NamedTuple):
         weigh = partial(_squares, size=size)
         H += weigh(onto_u[which : which + 1].imag, np.ones(1))
         later = slice(which + 1, S.size)  # those above are not its own to push away
-        apart = np.maximum(size - S[later], _APART * size) / size
+        apart = np.maximum(size - S[later], CLOSE * size) / size
         H += weigh(onto_u[later] + onto_v[later], 0.5 / apart)
         H += weigh(onto_u[later] - onto_v[later], 0.5 / (1.0 + S[later] / size))
         for rest in (onto_u[S.size :], onto_v[S.size :]):
             H += weigh(rest, np.ones(rest.shape[0]))
         rise, turning, bending = onto_u[which, -1].real, H[:count, count], H[count, count]
         H = H[:count, :count]
-        if bending < 0.0 and rise * rise < -2.0 * bending * _PEAK * size:
+        if bending < 0.0 and rise * rise < -2.0 * bending * NEGLIGIBLE * size:
             H = H - np.outer(turning, turning) / bending
         slope = onto_u[which, :count].real / size
         return np.asarray(H / size - np.outer(slope, slope))

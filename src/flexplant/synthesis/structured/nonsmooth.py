@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray
+from ...tolerances import NEGLIGIBLE, SAME
 
 #: value (infinite where not defined) and gradient
 Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -27,10 +28,6 @@ _ENOUGH, _POOR, _GOOD = 0.05, 0.3, 0.7
 _LESS, _MORE, _ANEW, _AGAIN = 0.2, 3.0, 2.0, 5.0
 #: number of refused steps in a row that ends a search, and a decrease that counts as zero
 _REFUSED, _SETTLED = 20, 1e-6
-#: fractions below this are rounding errors
-_SHARE = 1e-9
-#: small against the rest of the quadratic program, large against the rounding of its squares
-_LIFT = 1e-3
 
 
 class Pieces(NamedTuple):
@@ -189,7 +186,7 @@ class _Model:
         """Return the step, the weights of the pieces, and by how much the largest decreases."""
         weights = self.weights
         for _ in range(2):  # the weights of the first give the Hessian of the second
-            active = np.flatnonzero(weights > _SHARE).tolist()
+            active = np.flatnonzero(weights > SAME).tolist()
             values, vectors = la.eigh(sum(weights[i] * self.pieces.hessian(i) for i in active))
             self.size = float(np.abs(values).max())
             root = np.sqrt(np.abs(values) + mu)
@@ -205,8 +202,10 @@ def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, Flo
     from scipy.optimize import nnls
 
     size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny ** 0.5)
-    G, c = gradients / size, np.maximum(beside / size**2, -1.0 / _LIFT)
-    lifted = np.vstack([-_LIFT * G.T, np.ones((1, c.size)), _LIFT * c[None] + 1.0 / _LIFT])
+    # small against the rest of the quadratic program, large against the rounding of its squares
+    lift = NEGLIGIBLE
+    G, c = gradients / size, np.maximum(beside / size**2, -1.0 / lift)
+    lifted = np.vstack([-lift * G.T, np.ones((1, c.size)), lift * c[None] + 1.0 / lift])
     right = np.zeros(lifted.shape[0])
     right[-1] = 1.0
     weights, _ = nnls(lifted, right, maxiter=100 * c.size)

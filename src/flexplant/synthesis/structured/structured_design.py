@@ -18,7 +18,7 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...seeds import MOST, Rng, generator
-from ...tolerances import SAME, TINY
+from ...tolerances import CLOSE, NEGLIGIBLE, SAME, TINY
 from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf, PeakGain
@@ -46,14 +46,8 @@ _DRAWS = 4
 #: decay [1] of drawn starts before the norm is lowered, and the number of steps for it: a loop that
 #: is barely stable has peaks that hide the others
 _DECAYING, _DEEPER = 1e-2, 50
-#: radius around the end, relative, within which the report looks for a decrease
-_RADIUS = 1e-3
 #: the norm that the search claims and the one verified on the plant as given agree to this
 _AGREEMENT = 5e-4
-#: relative decrease that is left above which the end is said to be no local minimum
-_SHORT = 1e-2
-#: logarithms of norms that count as the same
-_SAME = 0.01
 #: part of the largest norm from which on another plant's counts
 _PART = 0.5
 
@@ -219,16 +213,16 @@ class _Structured(Design):
                 f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
                 f"{claim:.6g} by the search: {_blame(self.objectives)}."
             )
-        radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
+        radius = NEGLIGIBLE * max(1.0, float(np.linalg.norm(found.x)))
         slope, decrease = decrease_left(search.pieces(found.x), radius)
         certificate = each[worst] | {"slope": slope, "radius": radius}
-        certificate |= Certificate((Verified("decrease left", decrease, "a linear model", _SHORT),))
+        certificate |= Certificate((Verified("decrease left", decrease, "a linear model", CLOSE),))
         if self.moving is not None:
             certificate |= self.moving.certified(lambda plant: on(plant)["norm"], norms)
         elif len(plants) > 1:
             certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
         notes = search.notes
-        if decrease > _SHORT:
+        if decrease > CLOSE:
             notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
         final, loop = search.family.structure(found.x), lft(plants[worst].system, K)
         reached = (
@@ -458,7 +452,7 @@ class _StructureSearch:
         stable[lowest] = self._continued(stable[lowest])
         self.tried = {end.name: _end_norm(end) for end in (*ends, *stable)}
         best = min(stable, key=lambda end: end.value)
-        same = sum(end.value <= best.value + _SAME for end in stable)
+        same = sum(end.value <= best.value + CLOSE for end in stable)
         self.notes = (f"{same} of {len(ends)} starts end within 1 % of the best",)
         if self._spent()():
             self.notes += (f"{self.limit} evaluations ended the search: more may find less",)
