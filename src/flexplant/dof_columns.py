@@ -14,7 +14,7 @@ import numpy as np
 from .arrays import FloatArray, IntArray, real_array
 from .errors import LabelError, ShapeError, short, unknown_label
 from .store import Value
-from .tolerances import SAME
+from .tolerances import PRECISION, SAME
 from .words import check_names, name_list, several
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
@@ -44,7 +44,7 @@ class Interpolation(Value):
 
 _COLUMNS = ("node", "direction", "x", "y", "z")
 #: node numbers stay exact as floats, and their keys in 64 bits
-LARGEST_NODE = 2**53
+LARGEST_NODE = int(2 / PRECISION)
 
 
 def columns_of(

@@ -49,7 +49,7 @@ MOST_STEPS = 60
 TYPED = 1e-6
 #: a search ends when its value moves by less, relative to the value: nothing in a machine is known
 #: to nine digits
-SETTLED = 1e-9
+SETTLED = SAME
 #: poles closer than this, relative to their size, are one pole: eigenvalue solvers split a double
 #: pole, as of a rigid-body mode, by the root of their rounding (1.5e-8) times its condition
 SPLIT = 1e-6

@@ -18,18 +18,13 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..plant.partitioned import require_noise, require_sampled
-from ..tolerances import RESIDUAL
+from ..tolerances import CLOSE, RESIDUAL, TYPED
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, estimates, poi_channels, sensors
 from .filter_models import LEFT_OUT, FilterModel, filter_model, weigh
 from .left_out_modes import LeftOut, left_out
 from .machine_noise import unsure_noise
-
-#: largest relative difference of the covariances from the Riccati equation and from the gain's
-#: Stein equation; where rounding of the gain matters (`riccati_root`), of twice the standard
-#: deviation
-AGREEMENT, ROUNDED = 1e-6, 1e-2
 
 
 @one_thread()
@@ -130,7 +125,7 @@ def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
     complete = error_variances(plant.around(found.whole.machine), observer.system)
     certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}
     if complete.difference > certificate["difference"]:
-        certificate |= Certificate((_difference_check(complete.difference, ROUNDED),))
+        certificate |= Certificate((_difference_check(complete.difference, CLOSE),))
     return observer.replace(certificate=certificate, variances=complete.values)
 
 
@@ -187,7 +182,7 @@ class FilterDesign(NamedTuple):
     radius: float
     residual: float
     difference: float
-    allowed: float = AGREEMENT
+    allowed: float = TYPED
 
     @property
     def certificate(self) -> Certificate:
@@ -199,7 +194,7 @@ class FilterDesign(NamedTuple):
         return Certificate((*checks, _difference_check(self.difference, self.allowed)))
 
 
-def _difference_check(difference: float, limit: float = AGREEMENT) -> Verified:
+def _difference_check(difference: float, limit: float = TYPED) -> Verified:
     """Return the check of two routes to the variances at the POIs."""
     return Verified("difference", difference, "variances by a Stein equation of the gain", limit)
 
@@ -249,10 +244,10 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
         model.C1 - poi_rows @ model.C2,
         np.linalg.norm(found.L, axis=1),
     ) + np.sum((poi_rows @ H) ** 2, axis=1)
-    difference = _agreement(variances, truth, ROUNDED)
+    difference = _agreement(variances, truth, CLOSE)
     L_z = poi_rows + found.weighed(model.N)
     return FilterDesign(
-        gain, found.K, L_z, covariance, variances, radius, found.change, difference, ROUNDED
+        gain, found.K, L_z, covariance, variances, radius, found.change, difference, CLOSE
     )
 
 
@@ -287,7 +282,7 @@ def _stable_radius(model: FilterModel, predictor: FloatArray) -> float:
     return radius
 
 
-def _agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
+def _agreement(claim: FloatArray, truth: FloatArray, allowed: float = TYPED) -> float:
     """Return the largest relative difference of POI variances from those of a gain."""
     difference = difference_of(claim, truth)
     if not difference <= allowed:

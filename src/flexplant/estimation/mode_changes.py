@@ -31,9 +31,9 @@ _BAND, _SEARCH, _WIDTHS = 400, 40, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 _STEPS, _SETTLED = 12, 0.05
 #: fraction of the largest step within which the derivatives of the innovations are reused
 _LINEAR = 0.3
-#: finite differences: of a frequency in half-widths of the mode, and of the logarithm of damping;
-#: both are far above rounding and within the linear range
-_WIDTH, _LOG = 0.02, 0.02
+#: finite difference of a frequency in half-widths of the mode, and of the logarithm of damping: far
+#: above rounding and within the linear range
+_CHANGE = 0.02
 #: largest relative distance of the end of a fit from its peak: peaks are found within a few lines
 _NEAR = 5e-3
 
@@ -165,7 +165,7 @@ def moved_modes(
     theta = np.array([[one.frequency for one in starts], [one.decay for one in starts]]).ravel()
     information = np.eye(theta.size)
     now = task.at(theta)
-    steps = np.r_[_WIDTH * task.widths, np.full(task.widths.size, _LOG)]
+    steps = np.r_[_CHANGE * task.widths, np.full(task.widths.size, _CHANGE)]
     reach = np.r_[task.widths, np.ones(task.widths.size)]
     J, log_size = None, np.zeros(theta.size)
     for _ in range(_STEPS):

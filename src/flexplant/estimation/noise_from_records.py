@@ -15,7 +15,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..store import Value
-from ..tolerances import CHANCE, SETTLED, SPLIT, TINY
+from ..tolerances import CHANCE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SETTLED, SPLIT, TINY
 from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
@@ -24,10 +24,8 @@ from .estimator_channels import checked_plant, sensors
 from .innovations import seen_from_states, squared
 from .kalman import design_kalman
 
-#: largest number of filter designs, and change of all ratios at which they end
-_PASSES, _SETTLED = 6, 1e-3
-#: largest number of scoring steps, and slope relative to its deviation at which they end
-_STEPS, _FLAT = 60, 1e-4
+#: largest number of filter designs
+_PASSES = 6
 _EVALUATION = " Give the plant an evaluation model, if it lacks truncated modes."
 #: lags of the autocovariances of the start
 _LAGS = 40
@@ -128,7 +126,7 @@ def estimate_noise(
         # relative to a variance, which has a finite error even where it may be 0
         deviation = 2 * found.variances * np.sqrt(covariance.diagonal())
         # values that are known to a few percent are converged well within this
-        if np.all(np.abs(found.variances - 1.0) < np.maximum(2 * _SETTLED, 0.1 * deviation)):
+        if np.all(np.abs(found.variances - 1.0) < np.maximum(2 * NEGLIGIBLE, 0.1 * deviation)):
             break
     else:
         raise SolverError(
@@ -285,12 +283,12 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
     value, slope, information = _likelihood(spectrum, np.exp(log_t))
     # nearly a Newton step: the start is seldom far away
     damping = 1e-6
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         scale = np.sqrt(np.maximum(information.diagonal(), TINY))
         free = (log_t > bottom) | (slope > 0)
         unit = information / np.outer(scale, scale) * np.outer(free, free)
         unit[np.diag_indices_from(unit)] = 1.0
-        if np.max(np.abs(slope / scale)[free], initial=0.0) < _FLAT:
+        if np.max(np.abs(slope / scale)[free], initial=0.0) < FOUR_DIGITS:
             t = np.exp(log_t)
             worst = float(np.max(np.abs(slope / scale)[free], initial=0.0))
             return _Scored(t, information / np.outer(t, t), worst)
@@ -306,8 +304,8 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
         else:
             damping = max(10 * damping, 1e-3)  # from here on it shortens a step
     raise SolverError(
-        f"the likelihood of the noise levels did not converge in {_STEPS} steps: these channels "
-        "cannot explain the spectrum of the innovations. Judge the record with "
+        f"the likelihood of the noise levels did not converge in {MOST_STEPS} steps: these "
+        "channels cannot explain the spectrum of the innovations. Judge the record with "
         "flexplant.estimation.consistency, and give the plant an evaluation model."
     )
 

@@ -27,7 +27,7 @@ from ..arrays import (
 from ..errors import ModelError, SolverError, counted, short
 from ..modes.matching import assigned, in_span
 from ..store import Value, checked
-from ..tolerances import TINY
+from ..tolerances import NULL, SAME, TINY
 from ..words import several
 from .line_weights import PreparedLines
 
@@ -264,9 +264,6 @@ def _continued_poles(
 
 #: fraction of the unit circle that the band occupies; the rest separates its two ends
 ARC = 0.9
-#: distance on the circle below which poles count as repeated; reciprocal condition number above
-#: which normal equations are solved directly
-REPEATED, REGULAR = 1e-9, 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +367,7 @@ def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray
     """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0."""
     # null vectors of a pole that is repeated except for rounding are independent
     U, _, Vh = np.linalg.svd(matrices)
-    alike = np.abs(z[:, None] - z) < REPEATED
+    alike = np.abs(z[:, None] - z) < SAME
     first = np.sum(np.cumsum(alike, axis=1) == 0, axis=1)
     number = np.sum(np.tril(alike, -1), axis=1)
     place = np.maximum(U.shape[1] - 1 - number, 0)
@@ -379,7 +376,7 @@ def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray
 
 def _solve_hermitian(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
     factor, info = la.lapack.zpotrf(matrix)
-    if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > REGULAR:
+    if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > NULL:
         return np.asarray(la.lapack.zpotrs(factor, right)[0])
     # data without noise do not determine orders above the true one: the smallest solution is used
     return np.asarray(la.lstsq(matrix, right, cond=1e-13, lapack_driver="gelsd")[0])

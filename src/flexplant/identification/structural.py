@@ -14,15 +14,16 @@ from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
+from ..tolerances import NEGLIGIBLE
 from ..words import flag, instance
 from .result import IdentifiedModes
 
-#: fraction of the largest eigenvalue of an inertia or a flexibility below which an eigenvalue
-#: counts as noise, also a negative one
-NOISE, NEGATIVE = 1e-3, 0.05
+#: fraction of the largest eigenvalue of an inertia or a flexibility below which a negative
+#: eigenvalue counts as noise
+NEGATIVE = 0.05
 #: relative imaginary part of a shape, and relative error of its expansion in modes of a model,
 #: above which a warning is given
-COMPLEX, MISSED = 0.1, 0.1
+MISSED_SHAPE = 0.1
 #: relative error of the real shapes of a pole outside the band below which it counts as a mode
 ALIKE = 0.3
 #: frequencies of residual vectors that are tried, relative to the upper end of the band
@@ -110,7 +111,7 @@ def structural_modes(
         E = expansion(over, rows)
         left = np.linalg.norm(columns[1] - E[rows] @ columns[1], axis=0)
         worst = float(np.max(left / np.linalg.norm(columns[1], axis=0)))
-        check = Verified("expansion", worst, "least squares of the shapes", MISSED)
+        check = Verified("expansion", worst, "least squares of the shapes", MISSED_SHAPE)
         certificate |= Certificate((check,))
         columns = [E @ one for one in columns]
     else:
@@ -119,13 +120,13 @@ def structural_modes(
             # between the places that were measured only
             margin = float(getattr(dofs.interpolation, "margin", 0.0))
             place = interpolated(place, margin=margin)
-    if imaginary > COMPLEX:
+    if imaginary > MISSED_SHAPE:
         warn(
             f"a measured shape has an imaginary part of {imaginary:.0%}: the modes of this "
             "structure are real, so that it is left out. Measure longer, or look for two modes "
             "that were identified as one."
         )
-    if certificate.get("expansion", 0.0) > MISSED:
+    if certificate.get("expansion", 0.0) > MISSED_SHAPE:
         warn(
             f"{certificate['expansion']:.0%} of a measured shape is not in the span of the "
             "model's modes: the error of the expansion is at least this large. Give more modes "
@@ -278,7 +279,7 @@ class MeasuredPlaces:
                 "mass. "
                 "Pass rigid=False for a held structure; begin the band of a free one lower."
             )
-        keep = values > NOISE * values[-1]
+        keep = values > NEGLIGIBLE * values[-1]
         return np.asarray(U @ (vectors[:, keep] * np.sqrt(values[keep])))
 
     def residual(self, G: FloatArray, fast: float) -> FloatArray:
@@ -287,7 +288,7 @@ class MeasuredPlaces:
         o, i = [pair[0] for pair in both], [pair[1] for pair in both]
         block = G[np.ix_(o, i)]
         values, turn = la.eigh((block + block.T) / 2)
-        keep = values > NOISE * np.abs(values).max(initial=0.0)
+        keep = values > NEGLIGIBLE * np.abs(values).max(initial=0.0)
         half = turn[:, keep] / np.sqrt(values[keep])
         vectors = np.zeros((self.count, int(keep.sum())))
         vectors[self.inputs] = G[o].T @ half

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..arrays import ComplexArray, FloatArray, real_array
 from ..errors import AssumptionError, ModelError, SolverError, counted
 from ..lti.delays import Delayed, delayed
+from ..lti.peaks import PEAKS
 from ..store import Value
 from ..tolerances import FOUR_DIGITS, ROUNDING, SETTLED
 from ..words import one_of
@@ -23,8 +24,6 @@ _QUIET = 0.1
 _POINTS, _TURN, _STEP = 200, 0.2, 0.5
 #: points of the contour at most
 _MOST = 2_000_000
-#: peaks that are refined
-_PEAKS = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -328,7 +327,7 @@ def _peak(size: Callable[[Any], FloatArray], lines: FloatArray) -> tuple[float, 
     values = size(lines)
     best = float(values.max()), float(lines[np.argmax(values)])
     inner = 1 + np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:]))
-    for i in inner[np.argsort(-values[inner])[:_PEAKS]]:
+    for i in inner[np.argsort(-values[inner])[:PEAKS]]:
         found = minimize_scalar(
             lambda f: -float(size([f])[0]), bounds=(lines[i - 1], lines[i + 1]), method="bounded",
             options={"xatol": 1e-10 * lines[i]},

@@ -19,7 +19,7 @@ from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
-from ..tolerances import CLOSE, TINY
+from ..tolerances import CLOSE, DEVIATIONS, TINY
 from ..words import SHOWN
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
@@ -187,8 +187,6 @@ _TO_A_WIDTH, _ASIDE = 2, 400
 #: searched range of relative changes of damping: without damping, a mode that the loop does not
 #: affect is marginal
 _DAMPINGS = (-0.999, 2.0)
-#: required ratio of the tolerance of a mode to its uncertainty
-_SAFE = 2.0
 #: modulus margin for which tolerances are stated: |S| at u of 2.9, 9 dB
 MARGIN = 0.35
 #: ratio of the search range, or that of a grid, to the requested change, so that a crossing and the
@@ -254,7 +252,7 @@ class ModeTolerances(Value):
         """Modes with a tolerance below twice their uncertainty; empty if this is not known."""
         if self.known is None:
             return ()
-        return tuple(self.modes[self.least < _SAFE * self.known].tolist())
+        return tuple(self.modes[self.least < DEVIATIONS * self.known].tolist())
 
     @property
     def summary(self) -> str:
@@ -401,7 +399,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
 
 def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
     """Return the tolerances of a stable loop to the changes that a report follows."""
-    limit = min(max(CLOSE, BEYOND * _SAFE * max(known.values(), default=0.0)), LIMIT)
+    limit = min(max(CLOSE, BEYOND * DEVIATIONS * max(known.values(), default=0.0)), LIMIT)
     try:
         return mode_tolerances(
             loop.plant, loop.broken, margin=MARGIN, known=known or None, limit=limit

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
-from ..tolerances import ROOT, ROUNDING, SPLIT, TINY, TYPED
+from ..tolerances import ROOT, ROUNDING, SETTLED, SPLIT, TINY, TYPED
 from .response_solvers import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -19,10 +19,9 @@ POINTS, ROUNDS = 200, 6
 TURN = 0.6
 #: largest number of local maxima that are refined, and their least fraction of the highest one
 _PEAKS, _HIGH = 6, 0.5
-#: number of inner points of the halves of a bracket and of all of it; relative gain below which a
-#: maximum is found
-_ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
+#: inner points of a bracket, and of its halves
 _SIXTEENTHS = np.arange(1, 16) / 16.0
+_EIGHTHS, _ASIDE = _SIXTEENTHS[1::2], np.array([-1, 0, 1])
 #: grid around a resonance in units of its half-power half-width: for a drawn curve, and for a
 #: search that finds the maximum between points
 DRAWN = tuple(np.sinh(0.5 * np.arange(7)).tolist())
@@ -225,7 +224,7 @@ def highest(
         # a maximum first seen at half its height is now known to 1 - 0.5 / 8^n of it
         left_in = size[:, 1] >= (1.0 - (1.0 - _HIGH) / 8.0**n) * size[:, 1].max()
         freq, size = freq[left_in], size[left_in]
-        if not np.any(_vertex(freq, size)[1] > _GAIN * size[:, 1]):
+        if not np.any(_vertex(freq, size)[1] > SETTLED * size[:, 1]):
             break
     best = int(np.argmax(size[:, 1]))
     return float(size[best, 1]), float(freq[best, 1])

@@ -9,13 +9,13 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from ..tolerances import ROUNDING, SAME, TINY
+from ..tolerances import NEGLIGIBLE, ROUNDING, SAME, TINY
 from .frequency_sweep import around_resonance
 
 #: number of samples of a window that represents all lengths
 SAMPLES = 256
-#: correlation below which it is neglected, and largest distance of correlated lines
-LEAST, FARTHEST = 1e-3, 40
+#: largest distance of correlated lines
+FARTHEST = 40
 
 
 def line_correlation(
@@ -42,8 +42,8 @@ def line_correlation(
         shares = _window_overlap(values, window, overlap)[places]
         if values.size and values.min() > FARTHEST:
             break
-        if np.any(shares > LEAST):
-            shares = np.where(shares > LEAST, shares, 0.0)
+        if np.any(shares > NEGLIGIBLE):
+            shares = np.where(shares > NEGLIGIBLE, shares, 0.0)
             diagonals += [shares, shares]
             offsets += [apart, -apart]
     return sp.csr_array(sp.diags_array(diagonals, offsets=offsets, shape=(n, n)))

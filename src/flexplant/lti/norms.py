@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
-from ..tolerances import MISSED, MOST_STEPS, SAME, SETTLED
+from ..tolerances import MISSED, MOST_STEPS, RANK, SAME, SETTLED
 from .blocks_of_states import bilinear_matrices, is_block_diagonal
 from .equations import axis_frequencies, state_scale
 from .frequency_sweep import POINTS, ROUNDS, SOUGHT, highest, largest_gains, resonance_grid
@@ -179,7 +179,7 @@ def _gain_at(g: StateSpace, freq: float) -> float:
 
 #: relative tolerance of the squared H2 norms from both Gramians: five digits, as in the certificate
 #: of `design_h2`; or, if larger, the rounding of their terms
-_SAME_NORM, ROUNDING = 1e-5, 1e-13
+_SAME_NORM = 1e-5
 
 
 @one_thread()
@@ -231,7 +231,7 @@ def h2_norm(sys: System) -> float:
         square, terms = _trace_of_factor(g.C, controllability_factor(g))
         other, their = _trace_of_factor(g.B.T, observability_factor(g))
     direct = float(np.sum(g.D**2)) if g.dt else 0.0
-    allowed = _SAME_NORM * (max(square, other) + direct) + ROUNDING * max(terms, their)
+    allowed = _SAME_NORM * (max(square, other) + direct) + RANK * max(terms, their)
     if not abs(square - other) <= allowed:
         raise CertificateError(
             f"the H2 norm of {g!r} is {np.sqrt(max(square, 0.0)):.9g} by the controllability "

@@ -16,7 +16,7 @@ from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
-from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SPLIT, TINY, TYPED
+from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SETTLED, SPLIT, TINY, TYPED
 from .modes import Modes
 from .solve import damper_forces
 from .statics import StiffnessFactor, dissection_of, held_factor, static_response
@@ -29,12 +29,9 @@ _COUPLED = NULL
 _UNDAMPED = SAME
 #: number of frequencies solved together, and number of entries of their matrices
 _CHUNK, _ENTRIES = 256, 4_000_000
-#: relative change of a direct solution by its last refinement: wanted, and largest accepted
-_SETTLED, _UNSETTLED = 1e-9, 1e-6
 #: fraction of the remaining loads (root of their energy) that may remain after a correction; the
-#: error of a Galerkin response is its square. Relative to the loads themselves where the remainder
-#: is rounding
-_LEFT, _NOTHING = 0.2, 1e-9
+#: error of a Galerkin response is its square
+_LEFT = 0.2
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,7 @@ class DynamicBasis:
             moved -= basis.V[:, :n] @ (inner.T @ moved)
             stored = np.abs(np.sum(parts * moved, axis=0)).reshape(2, -1).sum(axis=0)
             first = first if first.size else stored
-            if np.all(stored <= np.maximum(_LEFT**2 * first, _NOTHING**2 * np.tile(energy, count))):
+            if np.all(stored <= np.maximum(_LEFT**2 * first, SAME**2 * np.tile(energy, count))):
                 return basis
             basis = basis.enriched(moved)
         return None
@@ -220,9 +217,9 @@ class DynamicBasis:
             found = found + step
             size_of = np.linalg.norm(found, axis=0)
             change = np.linalg.norm(step, axis=0) / divisor(size_of)
-            if np.all(change <= _SETTLED):
+            if np.all(change <= SETTLED):
                 break
-        if not np.all(change <= _UNSETTLED):
+        if not np.all(change <= TYPED):
             raise SolverError(
                 f"a direct solution at {freq:.6g} Hz changes by {change.max():.2g} when refined: "
                 "the frequency is at a resonance of an undamped motion. Move it a little, or give "

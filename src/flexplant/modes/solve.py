@@ -30,7 +30,7 @@ from ..sparse.symmetric import (
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROUNDING, TINY
+from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROOT, ROUNDING, TINY
 from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
@@ -333,7 +333,7 @@ def _coupled_modes(
 #: largest error of M-orthonormality of a result
 _ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
-_RESIDUAL = (1e-8, 1e-12)
+_RESIDUAL = (ROOT, ROUNDING)
 _EPS = float(np.finfo(np.float64).eps)
 
 

@@ -19,11 +19,9 @@ from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative, square_root
 from ..lti.riccati import control_dare, riccati_root
 from ..store import Value
-from ..tolerances import RESIDUAL, SAME, SETTLED, TINY
+from ..tolerances import MOST_STEPS, NEGLIGIBLE, RANK, RESIDUAL, SAME, SETTLED, TINY
 from .criterion import Scorer
 
-#: steps in the weights on one tangent, and the relative gap at which they stop
-_CUTS, _GAP = 40, 1e-3
 #: tangents of a bound at the root, and the parts of a step between them
 _TANGENTS, _HALVES = 20, (1.0, 0.5, 0.25, 0.125, 0.0625)
 
@@ -244,8 +242,8 @@ def least_sum(
         inverse,
         branch,
         start,
-        steps=_CUTS,
-        close=lambda h, most: 1.0 / h - 1.0 / most <= _GAP * (1.0 / h + size),
+        steps=MOST_STEPS,
+        close=lambda h, most: 1.0 / h - 1.0 / most <= NEGLIGIBLE * (1.0 / h + size),
     )
     if not np.isfinite(most):
         return -np.inf, weights
@@ -295,10 +293,10 @@ class Convex(Scorer, ABC):
                 lower = self.cost(0.999 * moved + 0.001 * centre)  # inside, where it has a slope
                 if lower < cost:
                     break
-            if not lower < cost - _GAP * abs(cost) and np.isfinite(cost):
+            if not lower < cost - NEGLIGIBLE * abs(cost) and np.isfinite(cost):
                 break
             weights, cost = moved, lower
-            if cost - best <= _GAP * abs(cost):
+            if cost - best <= NEGLIGIBLE * abs(cost):
                 break
         return best, weights
 
@@ -315,11 +313,6 @@ class Convex(Scorer, ABC):
 def safe(bound: FloatArray) -> FloatArray:
     """Return bounds less what rounding may have added."""
     return np.asarray(bound - SAME * np.abs(bound))
-
-
-#: variance relative to the largest that counts as zero, and the fraction of a gradient that must
-#: agree
-_NOTHING, _CONFIRMED = 1e-13, 1e-10
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -385,7 +378,7 @@ class Quadratic(Value, Convex):
         # compression of an inverse has an inverse that is concave as well
         cost, after, closed, adjoint, seen = self._stationary(weights)
         sizes, axes = np.linalg.eigh(0.5 * (after + after.T))
-        kept = sizes > _NOTHING * sizes[-1]
+        kept = sizes > RANK * sizes[-1]
         lost = (self.S @ axes[:, ~kept]) ** 2 @ np.abs(sizes[~kept])
         root = axes[:, kept] * np.sqrt(sizes[kept])
         face, into = root.T @ self.S.T, (root / sizes[kept]).T
@@ -393,11 +386,11 @@ class Quadratic(Value, Convex):
         most = float(np.max(gradient))
         for slopes in _increments(closed, seen, into):
             found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
-            if np.max(np.abs(found - gradient)) <= _CONFIRMED * most:
+            if np.max(np.abs(found - gradient)) <= RESIDUAL * most:
                 break
         else:
             raise SolverError("the derivatives of the Riccati equation are not certain.")
-        if float(np.sum(lost)) > _CONFIRMED * (cost - self.constant):
+        if float(np.sum(lost)) > RESIDUAL * (cost - self.constant):
             raise SolverError("directions of no variance have a part in the cost.")
         value, vectors = np.linalg.eigh(adjoint)
         rows = seen @ (vectors * np.sqrt(np.maximum(value, 0.0)))

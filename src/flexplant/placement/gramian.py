@@ -13,15 +13,15 @@ from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..store import checked
-from ..tolerances import RANK, ROOT, TINY
+from ..tolerances import NEGLIGIBLE, RANK, ROOT, TINY
 from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
 from .criterion import Criterion, Scorer, by_size
 
 MEASURES = ("trace", "log det", "least")
-#: steps to the largest log det, and the gap at which they stop [nats]
-_STEPS, _CLOSE = 300, 1e-3
+#: steps to the largest log det
+_STEPS = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class _LogDet(Below):
             branch,
             inner,
             steps=_STEPS,
-            close=lambda value, most: most - value <= _CLOSE,
+            close=lambda value, most: most - value <= NEGLIGIBLE,
         )
         return -most - ROOT, weights
 

@@ -17,7 +17,7 @@ from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, co
 from ..plant import StandardPlant
 from ..plant.scheduling import values_over
 from ..store import checked
-from ..tolerances import TINY
+from ..tolerances import NEGLIGIBLE, TINY
 from ..words import one_of
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .convex import Below, Branch, Convex, Tangent, least_sum
@@ -26,8 +26,8 @@ from .mode_shapes import PlacedShapes, shapes_of
 from .problem import RigidPart
 
 MEASURES = ("worst", "mean")
-#: rounds in which the shares of parts move to the worst one, how fast, and the gap that ends them
-_ROUNDS, _PULL, _GAP = 8, 4.0, 1e-3
+#: rounds in which the shares of parts move to the worst one, and how fast
+_ROUNDS, _PULL = 8, 4.0
 
 
 def over(measure: str, values: Any) -> Any:
@@ -240,7 +240,7 @@ class BelowAll(Below):
                 [f[0] + t.constant for f, t in zip(falls, tangents, strict=True) if f is not None]
             )
             size = float(np.abs(costs).max())
-            if float(costs.max()) - best <= _GAP * size:
+            if float(costs.max()) - best <= NEGLIGIBLE * size:
                 break
             shares = shares * np.exp(_PULL * (costs - costs.max()) / size)
             shares = shares / shares.sum()

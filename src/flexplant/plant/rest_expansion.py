@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace
-from ..tolerances import SAME
+from ..tolerances import ROOT, SAME, TYPED
 from .axes import apart, complex_gain, felt, resting_frequency
 from .partitioned import Partition
 
@@ -21,13 +21,10 @@ OfS: TypeAlias = Callable[[complex], ComplexArray]
 _SAMPLES = 16
 #: largest radius [rad/s]: 1 kHz, above the bandwidth of any motion; how often it is halved, to 5e-6
 _LARGEST, _RADII = 6e3, 30
-#: relative: two circles give the same coefficients
-_SAME = 1e-8
 #: where the expansion is compared with the function, relative to the radius: in decades, so that
-#: poles far inside of the circle are noticed too; and the relative difference: with eight terms it
-#: lacks 0.1^8 of a function that is regular within the circle
-_INSIDE, _NEAR = (1e-1, 1e-2, 1e-3, 1e-4), 1e-6
-#: terms that are compared
+#: poles far inside of the circle are noticed too
+_INSIDE = np.logspace(-1, -4, 4)
+#: terms that are compared: eight lack 0.1^8 of a function that is regular within the circle
 _TERMS = 8
 
 
@@ -45,8 +42,8 @@ def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatA
         size = np.abs(outer) * radius**powers
         scale = divisor(size.max(axis=tuple(range(1, size.ndim)), keepdims=True))
         low = (0.5 * radius) ** powers
-        same = np.abs(outer - inner)[..., :count] * low[:count] <= _SAME * scale
-        terms = np.where(np.abs(inner) * low <= _SAME * scale, 0.0, inner)
+        same = np.abs(outer - inner)[..., :count] * low[:count] <= ROOT * scale
+        terms = np.where(np.abs(inner) * low <= ROOT * scale, 0.0, inner)
         if np.all(same) and _is_inside(find, terms, 0.5 * radius):
             return np.asarray(terms[..., :count])
         outer, radius = inner, 0.5 * radius
@@ -63,7 +60,7 @@ def _is_inside(find: OfS, terms: FloatArray, radius: float) -> bool:
         wanted = find(complex(s)).real
         found = terms @ s ** np.arange(terms.shape[-1])
         scale = np.abs(wanted).max(axis=tuple(range(1, wanted.ndim)), keepdims=True)
-        if not np.all(np.abs(found - wanted) <= _NEAR * divisor(scale)):
+        if not np.all(np.abs(found - wanted) <= TYPED * divisor(scale)):
             return False
     return True
 

@@ -23,7 +23,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..plant.partitioned import require_noise
 from ..store import Value, checked
-from ..tolerances import SAME
+from ..tolerances import SAME, TYPED
 from ..words import flag, instance, name_list, sizes_of, with_unit
 from .moving_machine import (
     MovingMachine,
@@ -35,8 +35,8 @@ from .moving_machine import (
 )
 from .sampled_runs import unscheduled
 
-#: number of repetitions of a trajectory after which its errors must repeat, and relative tolerance
-_REPEATED, _SETTLED = 100, 1e-6
+#: number of repetitions of a trajectory after which its errors must repeat
+_REPEATED = 100
 #: ratio to the smallest error above which a filter with a steady gain counts as diverged
 _DIVERGED = 100.0
 #: ratio to the first error above which an unstable filter is not followed further
@@ -299,7 +299,7 @@ def filters_along(
         for _ in range(_REPEATED if flag(repeats, "repeats") else 0):
             before = rms
             rms, P = filters.run(P, gain)
-            if np.all(np.abs(rms - before) <= _SETTLED * rms):
+            if np.all(np.abs(rms - before) <= TYPED * rms):
                 break
             # a steady gain may be unstable at some positions: its errors then grow without bound
             if gain is not None and np.any(rms > _DIVERGED * found["exact"]):
@@ -307,7 +307,7 @@ def filters_along(
         else:
             if repeats:
                 raise SolverError(
-                    f"the errors change by more than {_SETTLED:g} after {_REPEATED} repetitions: "
+                    f"the errors change by more than {TYPED:g} after {_REPEATED} repetitions: "
                     "the trajectory is short compared with the memory of the filter. Use several "
                     "repetitions as one trajectory, or repeats=False."
                 )

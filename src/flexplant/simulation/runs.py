@@ -16,7 +16,7 @@ from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import StandardPlant
 from ..plant.building import WhiteNoise
-from ..tolerances import ROOT
+from ..tolerances import RESIDUAL, ROOT
 from .nonlinear_elements import Acting, Answering
 
 
@@ -265,10 +265,9 @@ STRETCH, ABREAST = 128, 16
 #: length of a run for which the preparation of blocks must pay off [samples]; fixed, since the
 #: first samples of a long run equal those of a short one to the last bit
 _TYPICAL = 10_000
-#: largest difference of blocks from single samples relative to the peak of a channel, in addition
-#: to this multiple of the rounding of single samples: a channel that is zero by symmetry is only
-#: rounding
-_AGREE, _ROUNDING = 1e-10, 100.0
+#: blocks may differ from single samples by this multiple of the rounding of single samples too: a
+#: channel that is zero by symmetry is only rounding
+_ROUNDING = 100.0
 
 
 def make_runner(
@@ -500,7 +499,7 @@ class InBlocks:
         single.advance(k, expected)
         rounding = np.abs(expected[1] / 3.0 - expected[0]).max(axis=1)
         wrong = np.abs(self._run(v, start)[0][:, : self.n_shown].T - expected[0]).max(axis=1)
-        allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
+        allowed = RESIDUAL * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))
 
 

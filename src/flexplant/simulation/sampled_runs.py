@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, only_one, require_known, short, warn
+from ..identification.periodic import MOST_SAMPLES
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import references, with_known
 from ..parallel import Progress, one_thread
@@ -138,7 +139,7 @@ def simulate(
     closed, loop = loop, finer_loop(loop, finer)
     plant = loop.machine
     steps = round(positive(duration, "duration") / plant.dt)
-    if steps > MOST_STEPS:
+    if steps > MOST_SAMPLES:
         raise ModelError(
             f"duration {float(duration):g} s is {steps:.3g} samples of {plant.dt:g} s: more than "
             "memory holds. Simulate a part of it."
@@ -391,10 +392,6 @@ def _check_setpoint(move: SetPointProfile, name: str, time: FloatArray) -> None:
                 f"{1.0 / dt:g} Hz: its derivatives are not in phase there. Make it with "
                 f"rate={1.0 / dt:g}."
             )
-
-
-#: largest number of samples of one run
-MOST_STEPS = 10**9
 
 
 def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:

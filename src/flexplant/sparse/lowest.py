@@ -375,10 +375,8 @@ def _error_radius(factor: MultifrontalFactor, matrix: Any) -> float:
 
 #: number of DOFs up to which dense LAPACK finds every eigenvalue
 _DENSE = 300
-#: first shift, relative to the typical K_ii / M_ii
-_FIRST_SHIFT = 1e-8
 #: largest number of zero eigenvalues that are listed one by one
-_MOST = 64
+MOST_ZEROS = 64
 
 
 @dataclass(frozen=True)
@@ -411,13 +409,13 @@ def lowest_modes(
     stiff, heavy = np.abs(diagonal(K)), diagonal(M)
     ratios = stiff[heavy > 0] / heavy[heavy > 0]
     typical = float(np.median(ratios[ratios > 0])) if np.any(ratios > 0) else 1.0
-    shift, number, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
+    shift, number, size = ROOT * typical, count, cast(Any, abs(K))
     floor = max(rounding, ZERO)
     of_known = np.einsum("ij,ij->j", np.abs(first), np.asarray(size @ np.abs(first)))
     # one elimination order serves all shifts
     large = K.shape[0] > DENSE_LIMIT
     order = dissect(sp.csc_array(K + shift * M), nodes, xyz) if large else None
-    limit = min(int(np.count_nonzero(heavy > 0)) - first.shape[1], _MOST)
+    limit = min(int(np.count_nonzero(heavy > 0)) - first.shape[1], MOST_ZEROS)
     for _ in range(6):
         number = min(number, limit)
         values, shapes = _inverse_iteration(K, M, shift, number, order, first)
@@ -462,7 +460,7 @@ def _most_negative(
             shift *= 10.0
             continue
         none = np.zeros((K.shape[0], 0))
-        return _inverse_iteration(K, M, shift, min(count, _MOST), order, none)
+        return _inverse_iteration(K, M, shift, min(count, MOST_ZEROS), order, none)
     return None
 
 

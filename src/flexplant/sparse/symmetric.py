@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, Matrix, divisor
+from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, divisor
 from ..errors import ModelError
 from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT
 
@@ -19,8 +19,6 @@ _FULL = 0.8
 SPREAD = SPLIT
 #: number of rows processed together
 _ROWS = 65536
-#: least number of shapes multiplied together: all shapes of a large model would fill the memory
-_COLUMNS = 16
 #: number of units in the last place below which an eigenvalue counts as zero
 ZERO = 30 * PRECISION
 
@@ -142,10 +140,10 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
 
 def width_of(rows: int) -> int:
     """Return how many shapes of a number of rows are multiplied at a time."""
-    return max(_COLUMNS, _ROWS // max(rows, 1))
+    return max(COLUMNS, _ROWS // max(rows, 1))
 
 
-def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
+def column_groups(count: int, most: int = COLUMNS) -> Iterator[slice]:
     """Yield the columns of a wide array in groups of one size, which limits the memory."""
     groups = -(-count // most)
     for k in range(groups):

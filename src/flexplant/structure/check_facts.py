@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from ..arrays import FloatArray, IntArray, divisor
 from ..errors import ModelError, SolverError
 from ..sparse.factor import is_positive_definite
-from ..sparse.lowest import Lowest, lowest_modes
+from ..sparse.lowest import MOST_ZEROS, Lowest, lowest_modes
 from ..sparse.symmetric import ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
 from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME
 from .definite import are_rigid, are_swapped, unstable_stiffness
@@ -23,8 +23,6 @@ from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_
 
 #: number of modes requested from the solver: six rigid-body motions and some elastic modes
 _MODES, _FEW = 10, 4
-#: largest number of DOFs without stiffness that are counted as motions without energy
-_LOOSE = 64
 
 
 @dataclass(frozen=True)
@@ -289,7 +287,7 @@ def _try_lowest_modes(
         )
     except (SolverError, ModelError) as error:
         return None, scaled, str(error)
-    few = loose[:_LOOSE]
+    few = loose[:MOST_ZEROS]
     shapes = np.zeros((K.shape[0], few.size + found.shapes.shape[1]))
     shapes[few, np.arange(few.size)] = 1.0
     shapes[there, few.size :] = found.shapes

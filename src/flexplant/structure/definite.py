@@ -23,14 +23,13 @@ from ..sparse.symmetric import (
     soft_group,
     unit_diagonal,
 )
-from ..tolerances import SAME, TYPED
+from ..tolerances import RESIDUAL, SAME, TYPED
 from .zero_energy_motions import most_moved, nonrigid
 
 #: input types that become a matrix of a structure
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
-#: fraction of the largest possible energy of a rigid translation: upper limit in K, lower limit in
-#: M
-_NONE, _SOME = 1e-6, 0.1
+#: least energy in M of a rigid translation, as a fraction of the largest possible one
+_SOME = 0.1
 #: sqrt(K_ii / M_ii) [rad/s] below which, if no DOF is faster, K and M are probably swapped
 _SLOW = 1e-2
 
@@ -156,7 +155,7 @@ def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
     moves = [(dofs.kinds == axis).astype(np.float64) for axis in range(3)]
     moves = [motion for motion in moves if motion.any()]
     energies = [(_energy(M, motion), _energy(K, motion)) for motion in moves]
-    if energies and all(of_M <= _NONE and of_K >= _SOME for of_M, of_K in energies):
+    if energies and all(of_M <= TYPED and of_K >= _SOME for of_M, of_K in energies):
         return True
     return bool(0.0 < _omega_bound(M, K) < _SLOW) and _unmoved(M, dofs.directions) > _unmoved(
         K, dofs.directions
@@ -245,8 +244,8 @@ def refuse_unstable(model: Any, what: str) -> None:
 
 #: shift of the inverse problem in units of the rounding of K, so that K + s M is well-conditioned
 _SHIFT = 1e3
-#: number of steps of inverse iteration, and change of the eigenvalues at which it ends
-_STEPS, _SETTLED = 5, 1e-10
+#: number of steps of inverse iteration
+_STEPS = 5
 
 
 def elastic_modes(
@@ -387,7 +386,7 @@ def _improved(
         for _ in range(2):
             moved -= rigid @ (inertia.T @ moved)
         values, soft = rayleigh_ritz(K, M, moved)
-        if np.all(np.abs(values - before) <= _SETTLED * np.abs(values)):
+        if np.all(np.abs(values - before) <= RESIDUAL * np.abs(values)):
             break
     stiff = phi[:, end:]
     for _ in range(2):

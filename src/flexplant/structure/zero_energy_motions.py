@@ -191,8 +191,8 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
     return float(np.mean(factors))
 
 
-#: relative errors of entries of K: reported above the first, rounding below the second
-_FINE, _COARSE = 3e-12, 1e-4
+#: relative error of entries of K above which it is reported
+_FINE = 3e-12
 #: least number of loaded rows for a median of their forces
 _ROWS = 12
 
@@ -219,7 +219,7 @@ def shown_digits(K: Any, dofs: DofSet) -> int | None:
         error = float(np.median(np.abs(force[rows]) / scale[rows])) / 0.39
         work = np.abs(motion * force)
         aligned = abs(float(motion @ force)) > 0.5 * float(work.sum())
-        if error < _COARSE and not aligned:
+        if error < FOUR_DIGITS and not aligned:
             worst = max(worst, error)
     return round(-float(np.log10(worst))) if worst > _FINE else None
 

@@ -15,7 +15,7 @@ from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
-from ..tolerances import DEVIATIONS, INTERVAL, SAME, TYPED
+from ..tolerances import CLOSE, DEVIATIONS, INTERVAL, MOST_STEPS, SAME, TYPED
 from ..words import instance
 from .family import Point
 from .residuals.modal_residuals import USUAL, Eigenvalues, growth
@@ -27,9 +27,6 @@ from .sensitivities import eigenvalue_sensitivities
 #: degrees of freedom of the usual discrepancy of a kind: two measured modes outweigh it, and it
 #: holds without measured modes
 USUAL_DOF = 2.0
-#: largest number of rounds of weights and parameters, and relative change of the deviations at
-#: which they end
-_ROUNDS, _SETTLED = 20, 0.01
 #: search range of the deviations, in units of the usual ones
 _LEAST, _MOST = 1e-3, 1e4
 
@@ -167,7 +164,7 @@ def weigh_discrepancy(
     before: FloatArray = np.zeros(0)
     places = [at for _, at in rows]
     found: list[Discrepancy] = []
-    for _ in range(_ROUNDS):
+    for _ in range(MOST_STEPS):
         objective.bounds, objective.defect = own, defect
         point = objective.at(end.p)
         r, J = objective.values(point), objective.slopes(point)
@@ -186,7 +183,7 @@ def weigh_discrepancy(
             )
         end = search.resumed(objective, end)
         size = np.array([one.deviation for one in found])
-        if before.size and np.all(np.abs(size - before) <= _SETTLED * size):
+        if before.size and np.all(np.abs(size - before) <= CLOSE * size):
             break
         before = size
     return end, tuple(found)

@@ -18,7 +18,7 @@ from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import FOUR_DIGITS, RANK, ROOT, SAME, TINY
+from ..tolerances import FOUR_DIGITS, NULL, RANK, ROOT, SAME, TINY
 from .parameters import Parameter
 
 
@@ -364,12 +364,12 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     return np.asarray(poles[keep], dtype=np.complex128), np.asarray(vectors, dtype=np.complex128)
 
 
-#: largest rank that is searched, and relative size below which an entry is rounding
-FEW, ROUNDING = 4, 1e-11
+#: largest rank that is searched
+FEW = 4
 
 
 def factors(
-    matrix: FloatArray, *, most: int = FEW, rounding: float = ROUNDING
+    matrix: FloatArray, *, most: int = FEW, rounding: float = NULL
 ) -> list[tuple[float, FloatArray]] | None:
     """Return s_i = +-1 and b_i of ``A = sum_i s_i b_i b_i^T``, by pivots; None when there are more.
 

@@ -20,7 +20,7 @@ from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL
 from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
-from ..tolerances import SAME
+from ..tolerances import SAME, TYPED
 from ..words import function, mapping
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 
@@ -330,9 +330,6 @@ def _checked_matrix(value: Any, name: str) -> Matrix | None:
     return checked
 
 
-#: errors of a polynomial relative to the change of the matrix: largest accepted error between its
-#: points, and rounding where the matrix is a polynomial
-CLOSE, EXACT = 1e-6, 1e-9
 #: degrees that are tried where none is given
 DEGREES = (3, 6, 12)
 #: points at which polynomials are compared with the matrices, relative to the width
@@ -383,7 +380,7 @@ class PolynomialParameter(_GivenParameter):
         degrees = {label[1]: len(self._powers(label)) for label in PARTS}
         parts = ", ".join(f"{part} of degree {count}" for part, count in degrees.items() if count)
         unit = f" [{self.unit}]" if self.unit else ""
-        about = f", good to {self.missed:.1g}" if self.missed > EXACT else ""
+        about = f", good to {self.missed:.1g}" if self.missed > SAME else ""
         return f"<PolynomialParameter: {self.name}{unit}, {parts}{about}>"
 
     @classmethod
@@ -427,7 +424,7 @@ class PolynomialParameter(_GivenParameter):
         for powers in DEGREES if degree is None else (whole(degree, "degree"),):
             found, missed = _interpolated(build, points, middle, half, powers, name)
             worst = max(missed, key=lambda label: missed[label][0])
-            if missed[worst][0] <= CLOSE:
+            if missed[worst][0] <= TYPED:
                 break
         else:
             part, at = missed[worst]
@@ -436,7 +433,7 @@ class PolynomialParameter(_GivenParameter):
                 f"{part:.2g} of the change at {middle + half * at:.6g}. Raise degree=, or make "
                 "width= smaller."
             )
-        if missed[worst][0] > EXACT:
+        if missed[worst][0] > SAME:
             low, high = checked_bounds(bounds, name) or (-np.inf, np.inf)
             bounds = max(low, -half), min(high, half)
         return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
@@ -496,7 +493,7 @@ def _interpolated(
             missed[label] = max(missed[label], (off / size if size else 0.0, x))
         kept = [part / half ** (k + 1) for k, part in enumerate(terms)]
         found["d" + label] = [
-            part if float(abs(part).max()) * half ** (k + 1) > EXACT * size else None
+            part if float(abs(part).max()) * half ** (k + 1) > SAME * size else None
             for k, part in enumerate(kept)
         ]
     return found, missed

@@ -12,13 +12,10 @@ from ...arrays import FloatArray, divisor
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING, TINY, TYPED
+from ...tolerances import NEGLIGIBLE, ROUNDING, TINY, TYPED
 
 #: directions of a Delta's change below this, relative to the largest, are left out
 _RANK = 1e-5
-#: relative curvature over a Delta that is taken as that of a fraction, as masses have: affine
-#: channels miss the machine by twice this, and are widened by as much
-_BENT = 1e-3
 #: largest norm of a fraction's feedback: its pole lies well beyond the ends of the Delta
 _FEEDBACK = 0.5
 
@@ -181,7 +178,7 @@ class EvenUnits(NamedTuple):
         left, right, root = left[:, :rank], right[:rank], np.sqrt(values[:rank])
         feed = np.zeros((rank, rank))
         bend = change.bend
-        if change.curved > _BENT:
+        if change.curved > NEGLIGIBLE:
             core = left.T @ bend @ right.T
             fraction = core / np.outer(root, root)
             if la.norm(fraction, 2) < _FEEDBACK:

@@ -13,7 +13,7 @@ from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
-from ...tolerances import DEVIATIONS, ROUNDING, SAME
+from ...tolerances import DEVIATIONS, ROUNDING, SAME, TYPED
 from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ...words import members, several
@@ -26,8 +26,8 @@ from .parameter_amounts import ParameterDelta
 #: largest relative uncertainty of a damping: an interval reaches farther above than below, where
 #: it ends at zero
 _DAMPING = 0.99
-#: relative distance of poles of one model; and of measured ones, typed, from those of the machine
-_SAME_MODEL, _TYPED_POLES = 1e-6, 0.1
+#: relative distance of measured poles, typed, from those of the machine
+_TYPED_POLES = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class Fit(Uncertainty):
         chosen = tuple(sorted(known) if self.modes is None else self.modes)
         require_known("elastic mode", chosen, known)
         at = np.array([numbers.index(number) for number in chosen], dtype=np.int64)
-        _check_poles(realisation, chosen, source.poles[at], _SAME_MODEL, "fit")
+        _check_poles(realisation, chosen, source.poles[at], TYPED, "fit")
         both = np.stack([at, at + len(numbers)], axis=1).ravel()
         scale = self.deviations / DEVIATIONS * source.share[both]
         scale[::2] *= 2.0  # stiffness is omega^2
@@ -142,7 +142,7 @@ class Fit(Uncertainty):
 
     def _of_poles(self, realisation: ModalRealisation, poles: _Poles, name: str) -> Known:
         """Return Deltas of poles that are known, with their covariance."""
-        limit = _SAME_MODEL if name == "fit" else _TYPED_POLES
+        limit = TYPED if name == "fit" else _TYPED_POLES
         _check_poles(realisation, poles.modes, poles.values, limit, name)
         G = _log_derivatives(poles.values)
         covariance = G @ poles.covariance @ G.T
@@ -238,7 +238,7 @@ def _renumbered(realisation: ModalRealisation, source: ModalUncertainty) -> list
     size = np.abs(source.poles)
     gap = np.abs(size[:, None, None] - np.abs(own)).min(axis=2) / size[:, None]
     same = np.equal.outer(source.modes, elastic)
-    found = assigned(gap + np.where(same, 0.0, _SAME_MODEL))
+    found = assigned(gap + np.where(same, 0.0, TYPED))
     return [elastic[i] if i >= 0 else 0 for i in found.tolist()]
 
 
@@ -248,10 +248,10 @@ def _calibration_of(plant: Partition) -> Any:
     if found is None:
         return None
     own = np.linalg.eigvals(plant.assembled.realisation.A)
-    poles = found.poles[np.abs(found.poles) <= (1.0 + _SAME_MODEL) * np.abs(own).max()]
+    poles = found.poles[np.abs(found.poles) <= (1.0 + TYPED) * np.abs(own).max()]
     gap = np.abs(poles[:, None] - own).min(axis=1)
     # a model that was updated after it was calibrated has other poles
-    return found if np.all(gap <= _SAME_MODEL * np.abs(poles)) else None
+    return found if np.all(gap <= TYPED * np.abs(poles)) else None
 
 
 def _check_poles(

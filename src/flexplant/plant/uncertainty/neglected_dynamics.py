@@ -17,7 +17,7 @@ from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...store import Value
-from ...tolerances import RANK, ROUNDING, TINY, TYPED
+from ...tolerances import NEGLIGIBLE, RANK, ROUNDING, TINY, TYPED
 from ...words import name_list
 from ..building import sampled_like
 from ..partitioned import Partition, is_plant
@@ -330,8 +330,6 @@ _VALLEY, _WIDE = 1e-4, 0.1
 _PROMINENT = 3.0
 #: poles of a hump of unit frequency, and how far its two pairs are apart
 _HUMP, _APART = complex(-0.4, np.sqrt(1 - 0.4**2)), 1.1
-#: terms that add nowhere more than this fraction of the square of the weight are left out
-_NEGLIGIBLE = 1e-3
 
 
 def covering(
@@ -357,7 +355,7 @@ def covering(
     spacing = np.gradient(np.log(np.maximum(freq, freq[1])))
     p = _raised(values, _log_fit(values, tall, spacing), square)
     part = np.max(values * p / (values @ p)[:, None], axis=0)
-    kept = np.flatnonzero(part[1:] > _NEGLIGIBLE)
+    kept = np.flatnonzero(part[1:] > NEGLIGIBLE)
     gains = p / size
     ends: dict[complex, complex] = {}
     for i in kept.tolist():

@@ -12,12 +12,11 @@ from ...errors import CertificateError, ModelError
 from ...lti.discretisation import bilinear, tustin
 from ...lti.sampling import discretized
 from ...lti.statespace import StateSpace
+from ...tolerances import CLOSE
 from .channels import Change, DeltaPart, EvenUnits, Opened, with_parts
 from .neglected_dynamics import NeglectedModes, with_neglected
 from .uncertain_plants import UncertainPlant
 
-#: relative curvature over a Delta above which another mapping is tried
-_CURVED = 0.01
 #: largest relative distance of the channels from machines at the corners of the uncertainty
 _LARGEST = 0.05
 
@@ -143,7 +142,7 @@ def _sampled_channels(uncertain: UncertainPlant[Any]) -> Opened:
     far = {
         delta.mode
         for delta in deltas
-        if found[delta.name][1].curved > max(_CURVED, found[delta.name][0].curved)
+        if found[delta.name][1].curved > max(CLOSE, found[delta.name][0].curved)
     }
     sides: tuple[list[DeltaPart], list[DeltaPart]] = ([], [])
     for delta in deltas:

@@ -15,7 +15,7 @@ from ...parallel import Progress
 from ...store import Value
 from ...structure.model import FEModel
 from ...tolerances import CLOSE
-from ..changed_models import FullBasis
+from ..changed_models import LARGE, FullBasis
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
 from .goodness import chance, is_bad
@@ -25,8 +25,6 @@ from .twins import ALIKE, alike_sets
 #: fraction of the first-order effect of the best candidate above which another one is fitted, and
 #: number that is always fitted
 WORTH, FEWEST = 0.25, 10
-#: number of DOFs of an FEModel above which a basis replaces it
-LARGE = 150
 
 
 def localise(

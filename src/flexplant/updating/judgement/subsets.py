@@ -12,8 +12,8 @@ import scipy.linalg as la
 from ...arrays import FloatArray, divisor
 from ...errors import ModelError, SolverError
 from ...modes.matching import ALIKE, mac_matrix
-from ...tolerances import CLOSE, MOST_STEPS, NEGLIGIBLE, TINY, TYPED
-from ..family import ROUNDING, Eigen, Family, Point, factors
+from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, NULL, SETTLED, TINY, TYPED
+from ..family import Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
 from .goodness import chance, is_bad, noise_misfit, worst
@@ -22,8 +22,6 @@ from .goodness import chance, is_bad, noise_misfit, worst
 BEAM = 3
 #: number of candidates that extend a subset, and number of pairs that are tried together
 JOIN = 6
-#: relative tolerance of the compared fits, and of the chosen one
-COMPARED, CHOSEN = 1e-4, 1e-9
 #: number of parts of the way to a guess at which modes are followed, if their shapes change much
 WAY = np.arange(4) / 4
 #: ratio of the effect of a candidate to its first-order effect, where noise may explain the
@@ -106,7 +104,7 @@ class Subsets:
         way = self.ways[subset][:-1]
         objective.path = [p for p in way if is_physical(objective.family, p)]
         end = self.ways[subset][-1]
-        found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
+        found = TrustRegion().search(objective, end, most=50, tolerance=SETTLED)
         self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
         point = objective.at(found.p)
         self.done[subset] = self._left(objective, found.p, point, subset)
@@ -254,7 +252,7 @@ class Subsets:
         J, r = self.whole.slopes(point), self.whole.values(point)
         J, r = _beside(J[:, : self.count], J[:, self.beside], r)
         length = np.linalg.norm(J, axis=0)
-        J = J / np.where(length > ROUNDING * length.max(initial=0.0), length, np.inf)
+        J = J / np.where(length > NULL * length.max(initial=0.0), length, np.inf)
         a, overlap = J.T @ r, J.T @ J
         room = 1 - overlap**2
         both = a[:, None] ** 2 + a[None] ** 2 - 2 * overlap * np.outer(a, a)
@@ -321,13 +319,13 @@ class Subsets:
             # modes keep the numbers of the start, and are followed on the way
             objective.path = self._way(objective, first, guess)
             try:
-                found = method.search(objective, guess, most=50, tolerance=COMPARED)
+                found = method.search(objective, guess, most=50, tolerance=FOUR_DIGITS)
             except (ModelError, SolverError, np.linalg.LinAlgError):
                 found = None
             if found is not None and found.trail.error[-1] < self._error(()):
                 return found, [*objective.path, *found.trail.p]
             objective.path = []
-        found = method.search(objective, first, most=50, tolerance=COMPARED)
+        found = method.search(objective, first, most=50, tolerance=FOUR_DIGITS)
         return found, found.trail.p
 
     def _way(self, objective: Objective, first: FloatArray, guess: FloatArray) -> list[FloatArray]:
@@ -387,7 +385,7 @@ def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
     # a candidate that depends on nuisance parameters explains nothing
-    own = length > ROUNDING * whole
+    own = length > NULL * whole
     return np.asarray((J.T @ r) ** 2 / np.where(own, length, np.inf))
 
 
@@ -405,7 +403,7 @@ def load_vectors(family: Family, parameter: int) -> FloatArray | None:
     for stack in family.terms:
         for j in np.flatnonzero(np.array(family.owner) == parameter).tolist():
             across = np.abs(stack[j] - np.diag(np.diag(stack[j]))).max(initial=0.0)
-            if across > ROUNDING * np.abs(stack[j]).max(initial=0.0):
+            if across > NULL * np.abs(stack[j]).max(initial=0.0):
                 own = factors(stack[j])
                 if own is None:
                     return None
@@ -422,7 +420,7 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     low = squares <= (BEYOND * top) ** 2
     high = np.flatnonzero(~low)
     coupled, sizes, _ = la.svd(family.D[np.ix_(high, low)], full_matrices=False)
-    coupled = coupled[:, sizes > ROUNDING * np.abs(family.D).max(initial=TINY)]
+    coupled = coupled[:, sizes > NULL * np.abs(family.D).max(initial=TINY)]
     forces = np.hstack([loads[high], coupled])
     kept = int(low.sum())
     if kept + SHIFTS * forces.shape[1] > WORTHWHILE * squares.size:
