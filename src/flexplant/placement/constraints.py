@@ -213,14 +213,6 @@ class JointGroups(Constraint):
         return LinearRows.equal(pairs, places.total)
 
 
-def _largest_distance(points: FloatArray, others: FloatArray) -> float:
-    """Return the largest distance from any point of one set to the other; inf if sizes differ."""
-    if len(points) != len(others):
-        return np.inf
-    between = np.linalg.norm(points[:, None] - others[None], axis=2)
-    return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
-
-
 @dataclass(frozen=True, eq=False)
 class CountLimits(Constraint):
     """Limits on how many of some named candidates are chosen, such as two accelerometers at most.

@@ -104,38 +104,6 @@ class LeftOutModes(Criterion):
         return Share(counts * _worth(more, beyond), counts * _worth(kept, kept.omega > 0))
 
 
-@dataclass(frozen=True, eq=False)
-class PenalisedScores(Scorer):
-    """``J + weight |J| penalty`` of the same choices."""
-
-    base: Scorer
-    penalty: Scorer
-    weight: float
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return it for one choice."""
-        base, penalty = self.base.value(chosen), self.penalty.value(chosen)
-        return float(_penalised_sum(base, penalty, self.weight))
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return it for several choices."""
-        values = self.base.score(sets)
-        finite = np.flatnonzero(np.isfinite(values)).tolist()
-        more = self.penalty.score([sets[i] for i in finite])
-        values[finite] = _penalised_sum(values[finite], more, self.weight)
-        return values
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the bound without a penalty, or with the least one."""
-        base = self.base.bound(count, required)
-        least = max(self.penalty.bound(count, required), 0.0)
-        return float(_penalised_sum(base, least, self.weight)) if base >= 0 else base
-
-
-def _penalised_sum(value: Any, penalty: Any, weight: float) -> Any:
-    return value + weight * np.abs(value) * penalty
-
-
 def _worth(shapes: PlacedShapes, which: npt.NDArray[np.bool_]) -> FloatArray:
     omega, zeta = shapes.omega[which], shapes.zeta[which]
     return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
