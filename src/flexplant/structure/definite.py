@@ -23,7 +23,7 @@ from ..sparse.symmetric import (
     soft_group,
     unit_diagonal,
 )
-from ..tolerances import RESIDUAL, SAME, TYPED
+from ..tolerances import CLOSE, RESIDUAL, SAME, TYPED
 from .zero_energy_motions import most_moved, nonrigid
 
 #: input types that become a matrix of a structure
@@ -199,10 +199,6 @@ def lowest(matrix: Matrix) -> str:
     return f"scaled to a unit diagonal its lowest eigenvalue is {least:.3g}"
 
 
-#: least fraction of the kinetic energy of an unstable mode in rigid-body motion
-_RIGID = 0.99
-
-
 def signed_root(squares: FloatArray) -> FloatArray:
     """Return frequencies omega [rad/s] of omega^2, negative ones for a negative omega^2."""
     # as finite-element programs print them: a mode of -3 rad/s has the poles +3 and -3 1/s
@@ -217,7 +213,7 @@ def signed_square(omega: FloatArray) -> FloatArray:
 def are_rigid(M: Any, motions: FloatArray, phi: FloatArray) -> np.ndarray:
     """Return which shapes (k,) are rigid-body motions to 1 % of their kinetic energy."""
     part = np.asarray(by_rows(M) @ motions).T @ phi
-    return np.asarray(np.sum(part**2, axis=0) > _RIGID)
+    return np.asarray(np.sum(part**2, axis=0) > 1.0 - CLOSE)
 
 
 def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
 from ...modes.matching import assigned
 from ...sparse.symmetric import dense
-from ...tolerances import DEVIATIONS, ROUNDING, SAME, TYPED
+from ...tolerances import CLOSE, DEVIATIONS, ROUNDING, SAME, TYPED
 from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ...words import members, several
@@ -23,9 +23,6 @@ from .kind import Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, modal_realisation, require_elastic
 from .parameter_amounts import ParameterDelta
 
-#: largest relative uncertainty of a damping: an interval reaches farther above than below, where
-#: it ends at zero
-_DAMPING = 0.99
 #: relative distance of measured poles, typed, from those of the machine
 _TYPED_POLES = 0.1
 
@@ -122,7 +119,8 @@ class Fit(Uncertainty):
         both = np.stack([at, at + len(numbers)], axis=1).ravel()
         scale = self.deviations / DEVIATIONS * source.share[both]
         scale[::2] *= 2.0  # stiffness is omega^2
-        scale[1::2] = np.minimum(scale[1::2], _DAMPING)
+        # an interval of a damping reaches farther above than below, where it ends at zero
+        scale[1::2] = np.minimum(scale[1::2], 1.0 - CLOSE)
         every = _of_modes(chosen, scale)
         keep = np.flatnonzero([delta.acts(realisation) for delta in every])
         covariance = source.covariance[np.ix_(both[keep], both[keep])]

@@ -11,15 +11,12 @@ import numpy as np
 from ...arrays import FloatArray
 from ...errors import counted
 from ...store import Value
-from ...tolerances import NEGLIGIBLE, TINY, TYPED
+from ...tolerances import CLOSE, NEGLIGIBLE, TINY, TYPED
 from ...words import SHOWN
 from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
 from .goodness import resolution
-
-#: correlation above which a pair is listed
-CORRELATED = 0.99
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,7 +76,7 @@ class IdentifiabilityReport(Value):
             f"{self.parameters[i]} and {self.parameters[j]} {self.correlation[i, j]:+.3f}"
             for i in range(q)
             for j in range(i)
-            if abs(self.correlation[i, j]) > CORRELATED
+            if abs(self.correlation[i, j]) > 1.0 - CLOSE
         ]
         lines += [f"  correlated: {text}" for text in close[:2]]
         for name, modes in list(self.missing.items())[:2]:
