@@ -161,7 +161,7 @@ def _mode_blocks(realisation: ModalRealisation, g: StateSpace) -> _Blocks:
         order = np.lexsort((values.imag, np.round(np.abs(values), 9), values.imag == 0))
         own = ModalMap(values[order], T[:, order], np.linalg.inv(T)[order])
     poles = own.poles.reshape(n, 2)
-    see, push = own.seen(C).reshape(-1, n, 2), own.driven(B).reshape(n, 2, -1)
+    see, push = own.seen(C).reshape(len(C), n, 2), own.driven(B).reshape(n, 2, B.shape[1])
     static = -np.real(np.einsum("pbi,bi,bim->bpm", see, 1 / poles, push))
     return _Blocks(poles, see, push, static)
 
