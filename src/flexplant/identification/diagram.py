@@ -99,6 +99,9 @@ class StabilisationDiagram(Value):
         than inputs.
     band : (2,) array [Hz]
         Band of the listed poles.
+    highest : (n,) int array
+        Highest model order of the part of the band in which a pole lies; a part with few lines has
+        fewer orders.
     """
 
     orders: IntArray
@@ -108,6 +111,7 @@ class StabilisationDiagram(Value):
     shapes: ComplexArray = field(kw_only=True)
     participation: ComplexArray = field(kw_only=True)
     band: FloatArray = field(kw_only=True)
+    highest: IntArray = field(kw_only=True)
 
     def __len__(self) -> int:
         return int(self.poles.size)
@@ -143,15 +147,16 @@ class StabilisationDiagram(Value):
             Fraction of the orders, between 0 and 1.
         """
         presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
-        known = np.unique(self.orders)
         kept = []
         for track in np.unique(self.tracks):
             mine = self.tracks == track
+            known = np.unique(self.orders[self.highest == self.highest[mine][0]])
             span = np.sum(known >= self.orders[mine].min())
             stable = int(np.sum(mine & (self.flags == STABLE)))
             if stable >= max(4, presence * span):
                 kept.append(int(track))
         if not kept:
+            known = np.unique(self.orders)
             where = f"over the orders {known[0]} to {known[-1]}" if known.size else "in the band"
             raise SolverError(
                 f"no pole is stable {where}: use a band where resonances exceed the noise, "
@@ -212,15 +217,20 @@ def built_diagram(
     tolerances: tuple[float, float, float],
     *,
     first: int = 0,
+    spacing: float = 0.0,
 ) -> StabilisationDiagram:
-    """Return the diagram of results by ascending order: flags and tracks, numbered from `first`."""
+    """Return the diagram of results by ascending order: flags and tracks, numbered from `first`.
+
+    `spacing`: distance of lines [rad/s] near zero, where fractions of a frequency are below what
+    the lines resolve.
+    """
     flags: list[IntArray] = []
     tracks: list[IntArray] = []
     for before, result in zip([None, *results], results, strict=False):
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
-            old, flag = _continued_poles(before, result, tolerances)
+            old, flag = _continued_poles(before, result, tolerances, spacing)
             track = np.where(old >= 0, tracks[-1][old], -1)
         fresh = np.flatnonzero(track < 0)
         track[fresh] = first + np.arange(fresh.size)
@@ -235,18 +245,21 @@ def built_diagram(
         shapes=np.concatenate([one.shapes for one in results], axis=1),
         participation=np.concatenate([one.participation for one in results], axis=1),
         band=band,
+        highest=np.full(sum(one.poles.size for one in results), results[-1].order),
     )
 
 
 def _continued_poles(
-    old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
+    old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float], spacing: float
 ) -> tuple[IntArray, IntArray]:
     """Return the old pole that each new one continues, or -1, and the flags of the new ones."""
     tol_freq, tol_damping, tol_mac = tolerances
     f_old, f_new = np.abs(old.poles), np.abs(new.poles)
     z_old, z_new = -old.poles.real / f_old, -new.poles.real / f_new
-    near = np.abs(f_new[:, None] / f_old - 1.0) <= tol_freq
-    damped = near & (np.abs(z_new[:, None] / z_old - 1.0) <= tol_damping)
+    # near zero the lines determine a pole relative to their distance
+    coarse = tol_damping * spacing / f_old
+    near = np.abs(f_new[:, None] / f_old - 1.0) <= np.maximum(tol_freq, coarse)
+    damped = near & (np.abs(z_new[:, None] - z_old) <= np.maximum(tol_damping * z_old, coarse))
     alike = np.zeros_like(near)
     for i, pole in enumerate(new.poles):
         # shapes of (nearly) repeated poles are arbitrary within their span
@@ -394,22 +407,39 @@ _WIDE = 0.9
 POLES = 100
 
 
-def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
-    """Return the orders, by default as many as the lines allow; ModelError if they are too high."""
-    parts = line_windows(ready)
-    fewest = min(_resolved(ready.freq[seen]) for _, seen in parts)
-    if orders is None:
+@dataclass(frozen=True)
+class Part:
+    """A part of the band: its own lines, those used for its poles, and its model orders."""
+
+    own: slice
+    seen: slice
+    orders: list[int]
+    #: whether lines of negative frequencies take part, whose responses are the conjugates: near
+    #: zero the conjugate poles are as close as the poles, and real coefficients halve the unknowns
+    mirrored: bool
+
+
+def parts_of(ready: PreparedLines, orders: list[int] | None = None) -> list[Part]:
+    """Return the parts of the band; ModelError if their lines do not allow the orders given."""
+    windows = _line_windows(ready)
+    references = ready.data.shape[1]
+    step = 2 if len(windows) * references >= MANY else 1
+    parts = []
+    for own, seen in windows:
+        freq = ready.freq[seen]
+        mirrored = bool(freq[0] * WIDEST < freq[-1])
+        count = _resolved(freq) * (2 if mirrored else 1)
         # at least four orders are compared, for which twenty lines are enough
-        references = ready.data.shape[1]
-        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1, max(POLES // references, 10)))
-        return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
-    if 2 * (orders[-1] + 1) > fewest:
-        raise ModelError(
-            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band, which "
-            f"count as {fewest} where they are widest apart: lower the orders, or measure lines "
-            "that are closer and evenly spaced."
-        )
-    return orders
+        top = max(6, min(HIGHEST, count // LINES_OF_ORDER - 1, max(POLES // references, 10)))
+        mine = list(range(2, top + 1, step if top >= 4 * step else 1)) if orders is None else orders
+        if 2 * (mine[-1] + 1) > count:
+            raise ModelError(
+                f"order {mine[-1]} needs more lines than the {freq.size} between {freq[0]:.4g} and "
+                f"{freq[-1]:.4g} Hz, which count as {count} where they are widest apart: lower the "
+                "orders, or measure lines that are closer and evenly spaced."
+            )
+        parts.append(Part(own, seen, mine, mirrored))
+    return parts
 
 
 def _resolved(freq: FloatArray) -> int:
@@ -435,12 +465,16 @@ def checked_orders(orders: Iterable[int]) -> list[int]:
 
 #: number of lines of a part, and fraction of it that is used beyond each of its ends
 LINES, OVERLAP = 400, 0.25
+#: ratio of the frequencies at the ends of a part above which it is divided, and least number of
+#: lines that a part keeps: modes far below the top of a part lie within few lines of it, closer
+#: than its orders resolve
+WIDEST, FEWEST = 8.0, 40
 #: distance outside of the band, relative to it, within which poles are searched, since they affect
 #: the responses inside
 MARGIN = 0.04
 
 
-def line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
+def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     """Return the lines of parts of about 400, cut where responses are weakest, and those used."""
     import scipy.ndimage as ndi
 
@@ -448,32 +482,45 @@ def line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     count = max(1, round(n_freq / LINES))
     power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))
     power = ndi.uniform_filter1d(np.log(power + TINY), 9)
-    cuts = [0]
-    for i in range(1, count):
-        middle, reach = round(i * n_freq / count), n_freq // (4 * count)
-        cuts.append(middle - reach + int(np.argmin(power[middle - reach : middle + reach])))
-    cuts.append(n_freq)
+    cuts = [n_freq]
+    for i in range(count - 1, 0, -1):
+        cuts.append(_weakest(power, round(i * n_freq / count), n_freq // (4 * count)))
+    while True:
+        low = int(np.searchsorted(ready.freq, ready.freq[cuts[-1] - 1] / WIDEST))
+        if min(low, cuts[-1] - low) < FEWEST:
+            break
+        cuts.append(_weakest(power, low, low // 4))
+    cuts.append(0)
     parts = []
-    for first, last in pairwise(cuts):
+    for last, first in pairwise(cuts):
         beyond = round(OVERLAP * (last - first))
         seen = slice(max(0, first - beyond), min(n_freq, last + beyond))
         parts.append((slice(first, last), seen))
-    return parts
+    return parts[::-1]
+
+
+def _weakest(power: FloatArray, middle: int, reach: int) -> int:
+    """Return the line of least power within a reach of another."""
+    return middle - reach + int(np.argmin(power[middle - reach : middle + reach]))
 
 
 def diagram_of(
-    ready: PreparedLines, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
+    ready: PreparedLines,
+    orders: list[int] | None,
+    tolerances: tuple[float, float, float],
+    max_zeta: float,
 ) -> StabilisationDiagram:
     """Return the diagrams of all parts as one; a track belongs to the part with its median."""
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
-    for own, seen in line_windows(ready):
-        freq = ready.freq[seen]
-        moments = moments_in(ready, seen, orders[-1])
+    for part in parts_of(ready, orders):
+        own, freq = part.own, ready.freq[part.seen]
+        moments = moments_in(ready, part)
         inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
-        results = [moments.solve(order, inside) for order in orders]
-        diagram = built_diagram(results, band, tolerances, first=first)
+        results = [moments.solve(order, inside) for order in part.orders]
+        spacing = 2 * np.pi * float(np.median(np.diff(freq))) if part.mirrored else 0.0
+        diagram = built_diagram(results, band, tolerances, first=first, spacing=spacing)
         first += len(diagram)
         ends = (
             low - edge if own.start == 0 else ready.freq[own.start],
@@ -484,7 +531,7 @@ def diagram_of(
             mine = diagram.tracks == track
             keep[mine] = ends[0] <= np.median(diagram.freq[mine]) < ends[1]
         found.append((diagram, keep))
-    names = ("orders", "poles", "flags", "tracks", "shapes", "participation")
+    names = ("orders", "poles", "flags", "tracks", "shapes", "participation", "highest")
     parts: dict[str, Any] = {
         name: np.concatenate([getattr(one, name)[..., keep] for one, keep in found], axis=-1)
         for name in names
@@ -492,24 +539,32 @@ def diagram_of(
     return StabilisationDiagram(**parts, band=band)
 
 
-def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
+def weighted_by_remainder(ready: PreparedLines, orders: list[int] | None) -> PreparedLines:
     """Return the same with weights from the residual of matrix fractions of high order."""
     now = ready
     n_out, n_in, n_freq = ready.data.shape
     for _ in range(2):
         error: FloatArray = np.zeros(ready.data.shape)
-        parts = line_windows(now)
-        for own, seen in parts:
-            fitted: ComplexArray = moments_in(now, seen, order).response(order, now.freq[own])
+        coefficients = 0
+        for part in parts_of(now, orders):
+            own, order = part.own, part.orders[-1]
+            fitted: ComplexArray = moments_in(now, part).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
-        share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
+            coefficients += order + 1
+        share = coefficients / n_freq * (1 + n_in / n_out)
         now = now.from_errors(error, min(0.5, share))
     return now
 
 
-def moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
+def moments_in(ready: PreparedLines, part: Part) -> Moments:
     """Return the normal equations of the lines of one part."""
-    return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
+    freq, data = ready.freq[part.seen], ready.data[:, :, part.seen]
+    weight = ready.line_weight[:, part.seen]
+    if part.mirrored:
+        freq = np.concatenate([-freq[::-1], freq])
+        data = np.concatenate([data[:, :, ::-1].conj(), data], axis=2)
+        weight = np.concatenate([weight[:, ::-1], weight], axis=1)
+    return Moments(freq, data, weight, part.orders[-1])
 
 
 def _in_band(poles: ComplexArray, *, low: float, high: float, max_zeta: float) -> BoolArray:

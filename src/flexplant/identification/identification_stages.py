@@ -14,13 +14,7 @@ from ..lti.frequency import Frf
 from ..modes.matching import ALIKE, mac_matrix
 from ..parallel import Progress, expect
 from ..tolerances import TINY
-from .diagram import (
-    PoleSelection,
-    StabilisationDiagram,
-    affordable,
-    diagram_of,
-    weighted_by_remainder,
-)
+from .diagram import PoleSelection, StabilisationDiagram, diagram_of, weighted_by_remainder
 from .line_weights import NARROW, PreparedLines, Rejected, mains_multiple
 from .model_error import (
     NOISE,
@@ -296,10 +290,9 @@ def identified(
             f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
             f"has {references}: compute the diagram from the same channels."
         )
-    listed = affordable(orders, ready)
     if not ready.known:
-        ready = weighted_by_remainder(ready, listed[-1])
-    begin = _Begin(start) if start is not None else _begin(task, ready, listed)
+        ready = weighted_by_remainder(ready, orders)
+    begin = _Begin(start) if start is not None else _begin(task, ready, orders)
     refine = False if begin.at_peaks else task.refine
     work = ready.data.size * (len(begin.poles) * ready.data.shape[1]) ** 2
     costly = work > UNASKED
@@ -334,7 +327,7 @@ def identified(
     return found
 
 
-def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
+def _begin(task: Task, ready: PreparedLines, orders: list[int] | None) -> _Begin:
     """Return the poles that are stable over the orders of the diagram, else those of the peaks."""
     diagram = diagram_of(ready, orders, (0.01, 0.05, 0.95), 0.2)
     try:
@@ -418,7 +411,7 @@ def _answered(
     # a first result may have some misfit, but deviations must not be enlarged to the double
     if compare or task.budget.done > BUDGET or (begin.alone and fit.misfit > LARGE):
         odd = None if apart is None else (apart.size, lines.side, _odd(task.frf, lines, apart))
-        warned(unexplained(fit), odd)
+        warned(lines.freq, unexplained(fit), odd)
     if task.side == RUNS:
         ready = ready.over_runs(task.runs)
         lines = replace(lines, data=ready.data, weight=ready.weight, setups=())

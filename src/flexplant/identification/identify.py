@@ -16,11 +16,10 @@ from ..words import instance, several
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
-    affordable,
     checked_orders,
     diagram_of,
-    line_windows,
     moments_in,
+    parts_of,
     weighted_by_remainder,
 )
 from .frf_estimation import repetitions, stacked_runs
@@ -107,9 +106,9 @@ def stabilisation_diagram(
     ready = prepared_lines(forward_in_time(frf, band), band)
     listed = None if orders is None else checked_orders(orders)
     if not ready.known:
-        ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
+        ready = weighted_by_remainder(ready, listed)
     with one_thread():
-        return diagram_of(ready, affordable(listed, ready), limits, top)
+        return diagram_of(ready, listed, limits, top)
 
 
 def identify_modes(
@@ -331,15 +330,15 @@ def _earlier(freq: FloatArray, data: ComplexArray) -> bool:
 
 def _stable_misfit(ready: PreparedLines) -> float:
     """Return the weighted squared error that the stable poles of a matrix fraction leave."""
-    order, left = affordable(None, ready)[-1], 0.0
-    for _, seen in line_windows(ready):
-        freq = ready.freq[seen]
+    left = 0.0
+    for part in parts_of(ready):
+        seen, freq = part.seen, ready.freq[part.seen]
 
         def stable(poles: ComplexArray, freq: FloatArray = freq) -> Any:
             inside = (poles.imag > 2 * np.pi * freq[0]) & (poles.imag < 2 * np.pi * freq[-1])
             return inside & (poles.real < 0) & (poles.real > -DAMPED * np.abs(poles))
 
-        poles = moments_in(ready, seen, order).solve(order, stable).poles
+        poles = moments_in(ready, part).solve(part.orders[-1], stable).poles
         terms = [1 / (2j * np.pi * freq[:, None] - poles), (freq[:, None] / freq[-1]) ** POWERS]
         for weight, data in zip(ready.line_weight[:, seen], ready.data[:, :, seen], strict=True):
             columns = np.hstack(terms) * weight[:, None]

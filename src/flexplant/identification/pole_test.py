@@ -281,6 +281,9 @@ def missed_poles(fit: PoleFit) -> Proposals:
         yield [_more_poles(fit, *_pole_at(fit, peak))]
 
 
+#: distance of lines, relative to a frequency, above which they resolve no mode there: the width of
+#: a resonance of 10 % damping
+RESOLVED = 0.2
 #: lengths [lines] of the examined groups of lines
 STRETCHES = (3, 9, 27, 81)
 #: number of highest groups of each length, and number of peaks at which a pole is tried
@@ -411,9 +414,17 @@ def _pole_at(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
     return np.array([pole]), part.astype(np.complex128)
 
 
-def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
+def warned(freq: FloatArray, left: list[Peak], apart: tuple[float, str, str] | None) -> None:
     """Warn of groups of lines without a pole, of single lines, or of outputs that disagree."""
     # for the last: their difference, their kind, and one that deviates far more than the others
+    step = float(np.median(np.diff(freq)))
+    coarse = [peak.freq for peak in left if peak.freq * RESOLVED < step]
+    near = (
+        f"The lines, {step:.3g} Hz apart, are too coarse for modes there: measure longer segments "
+        f"and pass band=({min(coarse) / 2:.3g}, {2 * max(coarse):.3g}). "
+        if coarse
+        else ""
+    )
     stretches = [peak for peak in left if not peak.isolated]
     if apart is not None:
         warn(
@@ -428,7 +439,7 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
         warn(
             f"the residual exceeds the noise near {_peak_list(stretches)}: a mode may be missed "
             "or merged there, and the errors of its neighbours may exceed their stated "
-            "deviation. Look at "
+            f"deviation. {near}Look at "
             "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
             "band."
         )

@@ -232,8 +232,8 @@ class PoleFit:
         self, lines: Lines, poles: ComplexArray, participation: ComplexArray, pivots: Any = None
     ) -> None:
         s = axis(lines.freq)
-        n_out = lines.data.shape[0]
-        m = poles.size
+        data, m = lines.data, poles.size
+        n_out = len(data)
         lines.work.add(lines.data.size * (2 * m) ** 2)
         self.lines, self.poles, self.participation, self.m = lines, poles, participation, m
         self.pivots: IntArray = np.zeros(m, dtype=int) if pivots is None else pivots
@@ -250,6 +250,10 @@ class PoleFit:
         for o, (right, stacked) in enumerate(zip(lines.goals, columns, strict=True)):
             size = np.maximum(np.linalg.norm(stacked, axis=0), TINY)
             Q, R = _orthonormal(stacked / size)
+            if np.min(np.abs(np.diag(R)), initial=1.0) < FAR_APART:
+                # the difference of two poles that nearly coincide holds their rounding, enlarged
+                rows = Q.T.reshape(2 * m, data.shape[1], -1).swapaxes(0, 1)
+                Q = _off(lines.smooth_bases[o][0], rows).swapaxes(0, 1).reshape(Q.shape[::-1]).T
             x = la.lstsq(R, Q.T @ right, cond=RANK)[0] / size
             self.shapes[o] = x[:m] + 1j * x[m:]
             self.triangles.append((R, size))
