@@ -482,9 +482,9 @@ def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     count = max(1, round(n_freq / LINES))
     power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))
     power = ndi.uniform_filter1d(np.log(power + TINY), 9)
-    cuts = [n_freq]
-    for i in range(count - 1, 0, -1):
-        cuts.append(_weakest(power, round(i * n_freq / count), n_freq // (4 * count)))
+    reach = n_freq // (4 * count)
+    inner = [_weakest(power, round(i * n_freq / count), reach) for i in range(1, count)]
+    cuts = [n_freq, *inner[::-1]]
     while True:
         low = int(np.searchsorted(ready.freq, ready.freq[cuts[-1] - 1] / WIDEST))
         if min(low, cuts[-1] - low) < FEWEST:
