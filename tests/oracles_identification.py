@@ -25,14 +25,25 @@ def modal_frf(freq, poles, out, drive, rigid=None, static=None):
     return H
 
 
-def held_mode(freq, p, rate):
-    """(n_freq,) of x'' - 2 Re(p) x' + |p|^2 x = u, u held, by the exponential of its matrix."""
+def held_mode(freq, p, rate, late=0.0):
+    """(n_freq,) of x'' - 2 Re(p) x' + |p|^2 x = u, u held, by the exponential of its matrix.
+
+    `late`: u is late by this number of samples.
+    """
     A = np.array([[0.0, 1.0], [-(abs(p) ** 2), 2 * p.real]])
     big = np.zeros((3, 3))
     big[:2, :2], big[1, 2] = A / rate, 1.0 / rate
-    e = la.expm(big)
+    e, older, newer = (la.expm(big * t) for t in (1.0, late % 1.0, 1.0 - late % 1.0))
     z = np.exp(2j * np.pi * np.asarray(freq) / rate)
-    return np.array([np.linalg.solve(x * np.eye(2) - e[:2, :2], e[:2, 2])[0] for x in z])
+    return np.array(
+        [
+            np.linalg.solve(
+                x * np.eye(2) - e[:2, :2], newer[:2, 2] + newer[:2, :2] @ older[:2, 2] / x
+            )[0]
+            / x ** (late // 1.0)
+            for x in z
+        ]
+    )
 
 
 def noisy(H, deviation, rng):

@@ -17,23 +17,24 @@ PHI = np.random.default_rng(3).normal(size=(4, 3))
 POLES = pole([30.0, 30.5, 70.0], [0.01, 0.01, 0.02])
 
 
-def test_held_poles_make_the_held_mode():
+@pytest.mark.parametrize("late", [0.0, 0.2, 0.9])
+def test_held_poles_make_the_held_mode(late):
     rate, p = 200.0, POLES[1]
-    plus, minus = (pole_terms(np.array([q]), S, rate)[0][0] for q in (p, p.conjugate()))
-    want = held_mode(FREQ, p, rate)
+    plus, minus = (pole_terms(np.array([q]), S, rate, late=late)[0][0] for q in (p, p.conjugate()))
+    want = held_mode(FREQ, p, rate, late) * np.exp(S * late / rate)
     found = (plus - minus) / (2j * p.imag)
     assert np.abs(found / want - 1).max() < 1e-11
     near = pole_terms(np.array([p]), S, 1e7)[0][0]
     assert np.abs(near * (S - p) - 1).max() < 1e-4
 
 
-@pytest.mark.parametrize("hold", [None, 200.0])
-def test_slopes_of_poles(hold):
+@pytest.mark.parametrize(("hold", "late"), [(None, 0.0), (200.0, 0.0), (200.0, 0.3)])
+def test_slopes_of_poles(hold, late):
     d = 1e-4
     for step in (d, 1j * d):
-        ahead, behind = (pole_terms(POLES + sign * step, S, hold)[0] for sign in (1, -1))
+        ahead, behind = (pole_terms(POLES + sign * step, S, hold, late=late)[0] for sign in (1, -1))
         slope = (ahead - behind) / (2 * step)
-        exact = pole_terms(POLES, S, hold)[1]
+        exact = pole_terms(POLES, S, hold, late=late)[1]
         assert np.abs(slope / exact - 1).max() < 1e-6
 
 
@@ -45,6 +46,10 @@ def test_residual_terms_are_powers_and_held_integrators():
     z = np.exp(S * T)
     held = residual_terms(S, lower=2, upper=0, hold=200.0, top=1.0)
     assert np.allclose(held, [T / (z - 1), T**2 * (z + 1) / (2 * (z - 1) ** 2)])
+    slow = pole_terms(np.array([-1e-6 + 0j, -2e-6 + 0j]), S, 200.0, late=0.3)[0]
+    late = residual_terms(S, lower=2, upper=0, hold=200.0, top=1.0, late=0.3)
+    np.testing.assert_allclose(slow[0], late[0], rtol=1e-6)
+    np.testing.assert_allclose((slow[0] - slow[1]) / 1e-6, late[1], rtol=1e-5)
 
 
 def test_a_fraction_of_high_enough_order_finds_every_pole():

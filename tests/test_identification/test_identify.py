@@ -410,6 +410,33 @@ def test_a_held_machine_needs_its_hold():
     assert np.abs(np.abs(without.shapes) / np.abs(phi) - 1).max() > 1e-2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_of_a_fraction_of_a_sample_is_exact(seed):
+    """Strong and weak modes behind 1.2 samples: they fitted worse by 1.7 Hz of 133 Hz."""
+    rng = np.random.default_rng(100 + seed)
+    rate, delay, freq = 4000.0, float(rng.uniform(0.2, 2.8)), np.arange(10.0, 600.0, 0.5)
+    truth = pole(np.array([33.0, 133.0, 269.0, 710.0]) * rng.uniform(0.9, 1.1, 4), 5e-3)
+    phi = rng.normal(size=(4, 4)) * np.array([100.0, 1.0, 1.0, 10.0])
+    H = sum(
+        np.outer(phi[:, k], phi[:2, k])[:, :, None] * held_mode(freq, p, rate, delay)
+        for k, p in enumerate(truth)
+    )
+    deviation = np.full(H.shape, 1e-3 * np.median(np.abs(H)))
+    frf = Frf(freq, noisy(H, deviation, rng), variance=deviation**2)
+    found = identify_modes(frf, hold=rate, delay=delay)
+    off = (found.poles - truth[:3]) / (2 * np.pi)
+    assert np.abs(off).max() < 0.02
+    z = np.concatenate([off.real, off.imag]) * 2 * np.pi
+    z = z / np.concatenate([found.std.real, found.std.imag])
+    assert np.abs(z).max() < 5.0
+    assert found.inconsistency is None
+    error = np.abs(found.frf(freq).data - H) / deviation
+    assert np.sqrt(np.mean(error**2)) < 0.5
+    with pytest.raises(ModelError, match="samples of a hold"):
+        identify_modes(frf, delay=delay)
+
+
 def test_slopes_against_central_differences():
     frf = measured(CLOSE[[0, 2, 6]], PHI[:, :3], n_in=2, freq=np.arange(40.0, 170.0, 1.0))
     weight = np.sqrt(2.0 / frf.variance)

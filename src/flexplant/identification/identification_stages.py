@@ -228,6 +228,8 @@ class Task:
     lower: int
     upper: int | None
     hold: float | None
+    #: delay in periods of the hold; the prepared lines are advanced by it
+    delay: float
     labels: Mapping[str, str]
     #: what may have separate poles (outputs, inputs, runs), empty where the data decide, and which
     #: rows were measured together
@@ -244,6 +246,7 @@ class Task:
         return Lines(
             *(ready.freq, ready.data, ready.weight, self.lower),
             *(UPPER[-1] if self.upper is None else self.upper, self.hold, ready.known),
+            late=self.delay % 1.0,
             inflation=ready.inflation,
             variance_freedom=self.frf.freedom,
             segment=hann_segment(self.frf),
@@ -417,7 +420,7 @@ def _answered(
         lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
         fit = PoleFit(lines, fit.poles, fit.participation, fit.pivots)
     found = answer(
-        *(task.frf, ready, fit, reported, task.labels, begin.diagram),
+        *(task.frf, task.delay, ready, fit, reported, task.labels, begin.diagram),
         *(tuple(sorted(weaker + rejected + ready.mains)), reason, apart),
     )
     if begin.at_peaks:

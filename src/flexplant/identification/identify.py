@@ -120,6 +120,7 @@ def identify_modes(
     lower: int = 2,
     upper: int | None = None,
     hold: float | None = None,
+    delay: float = 0.0,
     dofs: Mapping[str, str] | None = None,
     setups: Iterable[Iterable[str]] | None = None,
     refine: bool | None = None,
@@ -161,11 +162,10 @@ def identify_modes(
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
         sampled plant. Modes above half the rate then appear folded, as broad modes with several per
-        cent of damping, unless a filter removes them. A delay of n samples in the response has to
-        be removed first, ``frf.replace(data=frf.data * np.exp(2j * np.pi * frf.freq * n / rate))``,
-        which is exact for whole samples. After that of a fraction of a sample the modes above half
-        the rate, and strong modes, fit worse: weak modes are then less accurate, and outputs seem
-        to disagree.
+        cent of damping, unless a filter removes them.
+    delay : float [samples]
+        Delay of the response in samples of the hold, also a fraction of a sample, as for
+        `StandardPlant.discretized`.
     dofs : mapping {channel: DOF label}, optional
         DOFs of outputs and inputs. They label the shapes, which are mass-normalised where an input
         and an output share a DOF.
@@ -238,6 +238,14 @@ def identify_modes(
                 raise ModelError(f"a hold at {rate:g} Hz does not match lines up to {high:g} Hz.")
             if start is not None:
                 instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
+            late = positive(delay, "delay", zero=True)
+            if late and rate is None:
+                raise ModelError(
+                    f"delay={late:g} is in samples of a hold: give hold= its rate [Hz], or turn "
+                    "the phase of a continuous response back."
+                )
+            if rate is not None:
+                ready = ready.advanced(late / rate)
             side, together = _checked_sides(setups, runs)
             most_terms = upper
             if upper is not None:
@@ -248,6 +256,7 @@ def identify_modes(
                 lower=whole(lower, "lower", minimum=0, maximum=MOST_TERMS),
                 upper=most_terms,
                 hold=rate,
+                delay=late,
                 labels=_checked_channels(dofs, runs[0]),
                 side=side,
                 together=together,

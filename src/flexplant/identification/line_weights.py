@@ -64,6 +64,10 @@ class PreparedLines:
             return 1.0
         return float(np.median(self.line_correlation.sum(axis=1)))
 
+    def advanced(self, time: float) -> PreparedLines:
+        """Return the lines of responses that come earlier by a time [s]."""
+        return replace(self, data=self.data * np.exp(2j * np.pi * self.freq * time))
+
     def correlated(self, a: int, b: int) -> Any:
         """Return the correlation of the errors of rows a and b at each line, None where it is 0."""
         if self.correlation is None or self.swapped:

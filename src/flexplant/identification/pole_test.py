@@ -430,8 +430,8 @@ def warned(freq: FloatArray, left: list[Peak], apart: tuple[float, str, str] | N
         warn(
             f"{apart[1]} disagree on the frequencies by {100 * apart[0]:.2g} % (standard "
             "deviation), which explains most of the misfit: a moved sensor or hammer with mass, "
-            "an amplitude or temperature that changed between measurements, or a delay of a "
-            "fraction of a sample in a held response (see hold=). "
+            "an amplitude or temperature that changed between measurements, or the delay of a "
+            "held response (see hold= and delay=). "
             f"{apart[2]}Poles are means over the {apart[1]}, with deviations from how these "
             "differ."
         )

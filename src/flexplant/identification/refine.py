@@ -60,6 +60,8 @@ class Lines:
     lower: int
     upper: int
     hold: float | None
+    #: fraction of a period of the hold by which its input acts late; the data are advanced by it
+    late: float = field(default=0.0, kw_only=True)
     known: bool = True  # whether the weights are those of a known variance
     #: variance of a mean over many lines, relative to independent ones
     inflation: float = 1.0
@@ -94,12 +96,21 @@ class Lines:
         some.__dict__["goals"] = [self.goals[o] for o in rows]
         return some
 
+    def pole_terms(self, poles: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return the terms (m, n_freq) of poles and their derivatives."""
+        return pole_terms(poles, axis(self.freq), self.hold, self.segment, late=self.late)
+
     @cached_property
     def smooth(self) -> ComplexArray:
         """The residual terms (n_terms, n_freq)."""
         top = 2 * np.pi * float(self.freq[-1])
         return residual_terms(
-            axis(self.freq), lower=self.lower, upper=self.upper, hold=self.hold, top=top
+            axis(self.freq),
+            lower=self.lower,
+            upper=self.upper,
+            hold=self.hold,
+            top=top,
+            late=self.late,
         )
 
     @cached_property
@@ -231,14 +242,13 @@ class PoleFit:
     def __init__(
         self, lines: Lines, poles: ComplexArray, participation: ComplexArray, pivots: Any = None
     ) -> None:
-        s = axis(lines.freq)
         data, m = lines.data, poles.size
         n_out = len(data)
         lines.work.add(lines.data.size * (2 * m) ** 2)
         self.lines, self.poles, self.participation, self.m = lines, poles, participation, m
         self.pivots: IntArray = np.zeros(m, dtype=int) if pivots is None else pivots
-        self.plus, self.slope = pole_terms(poles, s, lines.hold, lines.segment)
-        self.minus, self.slope_minus = pole_terms(poles.conj(), s, lines.hold, lines.segment)
+        self.plus, self.slope = lines.pole_terms(poles)
+        self.minus, self.slope_minus = lines.pole_terms(poles.conj())
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error
@@ -301,10 +311,8 @@ class PoleFit:
         """Return the cost with further poles, also instead of one of the present poles."""
         # the bases Q stay: further columns A add `A - Q Q^T A`, and a pole that goes leaves the two
         # directions Z of `Q^T A` that the others do not span
-        lines, s = self.lines, axis(self.lines.freq)
-        plus, minus = (
-            pole_terms(some, s, lines.hold, lines.segment)[0] for some in (poles, poles.conj())
-        )
+        lines = self.lines
+        plus, minus = (lines.pole_terms(some)[0] for some in (poles, poles.conj()))
         cost, columns = self.cost, self._stacked(plus, minus, participation)
         gone = [] if instead is None else [instead, instead + self.m]
         for right, A, (Q, error), (R, _) in zip(

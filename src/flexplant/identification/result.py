@@ -22,6 +22,7 @@ from .terms import axis, pole_terms, residual_terms
 
 def answer(
     frf: Frf,
+    delay: float,
     ready: PreparedLines,
     fit: PoleFit,
     reported: IntArray,
@@ -66,6 +67,7 @@ def answer(
         lower=lines.lower,
         top=float(lines.freq[-1]),
         hold=lines.hold,
+        delay=delay,
         segment=lines.segment,
         unreported=(fit.poles[outside], shapes[:, outside], part[:, outside]),
         mass_normalised=normalised,
@@ -274,6 +276,8 @@ class IdentifiedModes(MeasuredModes):
         The largest frequency.
     hold : float [Hz], optional
         Rate of the zero-order hold in the measurement.
+    delay : float [samples]
+        Delay of the measurement, in samples of the hold.
     segment : float [s], optional
         Length of the Hann-windowed segments through which the poles were fitted.
     unreported : complex array
@@ -311,6 +315,7 @@ class IdentifiedModes(MeasuredModes):
     lower: int = field(kw_only=True)
     top: float = field(kw_only=True)
     hold: float | None = field(default=None, kw_only=True)
+    delay: float = field(default=0.0, kw_only=True)
     segment: float | None = field(default=None, kw_only=True)
     unreported: tuple[ComplexArray, ComplexArray, ComplexArray] = field(kw_only=True)
     mass_normalised: bool = field(default=False, kw_only=True)
@@ -378,15 +383,18 @@ class IdentifiedModes(MeasuredModes):
         shapes = np.concatenate([self.shapes, shapes], axis=1)
         participation = np.concatenate([self.participation, participation], axis=1)
         segment = self.segment if as_measured else None
-        plus, _ = pole_terms(poles, s, self.hold, segment)
-        minus, _ = pole_terms(poles.conj(), s, self.hold, segment)
+        late = self.delay % 1.0
+        plus, _ = pole_terms(poles, s, self.hold, segment, late=late)
+        minus, _ = pole_terms(poles.conj(), s, self.hold, segment, late=late)
         data = np.einsum("ok,ik,kf->oif", shapes, participation, plus)
         data += np.einsum("ok,ik,kf->oif", shapes.conj(), participation.conj(), minus)
         upper = self.terms.shape[2] - self.lower
         smooth = residual_terms(
-            s, lower=self.lower, upper=upper, hold=self.hold, top=2 * np.pi * self.top
+            s, lower=self.lower, upper=upper, hold=self.hold, top=2 * np.pi * self.top, late=late
         )
         data += self.terms @ smooth
+        if self.hold is not None:
+            data *= np.exp(-s * self.delay / self.hold)
         return Frf(freq, data, inputs=self.inputs, outputs=self.outputs, quantity="displacement")
 
     def _picked(self, places: list[int]) -> dict[str, Any]:

@@ -235,7 +235,7 @@ class MeasuredPlaces:
         measured, top = self.measured, self.top
         freq = np.geomspace(0.5 * float(measured.freq.min()), measured.top, 200)
         s2 = -((2 * np.pi * freq) ** 2)
-        whole = measured.replace(hold=None).frf(freq).data
+        whole = measured.replace(hold=None, delay=0.0).frf(freq).data
         s = 2j * np.pi * freq
         part: ComplexArray = np.asarray(measured.shapes)[:, None, :] * measured.participation
         poles = np.concatenate([measured.poles, beside.poles])[:, None]

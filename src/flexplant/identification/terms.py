@@ -49,7 +49,12 @@ def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, Complex
 
 
 def pole_terms(
-    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None = None
+    poles: ComplexArray,
+    s: ComplexArray,
+    hold: float | None,
+    segment: float | None = None,
+    *,
+    late: float = 0.0,
 ) -> tuple[ComplexArray, ComplexArray]:
     r"""Return ``1/(s - lambda)`` (n_poles, n_freq) and its derivative with respect to lambda.
 
@@ -58,7 +63,13 @@ def pole_terms(
     .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
 
     which has the same pole in s and tends to 1/(s - lambda) for small T ([PintelonSchoukens2012]_,
-    section 6.2). `segment`: with the effect of Hann-windowed segments [s].
+    section 6.2). `segment`: with the effect of Hann-windowed segments [s]. `late`: the hold's input
+    acts a fraction a of a period late, and the response is taken as much earlier; the gain before
+    ``1/(z - e^{\lambda T})`` is then
+
+    .. math:: \frac{e^{sTa}}{\lambda}
+        \left(e^{\lambda T b} - 1 + z^{-1} (e^{\lambda T} - e^{\lambda T b})\right),
+        \quad b = 1 - a.
     """
     gap = s[None, :] - poles[:, None]
     value, slope = 1.0 / gap, 1.0 / gap**2
@@ -67,8 +78,14 @@ def pole_terms(
         turn = np.exp(poles * T)[:, None]
         # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
         distance = turn * np.expm1(gap * T)
-        gain = (np.expm1(poles * T) / poles)[:, None]
-        change = (turn * T - gain) / poles[:, None]
+        before = np.exp(poles * T * (1.0 - late))[:, None]
+        newer = (np.expm1(poles * T * (1.0 - late)) / poles)[:, None]
+        older = before * (np.expm1(poles * T * late) / poles)[:, None]
+        ahead, behind = np.exp(s * T * late), np.exp(s * T * (late - 1.0))
+        gain = newer * ahead + older * behind
+        bent = before * T * (1.0 - late)
+        change = (bent - newer) * ahead + (turn * T - bent - older) * behind
+        change = change / poles[:, None]
         value, slope = gain / distance, change / distance + gain * T * turn / distance**2
     if segment is not None:
         ratio, change = hann_ratio(gap, segment)
@@ -77,11 +94,12 @@ def pole_terms(
 
 
 def residual_terms(
-    s: ComplexArray, *, lower: int, upper: int, hold: float | None, top: float
+    s: ComplexArray, *, lower: int, upper: int, hold: float | None, top: float, late: float = 0.0
 ) -> ComplexArray:
     """Return ``1/s, ..., 1/s^lower`` and ``1, s, ..., s^(upper-1)`` (lower + upper, n_freq)."""
     # 1/s^2 is the motion of a rigid body; with a hold 1/s and 1/s^2 are T/(z-1) and T^2 (z+1)/(2
-    # (z-1)^2). Powers are of s/top, top in rad/s
+    # (z-1)^2), and the limits of `pole_terms` where the input is late. Powers are of s/top, top in
+    # rad/s
     rows = []
     for power in range(1, lower + 1):
         term = s ** (-float(power))
@@ -89,7 +107,10 @@ def residual_terms(
             T = 1.0 / hold
             back: Any = np.expm1(s * T)
             held = back / (np.exp(s * T) * s * T)
-            known = {1: T / back, 2: T**2 * (back + 2.0) / (2.0 * back**2)}
+            turn, fresh = np.exp(s * T * late), (1.0 - late) ** 2
+            first = T * ((1.0 - late) * turn + late * turn * np.exp(-s * T)) / back
+            moved = T**2 / 2.0 * (fresh + (1.0 - fresh) * np.exp(-s * T)) * turn
+            known = {1: first, 2: (T * first + moved) / back}
             term = known.get(power, term * held)
         rows.append(term * top**power)
     rows += [(s / top) ** power for power in range(upper)]
