@@ -437,6 +437,38 @@ def test_a_delay_of_a_fraction_of_a_sample_is_exact(seed):
         identify_modes(frf, delay=delay)
 
 
+#: a robot joint with two geared drives: [Hz], damping ratios, and shapes at two motors and two
+#: links, whose drives act at the motors; the modes from 2 kHz on fold below half the rate
+JOINT_FREQ = [22.759, 34.312, 134.22, 270.38, 469.26, 646.93, 1143.7, 1293.5]
+JOINT_FREQ += [2169.4, 2458.0, 3266.0, 3892.1, 4966.3, 5753.5, 6978.4, 8611.3]
+JOINT_ZETA = [0.015, 0.031, 0.044, 0.028, 0.018, 0.0065] + 10 * [0.005]
+JOINT_SHAPES = """
+-.323 -.473 -.00613 -.00175 -.00663 .000551 .000728 8.6e-5 0 -4.2e-5 0 0 -1e-6 1e-6 0 0
+.0814 .872 .261 .308 3.52 -.557 -2.3 -.347 .00979 .618 .0405 .0113 .0548 -.115 -.0746 .11
+-1.5 -.556 .0238 -.0783 3.12 -.529 5.89 1.32 .0121 6.07 1.96 .524 6.8 -12 -1.06 -12.9
+-.346 -1.29 -6.47 7.11 3.54 1.87 6.11 .197 -.658 6.1 2.36 .445 7.04 -12 -.855 -13
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5])
+def test_folded_modes_do_not_make_weak_modes_means_of_separate_fits(seed):
+    """Weak modes were means over outputs that "disagree", with up to 2.4 Hz of deviation."""
+    rate, freq, delay = 4000.0, np.arange(10.0, 590.0, 0.25), 1.2
+    truth = pole(np.array([1e-4, 1e-4, *JOINT_FREQ]), np.array([1e-3, 1e-3, *JOINT_ZETA]))
+    rigid = [[0.683, 0.0], [0.683, 0.0], [-1.07, -1.23], [-1.07, -1.23]]
+    phi = np.array([row.split() for row in JOINT_SHAPES.strip().splitlines()], dtype=float)
+    phi = np.concatenate([rigid, phi], axis=1)
+    H = sum(
+        np.outer(phi[:, k], phi[[0, 2], k])[:, :, None] * held_mode(freq, p, rate, delay)
+        for k, p in enumerate(truth)
+    )
+    frf = Frf(freq, noisy(H, 2e-9, np.random.default_rng(seed)))
+    found = identify_modes(frf, hold=rate, delay=delay)
+    near = found.poles[[np.argmin(np.abs(found.poles - p)) for p in truth[2:7]]]
+    assert np.max(np.abs(near - truth[2:7])) < 2 * np.pi * 0.1
+
+
 def test_slopes_against_central_differences():
     frf = measured(CLOSE[[0, 2, 6]], PHI[:, :3], n_in=2, freq=np.arange(40.0, 170.0, 1.0))
     weight = np.sqrt(2.0 / frf.variance)

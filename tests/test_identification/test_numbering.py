@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.identification import MeasuredModes, numbered
+from flexplant.identification import MeasuredModes, identify_modes, numbered
+from flexplant.lti import Frf
 from flexplant.modes import solve_modes
-from flexplant.structure import ModalDamping
+from flexplant.structure import FEModel, ModalDamping
+from oracles_identification import modal_frf
 from plates import make_plate
 
 SPOTS = [(0.0, 0.0), (0.6, 0.0), (0.0, 0.6), (0.6, 0.6), (0.3, 0.0), (0.0, 0.3)]
@@ -110,3 +112,32 @@ def test_bad_arguments_are_refused(measured, model, options, error, cause):
     value = measured([4, 6]) if callable(measured) else measured
     with pytest.raises(error, match=cause):
         numbered(value, model(), **options)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_folded_pole_does_not_take_the_number_of_a_mode_that_no_sensor_sees(seed):
+    """Of two separate machines the sensors see one: shapes of the other are rounding there."""
+    rng = np.random.default_rng(seed)
+    masses, springs = rng.uniform(1.0, 2.0, 6), rng.uniform(1e6, 2e6, 6)
+    K = np.diag(springs + np.append(springs[1:], 0.0))
+    K -= np.diag(springs[1:], 1) + np.diag(springs[1:], -1)
+    K[3, 2] = K[2, 3] = 0.0
+    turn = np.eye(6) + 1e-13 * rng.normal(size=(6, 6))  # as rounding of a solver couples them
+    model = FEModel(np.diag(masses), turn.T @ K @ turn / 2 + (turn.T @ K @ turn).T / 2)
+    known = solve_modes(model, damping=ModalDamping(0.005))
+    places, ends = ["1:x", "2:x"], ["1:x"]
+    phi, by = (np.array([known.at(one) for one in names]) for names in (places, ends))
+    mine = np.flatnonzero(np.abs(phi[0]) > 1e-6)
+    hidden = np.setdiff1d(np.arange(6), mine)
+    freq = np.arange(1.0, 600.0, 0.5)
+    folded = known.omega[hidden[0]] * 1.01 * (-0.036 + 1j)
+    poles = np.append(known.poles[mine], folded)
+    shapes = np.column_stack([phi[:, mine], phi[:, hidden[0]] / np.abs(phi[0, hidden[0]]) * 0.1])
+    by = np.append(by[:, mine], [[0.1]], axis=1)
+    H = modal_frf(freq, poles, shapes, by)
+    frf = Frf(freq, H, variance=np.full(H.shape, 1e-24))
+    found = identify_modes(frf, dofs={"y1": "1:x", "y2": "2:x", "u1": "1:x"})
+    assert np.min(np.abs(found.freq / (np.abs(folded) / 2 / np.pi) - 1)) < 1e-3
+    assert numbered(found, known, partial=True).modes == tuple(mine + 1)
+    with pytest.raises(ModelError, match="like size"):
+        numbered(found, known)

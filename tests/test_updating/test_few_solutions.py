@@ -108,3 +108,29 @@ def test_a_path_that_is_followed_again_is_not_solved_again(plate, solved):
     again = objective.follow(path)
     assert isinstance(point, Point) and again is point
     assert len(solved) == solutions
+
+
+def test_starts_of_a_parameter_that_moves_few_modes_are_of_its_own_size(monkeypatch):
+    """Two springs of a machine of 14 modes: starts of 1e25, since other modes move by rounding."""
+    apart = 8
+    rng = np.random.default_rng(5)
+    masses, springs = rng.uniform(1.0, 2.0, 14), rng.uniform(1e6, 2e6, 14)
+    springs[apart] = 1e-6  # the last six masses are a machine of their own, but for rounding
+    K = np.diag(springs + np.append(springs[1:], 0.0))
+    K -= np.diag(springs[1:], 1) + np.diag(springs[1:], -1)
+    K[apart, apart] += 1e6
+    model = fx.FEModel(np.diag(masses), K)
+    rom = fx.reduce(
+        fx.solve_modes(model, damping=fx.ModalDamping(0.01)), fx.DesiredDofs(model.dofs)
+    )
+    parts = [np.zeros_like(K), np.zeros_like(K)]
+    parts[0][:apart, :apart], parts[1][-2:, -2:] = K[:apart, :apart], K[-2:, -2:]
+    unknown = [fx.MatrixParameter(name, dK=dK) for name, dK in zip("ab", parts, strict=True)]
+    poles = rom.modes().poles * (1 + 0.02 * rng.normal(size=14))
+    data = fx.MeasuredModes(poles, modes=range(1, 15), covariance=(1e-4 * np.abs(poles)) ** 2)
+    drawn, scattered = [], searching._scattered
+    monkeypatch.setattr(
+        searching, "_scattered", lambda *given: drawn.extend(found := scattered(*given)) or found
+    )
+    fx.update(rom, unknown, [fx.Eigenvalues(data)])
+    assert drawn and np.max(np.abs(drawn)) < 2.0

@@ -427,7 +427,7 @@ def parts_of(ready: PreparedLines, orders: list[int] | None = None) -> list[Part
     parts = []
     for own, seen in windows:
         freq = ready.freq[seen]
-        mirrored = bool(freq[0] * WIDEST < freq[-1])
+        mirrored = own.start == 0 and _last_low(ready, seen.stop) > 0
         count = _resolved(freq) * (2 if mirrored else 1)
         # at least four orders are compared, for which twenty lines are enough
         top = max(6, min(HIGHEST, count // LINES_OF_ORDER - 1, max(POLES // references, 10)))
@@ -469,6 +469,8 @@ LINES, OVERLAP = 400, 0.25
 #: lines that a part keeps: modes far below the top of a part lie within few lines of it, closer
 #: than its orders resolve
 WIDEST, FEWEST = 8.0, 40
+#: distance of the lowest line from zero, in lines, up to which this is so
+NEAREST = 20
 #: distance outside of the band, relative to it, within which poles are searched, since they affect
 #: the responses inside
 MARGIN = 0.04
@@ -485,11 +487,10 @@ def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     reach = n_freq // (4 * count)
     inner = [_weakest(power, round(i * n_freq / count), reach) for i in range(1, count)]
     cuts = [n_freq, *inner[::-1]]
-    while True:
-        low = int(np.searchsorted(ready.freq, ready.freq[cuts[-1] - 1] / WIDEST))
-        if min(low, cuts[-1] - low) < FEWEST:
-            break
+    low = _last_low(ready, cuts[-1])
+    while FEWEST <= low <= cuts[-1] - FEWEST:
         cuts.append(_weakest(power, low, low // 4))
+        low = _last_low(ready, cuts[-1])
     cuts.append(0)
     parts = []
     for last, first in pairwise(cuts):
@@ -497,6 +498,14 @@ def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
         seen = slice(max(0, first - beyond), min(n_freq, last + beyond))
         parts.append((slice(first, last), seen))
     return parts[::-1]
+
+
+def _last_low(ready: PreparedLines, last: int) -> int:
+    """Return the number of lines far below the last one, zero where no line is near zero."""
+    spacing = float(np.median(np.diff(ready.freq)))
+    if ready.freq[0] > NEAREST * spacing:
+        return 0
+    return int(np.searchsorted(ready.freq, ready.freq[last - 1] / WIDEST))
 
 
 def _weakest(power: FloatArray, middle: int, reach: int) -> int:

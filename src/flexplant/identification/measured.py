@@ -10,7 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, between, complex_array, positive, real_array, whole
+from ..arrays import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    between,
+    complex_array,
+    positive,
+    real_array,
+    whole,
+)
 from ..errors import LabelError, ModelError, ShapeError, counted, short, some_names
 from ..modes import Modes
 from ..modes.matching import assigned, in_span
@@ -323,9 +332,12 @@ def numbered(
 
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
-    over the measured DOFs. For repeated modes of the model (within 0.5 %) it is the MAC with the
-    closest shape of their span, which does not distinguish them: they are numbered by frequency.
-    Where fewer poles than modes of one frequency are measured, they get the lowest numbers.
+    over the measured DOFs. The residues of a pair differ by at most a factor of 30 where the model
+    has the places of the inputs: a mode that the sensors do not see has a shape of rounding there,
+    and a folded mode may have its frequency. For repeated modes of the model (within 0.5 %) the MAC
+    is that with the closest shape of their span, which does not distinguish them: they are numbered
+    by frequency. Where fewer poles than modes of one frequency are measured, they get the lowest
+    numbers.
 
     Parameters
     ----------
@@ -335,7 +347,8 @@ def numbered(
         Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
         Places of the rows of the shapes: along z at a point unless a sensor gives another
-        direction; or Ports, for their sensors. By default the labels are DOFs of the model.
+        direction; or Ports, for their sensors and actuators. By default the labels are DOFs of the
+        model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float
@@ -380,6 +393,9 @@ def numbered(
     distance = np.abs(np.log(measured.freq[:, None] / modes.freq[elastic]))
     alike = _likeness(measured, modes, elastic, at)
     allowed = (distance <= width) & (alike >= least_mac)
+    sized = allowed & _sizes_agree(measured, modes, elastic, at)
+    if np.any(sized):  # otherwise the response is not calibrated
+        allowed = sized
     cost = np.where(allowed, (distance / width) ** 2 + 1.0 - alike, 1e6)
     partner = assigned(cost, most=2.0).tolist()
     pairs = {i: int(elastic[j]) + 1 for i, j in enumerate(partner) if j >= 0}
@@ -388,9 +404,10 @@ def numbered(
         worst = lost[0]
         near = elastic[int(np.argmin(distance[worst]))]
         raise ModelError(
-            f"no separate mode of the model within {width:.0%} and with a MAC of {least_mac:g} for "
-            f"the poles at {[round(float(measured.freq[i]), 2) for i in lost[:6]]} Hz; nearest to "
-            f"the first is mode {near + 1} at {modes.freq[near]:.5g} Hz with a MAC of "
+            f"no separate mode of the model within {width:.0%}, with a MAC of {least_mac:g} and a "
+            "response of like size, for the poles at "
+            f"{[round(float(measured.freq[i]), 2) for i in lost[:6]]} Hz; nearest to the first is "
+            f" mode {near + 1} at {modes.freq[near]:.5g} Hz with a MAC of "
             f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
             "tolerance=, or leave these poles out with partial=True."
         )
@@ -398,6 +415,40 @@ def numbered(
     kept = sorted(pairs)
     chosen = measured if len(kept) == len(measured) else measured.select(kept)
     return chosen.replace(modes=tuple(pairs[i] for i in kept), **_points(measured, modes, at))
+
+
+#: largest ratio of the measured to the modelled residue of a pair: updates and nodes close to a
+#: sensor change it by less, folded modes and unseen modes by far more
+LIKE_SIZE = 30.0
+
+
+def _sizes_agree(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> BoolArray:
+    """Return which residues are of like size, all of them where inputs have no known places."""
+    part, names = getattr(measured, "participation", None), getattr(measured, "input_dofs", ())
+    given = {port.name: port for port in at.u} if hasattr(at, "u") else {}
+    places = [given.get(name, name) for name in names]
+    known = all(not isinstance(place, str) or place in modes.dofs.labels for place in places)
+    if part is None or measured.shapes is None or not places or not known:
+        return np.ones((len(measured), elastic.size), dtype=bool)
+    outputs, inputs = (
+        np.linalg.norm(_rows(some, modes)[:, elastic], axis=0)
+        for some in (_places(measured, at), places)
+    )
+    omega = modes.omega[elastic]
+    family = np.abs(omega / omega[:, None] - 1.0) <= FAMILY
+    size = np.sqrt(family @ (outputs * inputs) ** 2) / (2.0 * omega)
+    own = np.linalg.norm(measured.shapes, axis=0) * np.linalg.norm(part, axis=0)
+    ratio = size / own[:, None]
+    return np.asarray((ratio < LIKE_SIZE) & (ratio > 1.0 / LIKE_SIZE))
+
+
+def _rows(places: list[Any], modes: Modes) -> FloatArray:
+    """Return the entries (n, n_modes) of shapes at places."""
+    rows = [
+        modes.at(place.at, place.direction) if hasattr(place, "direction") else modes.at(place)
+        for place in places
+    ]
+    return np.array(rows)
 
 
 def _points(measured: MeasuredModes, modes: Modes, at: Any) -> dict[str, Any]:
@@ -448,12 +499,7 @@ def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
     if measured.shapes is None or measured.dofs is None:
         return np.ones((len(measured), elastic.size))
-    places = _places(measured, at)
-    rows = [
-        modes.at(place.at, place.direction) if hasattr(place, "direction") else modes.at(place)
-        for place in places
-    ]
-    phi: ComplexArray = np.array(rows, dtype=np.complex128)[:, elastic]
+    phi = _rows(_places(measured, at), modes).astype(np.complex128)[:, elastic]
     alike = np.zeros((len(measured), elastic.size))
     omega = modes.omega[elastic]
     for j in range(elastic.size):

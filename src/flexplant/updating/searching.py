@@ -19,7 +19,7 @@ from ..errors import (
     counted,
 )
 from ..seeds import Rng, generator
-from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, TINY, TYPED
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, ROUNDING, TINY, TYPED
 from .changed_models import changed_model
 from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
@@ -390,6 +390,9 @@ def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -
     every = list(range(eigen.poles.size))
     moved = np.abs(objective.family.sensitivity(eigen, every)) / np.abs(eigen.poles)[:, None]
     typical = np.median(moved, axis=0)
+    for k in np.flatnonzero(typical < ROUNDING * np.max(moved, axis=0)):
+        # a parameter that moves fewer than half of the modes: the others change by rounding
+        typical[k] = np.median(moved[moved[:, k] > ROUNDING * np.max(moved[:, k]), k])
     scale = np.where(typical > 0, FIRST_CHANGE / divisor(typical), 0.0)
     scale = np.where(objective.has_prior, objective.prior_std, scale)
     chance = generator(rng)
