@@ -131,18 +131,11 @@ def source_variances(
     monitored: StateSpace, row: int, noises: Sequence[Source]
 ) -> tuple[FloatArray, float]:
     """Return the variance of an output by source, and its largest relative difference."""
-    # by the observability Gramian, trace(G' Q G) + D D', and by the states' covariance. Factors of
-    # both make each variance a sum of squares: a slow pole among states of different size costs the
-    # entries of a Gramian their digits, and not its trace
+    variances = unverified_variances(monitored, row, noises)
     if not noises:
-        return np.zeros(0), 0.0
-    c = monitored.C[[row]]
-    G, D = (np.hstack(parts) for parts in zip(*((n.G, n.D[[row]]) for n in noises), strict=True))
-    driven = StateSpace(monitored.A, G, c, D, monitored.dt)
-    seen = observability_factor(driven).T
-    found = [float(np.sum((seen @ one.G) ** 2) + np.sum(one.D[row] ** 2)) for one in noises]
-    variances = np.array(found)
-    other = float(np.sum((c @ controllability_factor(driven)) ** 2) + np.sum(D**2))
+        return variances, 0.0
+    driven = _driven(monitored, row, noises)
+    other = float(np.sum((driven.C @ controllability_factor(driven)) ** 2) + np.sum(driven.D**2))
     total = float(variances.sum())
     difference = abs(other - total) / total if total else 0.0
     if not difference <= TYPED:
@@ -152,6 +145,23 @@ def source_variances(
             "close to the edge of stability for double precision. Check the least damped poles."
         )
     return variances, difference
+
+
+def unverified_variances(monitored: StateSpace, row: int, noises: Sequence[Source]) -> FloatArray:
+    """Return the variance of an output by source, by one route: for draws of a verified loop."""
+    # trace(G' Q G) + D D' of the observability Gramian Q, by its factor: a slow pole among states
+    # of different size costs the entries of a Gramian their digits, and not a sum of squares
+    if not noises:
+        return np.zeros(0)
+    seen = observability_factor(_driven(monitored, row, noises)).T
+    found = [np.sum((seen @ one.G) ** 2) + np.sum(one.D[row] ** 2) for one in noises]
+    return np.array(found, dtype=np.float64)
+
+
+def _driven(monitored: StateSpace, row: int, noises: Sequence[Source]) -> StateSpace:
+    """Return the system from all noises, as white noise of unit variance, to one output."""
+    G, D = (np.hstack(parts) for parts in zip(*((n.G, n.D[[row]]) for n in noises), strict=True))
+    return StateSpace(monitored.A, G, monitored.C[[row]], D, monitored.dt)
 
 
 def error_budget(

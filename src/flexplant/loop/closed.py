@@ -36,6 +36,7 @@ from .budget import (
     source_variances,
     sources,
     stationary_row,
+    unverified_variances,
 )
 from .machine_figures import MachineLoops, interval_line, loop_interval
 from .on_measurement import NOT_MEASURED, OnMeasurement, judged
@@ -432,6 +433,11 @@ class ClosedLoop(Value):
         row, noises = self._noises(channel)
         variances, _ = source_variances(self.monitored, row, noises)
         return float(np.sqrt(variances.sum()))
+
+    def drawn_rms(self, channel: str) -> float:
+        """Return the same by one route: for a machine that is drawn around a verified loop."""
+        row, noises = self._noises(channel)
+        return float(np.sqrt(unverified_variances(self.monitored, row, noises).sum()))
 
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a signal under all white noises.

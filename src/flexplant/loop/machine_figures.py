@@ -76,7 +76,7 @@ def _figure(loop: Any, figure: str | Callable[[Any], float]) -> float:
         return min(axis_bandwidths(loop).values())
     if figure == RADIUS:  # the distance to the circle is log-normal, not the radius
         return 1.0 - float(loop.spectral_radius)
-    return float(loop.modulus_margin if figure == MARGIN else loop.rms(figure))
+    return float(loop.modulus_margin if figure == MARGIN else loop.drawn_rms(figure))
 
 
 def loop_interval(
@@ -98,7 +98,9 @@ def loop_interval(
     if isinstance(figure, str):
         unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
     given = "" if callable(figure) or figure in FIGURES else known.densities
-    own = _figure(loop, figure) if isinstance(figure, str) and loop.is_stable else None
+    own = None
+    if isinstance(figure, str) and loop.is_stable:  # a figure of its own is verified
+        own = _figure(loop, figure) if figure in FIGURES else loop.rms(figure)
     found = interval(known, partial(loops.values, figure), level, unit, given, own)
     if figure != RADIUS or found.low is None or found.high is None:
         return found
