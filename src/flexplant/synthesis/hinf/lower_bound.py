@@ -15,7 +15,7 @@ from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
-from ...tolerances import SAME, SPLIT
+from ...tolerances import NEGLIGIBLE, SAME, SPLIT
 from ..preparation import Prepared
 
 #: points of the sweep, and times that it is refined
@@ -109,7 +109,7 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
 INACCURATE, _ROUNDED = 1e-5, 1e-14
 #: gamma is tried just below the value after a back-off of 5 %, then with squares of this fraction
 #: until one is refuted; then intervals are halved to a relative width
-_PART, _SQUARES, _WIDTH = 0.951, 8, 1e-3
+_PART, _WIDTH = 0.951, 1e-3
 
 
 class FullInformation(NamedTuple):
@@ -145,15 +145,7 @@ class FullInformation(NamedTuple):
 
     def least_squares(self) -> tuple[FloatArray, FloatArray]:
         """Return X and its gain where w is zero: the least integral of |z|^2 is x' X x."""
-        R, S = self.D12.T @ self.D12, self.C.T @ self.D12
-        return stabilising(self.A, self.B2, self.C.T @ self.C, R, S)
-
-    def value(self, gamma: float) -> FloatArray | None:
-        """Return X (n, n) of x, None where gamma is refuted."""
-        if gamma <= self.direct:
-            return None
-        X, F = self.solution(gamma)
-        return None if self.refutes(X, F, *la.eigh(X)) else np.asarray(self.T @ X @ self.T.T)
+        return self._replace(B1=self.B1[:, :0], D11=self.D11[:, :0]).solution(1.0)
 
     def refutes(
         self, X: FloatArray, F: FloatArray, values: FloatArray, vectors: FloatArray
@@ -206,16 +198,10 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     # [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems)
     sides = [side.regular() for side in both_sides(p)]
     low = max(known, *(one.direct for one in sides))
-    high = gamma
-    for part in _PART**2.0 ** np.arange(_SQUARES):
-        if part * gamma <= low:
-            break
-        if _refuted(sides, part * gamma):
-            low = part * gamma
-            break
-        high = part * gamma
-    while 0.0 < low < high / (1.0 + _WIDTH):
-        middle = float(np.sqrt(low * high))
+    high, part = gamma, _PART
+    while high > low * (1.0 + _WIDTH) and (low > 0.0 or part > NEGLIGIBLE):
+        middle = max(part * gamma, float(np.sqrt(low * high)))
+        part *= part
         if _refuted(sides, middle):
             low = middle
         else:
@@ -224,15 +210,16 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
 
 
 def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
+    """Return whether a gamma is refuted for one side, or for both together."""
     values = []
     for one in sides:
         try:
-            X = one.value(gamma)
-        except (OnAxisError, SolverError, la.LinAlgError):
+            X, F = one.solution(gamma)
+        except (OnAxisError, SolverError, la.LinAlgError):  # this side says nothing of that gamma
             continue
-        if X is None:
+        if one.refutes(X, F, *la.eigh(X)):
             return True
-        values.append(X)
+        values.append(one.T @ X @ one.T.T)
     if len(values) < 2:
         return False
     return bool(coupling(*values).max(initial=0.0) > gamma**2 * (1.0 + INACCURATE))
