@@ -53,13 +53,10 @@ def design_hinf(
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
-    Weights define the required norms. For a stage they follow from a bandwidth:
-    ``weights = fx.stage_weights(plant, 60.0)``, then
-    ``K = fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``; if `K.gamma` is below 1, all
-    their requirements are satisfied. (`design_stage` does both and finds the bandwidth.)
-    `mixed_sensitivity` builds a plant from weights of S, KS and T. The controller is verified with
-    its closed loop in the original channels: stability, and the norm by two methods;
-    ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
+    Weights define the required norms: those of `stage_weights` of a stage, or those of S, KS and T
+    of `mixed_sensitivity`. If `gamma` is below 1, all their requirements are satisfied. The
+    controller is verified with its closed loop in the original channels: stability, and the norm by
+    two methods. How it works: `algorithms`.
 
     Parameters
     ----------
@@ -68,8 +65,7 @@ def design_hinf(
         (``{x: plant.at(x=x) for x in places}``): one controller for all positions is designed on
         the mean plant, with channels that tolerate the motion; `gamma` is then the worst norm, and
         the certificate has those of all positions and half way between. A StateSpace (also of
-        python-control) is accepted too, if its channels are named as in a StandardPlant, or if u
-        and y are given.
+        python-control) serves with the channels of a StandardPlant, or with u and y.
     method : Riccati or Lmi, optional
         By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
         singular, and a little disturbance where w or z misses an undamped mode. `Lmi()` finds
@@ -81,13 +77,11 @@ def design_hinf(
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
         Uncertainty of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: the design
-        tolerates its frequencies. Not needed where the plant itself is uncertain, or was made from
-        ``uncertain.nominal`` by weights. Each mode gets a channel through which a change of its
-        frequency acts, scaled by the disturbances and with the shift of real mu. The problem is
-        solved twice; in between, the scales are balanced in closed loop. `gamma` then includes
-        these channels (above 1 is not a failure). `certificate` has ``all frequencies at once``:
-        below 1, no machine of the uncertainty has a pole on the grid.
-        ``ClosedLoop.mode_tolerances`` gives the allowed error of each.
+        tolerates its frequencies. Not needed where the plant itself is uncertain. Each mode gets a
+        channel through which a change of its frequency acts, with the shift of real mu; its scale
+        is found in a first design. `gamma` then includes these channels (above 1 is not a failure).
+        `certificate` has ``all frequencies at once``: below 1, no machine of the uncertainty has a
+        pole on the grid. ``ClosedLoop.mode_tolerances`` gives the allowed error of each.
     damped_below : float [Hz]
         Uncertain modes below it that actuators push are damped, not only tolerated: their channel
         then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.

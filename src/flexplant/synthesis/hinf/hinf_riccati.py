@@ -50,18 +50,17 @@ Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
 class Riccati(Value):
     """Synthesis by the two Riccati equations of Glover and Doyle, gamma by bounded bisection.
 
-    The search begins at the norm of the loop with least quadratic cost, which exists whenever any
-    controller does. A gamma counts as reached only by the closed loop that it gives: stable, its
-    gains below gamma. The controller is taken back_off above the smallest one (at the optimum it
-    is fast and badly conditioned, and gains nothing) when the exact norm of its loop holds. The
-    lower bound is the largest gamma that was refuted, not the largest that failed.
+    A gamma counts as reached only by the closed loop that it gives: stable, its gains below gamma.
+    The controller is taken back_off above the smallest one (at the optimum it is fast and badly
+    conditioned). The lower bound is the largest gamma that was refuted, not the largest that
+    failed.
 
     The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
     boundary. Where a rank is missing, a little noise on each sensor and a little effort of each
     actuator are added, at most 1e-3 of what the plant itself does at the speed of its loop; where
     a mode is missed, or one that decays by less than 1e-4 of that speed, w also acts a little at
-    the actuators and z sees a little of the sensors. The loop is verified without them. The notes
-    and the certificate say what was added and what it costs in gamma.
+    the actuators and z sees a little of the sensors. The loop is verified without them, and the
+    notes say what was added and what it costs in gamma.
 
     Parameters
     ----------
