@@ -17,8 +17,8 @@ from ..parallel import one_thread
 from ..plant import AnyPlant
 from .controller import Controller, SolvedController, required_stability
 from .hinf.singular import lacking, made_regular
-from .pipeline import Design, Solution, designed
-from .preparation import Prepared, posed, prepared, require_reach
+from .pipeline import Design, Solution, designed, posed
+from .preparation import Prepared, prepared, require_reach
 from .structured.judges import require_finite_h2
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this

@@ -1,17 +1,51 @@
-"""The way of every design: prepare, solve, restore, certify, judge on the evaluation model."""
+"""The way of every design: pose, prepare, solve, restore, certify, judge on evaluation models."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple
 
-from ..errors import AssumptionError, CertificateError, SolverError
-from ..lti.statespace import StateSpace
-from ..plant import AnyPlant
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..lti.statespace import StateSpace, System
+from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
+from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from .controller import Controller, with_left_out
 from .preparation import Prepared, badly_scaled, prepared, require_reach
+
+#: what the channels of each side are
+_ROLES = {
+    "w": "disturbance or noise",
+    "z": "output to be kept small",
+    "u": "actuator",
+    "y": "sensor",
+}
+
+
+def posed(
+    given: AnyPlant | UncertainPlant[Any] | System,
+    u: Sequence[str] | None,
+    y: Sequence[str] | None,
+    what: str,
+) -> AnyPlant:
+    """Return the plant of a synthesis, with u and y given where it does not name them."""
+    if u is None and y is None:
+        plant: AnyPlant = plant_of(given)
+    elif isinstance(given, StandardPlant | GeneralizedPlant):
+        raise ModelError("a plant names its u and y: leave them out.")
+    else:
+        plant = StandardPlant.from_statespace(given, u=u, y=y)
+    for name, role in _ROLES.items():
+        if not getattr(plant, name):
+            others = ", ".join(f"{len(getattr(plant, one))} {one}" for one in _ROLES if one != name)
+            raise AssumptionError(
+                f"{what} needs channels w, z, u and y, got a plant without {name} "
+                f"({others}). Add a channel {name} ({role})."
+            )
+    if plant.modal_blocks.size:  # it can name the rigid-body motion that is missed
+        plant.check().require(("stabilisable", "detectable"), what)
+    return plant
 
 
 class Solution(NamedTuple):

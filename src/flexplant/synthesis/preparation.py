@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -23,11 +22,9 @@ from ..lti.blocks_of_states import Matrices
 from ..lti.discretisation import bilinear, image_freq, tustin
 from ..lti.equations import mean_speed
 from ..lti.modal import modal_form
-from ..lti.statespace import StateSpace, System
-from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
-from ..plant.uncertainty.uncertain_plants import UncertainPlant
+from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import ROUNDING, SPLIT, TINY
+from ..tolerances import RESIDUAL, ROUNDING, SPLIT, TINY
 from ..words import inner_names
 from .scaling import (
     POINT,
@@ -224,44 +221,8 @@ def _with_image(
     return P, bilinear(P, 1.0 / P.dt) if P.dt else P
 
 
-#: relative to the size of A: poles with real parts above this are not stable
-_STABLE = -1e-10
 #: |z| of poles that are delays; e-folds of a mode during them that leave nothing to be gained
 _NILPOTENT, _TOO_LONG = 0.5, 15.0
-
-
-#: what the channels of each side are
-_ROLES = {
-    "w": "disturbance or noise",
-    "z": "output to be kept small",
-    "u": "actuator",
-    "y": "sensor",
-}
-
-
-def posed(
-    given: AnyPlant | UncertainPlant[Any] | System,
-    u: Sequence[str] | None,
-    y: Sequence[str] | None,
-    what: str,
-) -> AnyPlant:
-    """Return the plant of a synthesis, with u and y given where it does not name them."""
-    if u is None and y is None:
-        plant: AnyPlant = plant_of(given)
-    elif isinstance(given, StandardPlant | GeneralizedPlant):
-        raise ModelError("a plant names its u and y: leave them out.")
-    else:
-        plant = StandardPlant.from_statespace(given, u=u, y=y)
-    for name, role in _ROLES.items():
-        if not getattr(plant, name):
-            others = ", ".join(f"{len(getattr(plant, one))} {one}" for one in _ROLES if one != name)
-            raise AssumptionError(
-                f"{what} needs channels w, z, u and y, got a plant without {name} "
-                f"({others}). Add a channel {name} ({role})."
-            )
-    if plant.modal_blocks.size:  # it can name the rigid-body motion that is missed
-        plant.check().require(("stabilisable", "detectable"), what)
-    return plant
 
 
 def require_reach(problem: Prepared, hidden: str = "") -> None:
@@ -275,7 +236,7 @@ def require_reach(problem: Prepared, hidden: str = "") -> None:
     size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, TINY)
     # the poles of a chain of integrators come out of rounding as a ring around zero
     poles = np.where(np.abs(poles) < SPLIT * size, 0.0, poles)
-    for pole in poles[poles.real > _STABLE * size]:
+    for pole in poles[poles.real > -RESIDUAL * size]:
         for matrix, gain, text in (
             (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
             (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),

@@ -24,8 +24,8 @@ from ..controller import (
     certified_norm,
     reached_norms,
 )
-from ..pipeline import Design, Solution, designed, solved, verified
-from ..preparation import Prepared, badly_scaled, posed
+from ..pipeline import Design, Solution, designed, posed, solved, verified
+from ..preparation import Prepared, badly_scaled
 from .hinf_riccati import Riccati
 from .lower_bound import raised_bound
 from .moved_design import PlantRange, over_positions

@@ -22,8 +22,8 @@ from ..controller import Controller
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
-from ..pipeline import Design, Solution, designed
-from ..preparation import posed, require_reach
+from ..pipeline import Design, Solution, designed, posed
+from ..preparation import require_reach
 from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion

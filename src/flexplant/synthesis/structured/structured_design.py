@@ -22,8 +22,8 @@ from ...tolerances import CLOSE, NEGLIGIBLE, SAME, TINY
 from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf, PeakGain
-from ..pipeline import Design, Solution, designed
-from ..preparation import Prepared, posed, require_reach
+from ..pipeline import Design, Solution, designed, posed
+from ..preparation import Prepared, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .measured_objective import MeasuredObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
