@@ -238,7 +238,7 @@ def loaded(g):
         (lyapunov, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
         (lyapunov, "is_block_diagonal", controllability_gramian),
         (balancing, "split_stable", lambda g: balanced(g, order=1)),
-        (kalman, "filter_design", lambda g: flexplant.design_kalman(machines.stage())),
+        (kalman, "auto_filter_design", lambda g: flexplant.design_kalman(machines.stage())),
         (
             servo,
             "servo_task",

@@ -436,6 +436,21 @@ def test_square_roots_give_the_filter_that_covariances_give():
     assert root.L[0, 0] ** 2 == pytest.approx(errors[best], rel=1e-6)
 
 
+def test_what_was_tried_before_the_square_roots_is_listed(monkeypatch):
+    plant = plate_plant(1e-2)
+    found = design_kalman(plant)
+
+    def fails(model):
+        raise SolverError("few digits")
+
+    monkeypatch.setattr(kalman, "_design_by_covariance", fails)
+    again = design_kalman(plant)
+    np.testing.assert_allclose(again.variances, found.variances, rtol=1e-6)
+    routes = [one.route for one in again.certificate.checks]
+    assert any(route.endswith("; by the covariance: few digits") for route in routes)
+    assert "covariance: few" not in str([one.route for one in found.certificate.checks])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "words"),

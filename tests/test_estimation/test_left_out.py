@@ -11,7 +11,7 @@ from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out_modes import left_out
 from flexplant.lti import low_pass_filter
 from flexplant.modes import solve_modes
-from flexplant.plant import Disturbance, Sensor, assemble_plant
+from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import FEModel, ModalDamping, chain, kirchhoff_plate
 from flexplant.testbeds import three_masses
@@ -121,6 +121,29 @@ def dictionaries(plant, observer):
     truth = {"A": g.A, "C1": g.C[rows], "C2": g.C[seen], "factor": plant.noise_factor}
     truth["R"] = plant.sensor_noise[:4, :4]
     return truth, {"A": observer.A, "B": observer.B[:, :4], "C": observer.C, "D": observer.D[:, :4]}
+
+
+def test_a_plant_that_moves_as_a_rigid_body_only():
+    """No elastic mode is in the plant: all those of the evaluation model are noise."""
+    model = chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e6, 5e6])
+    modes = solve_modes(model, count=3, damping=ModalDamping(0.01))
+    channels = Ports(
+        w=[Disturbance("d", at="1:x", asd=1e-3)],
+        u=[Actuator("u", at="1:x")],
+        z=[Poi("die", at="3:x", axes=("x",))],
+        y=[Sensor("y", at="2:x", asd=1e-11)],
+    )
+    whole = assemble_plant(modes, channels).discretized(5e3, delay=1)
+    body = assemble_plant(modes.select([0]), channels, evaluation=modes)
+    estimator = design_kalman(body.discretized(5e3, delay=1))
+    assert estimator.certificate["truncated modes"] == 2
+    g, filter_ = whole.system, estimator.system
+    rows, seen = g.output_index(["die:x"]), g.output_index(["y"])
+    truth = {"A": g.A, "C1": g.C[rows], "C2": g.C[seen], "factor": whole.noise_factor}
+    truth["R"] = whole.sensor_noise
+    own = {"A": filter_.A, "B": filter_.B[:, :1], "C": filter_.C, "D": filter_.D[:, :1]}
+    expected = error_by_frequency(truth, own)
+    np.testing.assert_allclose(estimator.variances, expected, rtol=5e-3)
 
 
 @pytest.mark.slow

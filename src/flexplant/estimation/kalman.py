@@ -143,7 +143,7 @@ def redesigned(
 def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     """Return the filter of a plant and truncated modes, with its errors on its own model."""
     model = filter_model(plant, found)
-    design = filter_design(model)
+    design = auto_filter_design(model)
     own = plant if found is None else found.plant
     system = _filter_system(own, model, design.K, design.L_z)
     return KalmanEstimator(
@@ -183,13 +183,19 @@ class FilterDesign(NamedTuple):
     residual: float
     difference: float
     allowed: float = TYPED
+    #: what was tried before, and why it failed
+    tried: str = ""
 
     @property
     def certificate(self) -> Certificate:
         """Checks of the filter."""
         checks = (
             stability_check(self.radius, sampled=True),
-            Verified("residual", self.residual, "the Riccati equation, in states of unit variance"),
+            Verified(
+                "residual",
+                self.residual,
+                f"the Riccati equation, in states of unit variance{self.tried}",
+            ),
         )
         return Certificate((*checks, _difference_check(self.difference, self.allowed)))
 
@@ -199,16 +205,19 @@ def _difference_check(difference: float, limit: float = TYPED) -> Verified:
     return Verified("difference", difference, "variances by a Stein equation of the gain", limit)
 
 
-def filter_design(model: FilterModel) -> FilterDesign:
-    """Return the gains of a model whose sensors may include the noise of truncated modes."""
+def auto_filter_design(model: FilterModel) -> FilterDesign:
+    """Return the gains by the covariance, else in square roots; the certificate says why."""
     own = np.sum(model.H[:, ~np.any(model.G, axis=0)] ** 2, axis=1)
     # R is nearly all noise that moves the states too, the sensors' own part lost in it
     if np.any(own < RESIDUAL * np.sum(model.H**2, axis=1)):
-        return _design_in_roots(model, None)
+        return _design_in_roots(model)
     try:
         return _design_by_covariance(model)
     except (SolverError, CertificateError, ModelError) as error:  # R singular by rounding, say
-        return _design_in_roots(model, error)
+        try:
+            return _design_in_roots(model)._replace(tried=f"; by the covariance: {error}")
+        except SolverError:
+            raise error from None
 
 
 def _design_by_covariance(model: FilterModel) -> FilterDesign:
@@ -225,13 +234,10 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
     return FilterDesign(gain, K, L_z, covariance, variances, radius, solution.residual, difference)
 
 
-def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
-    """Return the gains where P has too few digits; raise `why` if they do not exist."""
+def _design_in_roots(model: FilterModel) -> FilterDesign:
+    """Return the gains where P has too few digits."""
     G, H = model.G, model.H
-    try:
-        found = riccati_root(model.A, model.C2, G, H)
-    except SolverError as error:
-        raise why or error from error
+    found = riccati_root(model.A, model.C2, G, H)
     gain = found.weighed(found.L @ (model.C2 @ found.L).T)
     rest = np.hstack([found.L - gain @ (model.C2 @ found.L), gain @ H])
     covariance = rest @ rest.T

@@ -187,7 +187,7 @@ def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntAr
     """Return the common modes of both, by frequency and compliance."""
     one, two = kept.static[genuine], every.static
     size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
-    one, two = ((part / size).reshape(part.shape[0], -1) for part in (one, two))
+    one, two = ((part / size).reshape(len(part), size.size) for part in (one, two))
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
     alike = np.abs(one @ two.T) / divisor(lengths)
     apart = np.abs(np.log(kept.omega[genuine][:, None] / every.omega))
