@@ -245,7 +245,8 @@ def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def largest_gains(H: ComplexArray) -> FloatArray:
     """Return the largest singular values of responses (p, m, n): lower bounds off the peak."""
     # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
-    size, root = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1))), np.sqrt(min(H.shape[:2]))
+    squares = [np.einsum("pmn,pmn->n", part, part) for part in (H.real, H.imag)]
+    size, root = np.sqrt(squares[0] + squares[1]), np.sqrt(min(H.shape[:2]))
     if root == 1.0:
         return np.asarray(size)
     near = size * root >= size.max(initial=0.0) * (1.0 - ROUNDING)

@@ -164,7 +164,9 @@ class PlantMachines:
         if self.fit is not None:
             modes = self._of_fit(rng)
         elif of_modes:
-            modes = StatedFamily(machine.realisation, uncertain).machine(rng, of_modes)
+            whole = machine.realisation
+            family = whole.once(uncertain, lambda: StatedFamily(whole, uncertain))
+            modes = family.machine(rng, of_modes)
         else:
             return machine.assembled()
         return machine.replace(realisation=modes, pairs=modes.pairs).assembled()
