@@ -13,6 +13,7 @@ from ..errors import ModelError, ShapeError, aligned, counted, short
 from ..loop import ClosedLoop
 from ..plant import AnyPlant
 from ..store import Value
+from ..tolerances import MOST_STEPS, SAME
 from ..words import instance
 from .causes import (
     Cause,
@@ -59,8 +60,6 @@ _COMPARED = 32768
 #: p-value below which innovations do not agree with the evaluation plant; small, since they already
 #: failed the test with the plant
 _AGREES = 1e-4
-#: number of steps of the fit of two noise levels, and regularisation if one of them has no effect
-_SCORING, _RIDGE = 40, 1e-9
 #: largest number of modes that are fitted one after the other until no peak remains
 _MOVED = 6
 #: band of a mode in half-widths and in lines to each side, with nearly all of its power
@@ -487,9 +486,9 @@ def _fitted_levels(parts: FloatArray, density: FloatArray) -> FloatArray:
     # scoring
     parts = np.maximum(parts, 0.0)
     levels = np.full(2, density.mean() / parts.sum(axis=0).mean())
-    for _ in range(_SCORING):
+    for _ in range(MOST_STEPS):
         weighted = parts / (levels @ parts) ** 2
-        information = weighted @ parts.T + _RIDGE * np.eye(2) * np.trace(weighted @ parts.T)
+        information = weighted @ parts.T + SAME * np.eye(2) * np.trace(weighted @ parts.T)
         step = np.linalg.solve(information, weighted @ (density - levels @ parts))
         levels = np.clip(levels + step, 0.1 * levels, 10 * levels)
     return levels

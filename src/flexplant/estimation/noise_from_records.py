@@ -15,7 +15,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..store import Value
-from ..tolerances import CHANCE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SETTLED, SPLIT, TINY
+from ..tolerances import CHANCE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SETTLED, SPLIT, TINY, TYPED
 from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
@@ -32,7 +32,7 @@ _LAGS = 40
 #: fewest samples, and lines of the spectrum computed at once
 _FEWEST, _LINES = 1000, 4000
 #: least and largest ratio of a variance to the given one in one pass
-_LOW, _HIGH = 1e-6, 1e6
+_LOW, _HIGH = TYPED, 1.0 / TYPED
 
 
 @one_thread()

@@ -10,7 +10,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
-from ..tolerances import MOST_STEPS, PRECISION, RESIDUAL, SPLIT, TINY, TYPED
+from ..tolerances import MOST_STEPS, PRECISION, RESIDUAL, ROOT, ROUNDING, SAME, SPLIT, TINY, TYPED
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ def axis_frequencies(hamiltonian: FloatArray | ComplexArray) -> FloatArray:
     # false candidates do no harm, since the gain is computed there
     balanced = _gebal(hamiltonian)[0]
     values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
-    return values.imag[np.abs(values.real) <= _NEARLY * np.linalg.norm(balanced)]
+    return values.imag[np.abs(values.real) <= SAME * np.linalg.norm(balanced)]
 
 
 def mean_speed(poles: ComplexArray) -> float:
@@ -92,10 +92,7 @@ def reciprocal(size: FloatArray) -> FloatArray:
 
 _Schur = tuple[ComplexArray, ComplexArray]
 #: a doubled Riccati equation has converged: the next term would be the square of this
-_CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
-#: relative tolerances: eigenvalues of a Hamiltonian that lie, or may lie, on the imaginary axis; Q
-#: - S R^-1 S' that counts as zero
-_AXIS, _NEARLY, _CANCELLED = 1e-10, 1e-9, 1e-12
+_CONVERGED, _CONVERGED_QUICKLY = 1e-15, ROOT
 #: number of examined residuals, with a Newton correction between them, which squares the error
 _CORRECTIONS = 4
 
@@ -239,13 +236,13 @@ def stable_subspace(
     # units of the states, and one of the adjoint states: still Hamiltonian
     parts = (A * d / d[:, None], G / d / d[:, None], Q * d * d[:, None], whole * d * d[:, None])
     inner, reach, cost, own = (float(np.linalg.norm(part)) for part in parts)
-    if cost <= _CANCELLED * own:  # only rounding: X has the size of A over G
+    if cost <= ROUNDING * own:  # only rounding: X has the size of A over G
         cost = inner**2 / reach if reach else 0.0
     unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
     scale = np.concatenate([d, unit / d])
     balanced = np.block([[A, -G], [-Q, -A.T]]) * scale / scale[:, None]
     values, vectors, count = _stable_first(balanced)
-    on_axis = np.abs(values.real) <= _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
+    on_axis = np.abs(values.real) <= RESIDUAL * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
     if count != d.size or np.any(on_axis):
         near = np.argsort(np.abs(values.real))[:2]
         raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))

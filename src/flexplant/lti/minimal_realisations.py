@@ -10,7 +10,7 @@ import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..arrays import ComplexArray, FloatArray, between
-from ..tolerances import CLOSE, RANK, ROOT, SAME, SPLIT, TINY, TYPED
+from ..tolerances import CLOSE, RANK, ROOT, ROUNDING, SAME, SPLIT, TINY, TYPED
 from .blocks_of_states import block_matrix, is_block_diagonal, joined_blocks
 from .equations import reciprocal, state_scale
 from .lyapunov import controllability_factor, observability_factor
@@ -20,7 +20,7 @@ from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
 #: largest meaningful condition numbers of a pole: for a double pole, then for any multiplicity
-DEFECTIVE = ((1.0 / ROOT), 1e12)
+DEFECTIVE = (1.0 / ROOT, 1.0 / ROUNDING)
 #: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
 #: resonances and zeros
 BESIDE = 0.1

@@ -22,7 +22,7 @@ from ..arrays import ComplexArray, FloatArray, divisor, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..store import Value
-from ..tolerances import MOST_STEPS, RANK, SPLIT
+from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, RANK, SAME, SETTLED, SPLIT
 from .equations import (
     OnAxisError,
     accumulated,
@@ -278,16 +278,8 @@ def _riccati_problem(
     return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening, discrete)
 
 
-#: largest accepted relative residual, and last Newton correction, in states of unit variance
-RESIDUAL, CORRECTION = 1e-9, 1e-7
-#: relative correction at which Newton's steps end, since the next one would be below rounding;
-#: largest number of steps, which double the digits each time
-SETTLED, NEWTON_STEPS = 1e-11, 10
-
-
-#: relative decay per step (or period) below which a closed loop is examined for modes that only
-#: rounding stabilises; relative size of a pole or singular value that counts as undamped
-SLOW, EDGE = 0.01, 1e-9
+#: largest number of Newton's steps, which double the digits each time
+NEWTON_STEPS = 10
 
 
 class RiccatiProblem(NamedTuple):
@@ -426,15 +418,15 @@ def _solution(
     P, K, residual, steps = _newton(scaled, P)
     poles = np.asarray(la.eigvals(scaled.A - K @ scaled.C), dtype=np.complex128)
     stable = np.max(_growth(first, poles)) < 0.0
-    if not stable or not residual <= RESIDUAL:
+    if not stable or not residual <= SAME:
         raise SolverError(
-            f"the residual is {residual:.1e} of P (allowed {RESIDUAL:.0e}), the closed loop is "
+            f"the residual is {residual:.1e} of P (allowed {SAME:.0e}), the closed loop is "
             f"{'' if stable else 'not '}strictly stable. The problem is too badly "
             "conditioned for double precision."
         )
     # noise that excites a rigid-body mode only by rounding gives a slow, meaningless loop
     size = 1.0 if first.discrete else float(np.max(np.abs(poles)))
-    if np.max(_growth(first, poles)) > -SLOW * size and (reason := _defect(first)):
+    if np.max(_growth(first, poles)) > -CLOSE * size and (reason := _defect(first)):
         raise SolverError(reason)
     gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
     return RiccatiSolution(P * d * d[:, None], gain, poles, residual, doublings + steps)
@@ -448,9 +440,9 @@ def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, f
         change = correction(p.A - K @ p.C, _residual(p, P, K)[0])
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
         # far from the solution the second step may be larger, since the first one is arbitrary
-        if size < last or last > CORRECTION:
+        if size < last or last > MISSED:
             P = symmetrised(P + change)
-        if size < SETTLED or (size >= 0.5 * last and last < CORRECTION):
+        if size < NULL or (size >= 0.5 * last and last < MISSED):
             break
         last = min(size, last)
     else:
@@ -467,7 +459,7 @@ def _defect(p: RiccatiProblem) -> str:
     marginal = 1.0 if p.discrete else 0.0
     lam = la.eigvals(p.A).astype(np.complex128)
     size = max(marginal, float(np.max(np.abs(lam), initial=0.0)))
-    critical = lam[_growth(p, lam) >= -EDGE * size]
+    critical = lam[_growth(p, lam) >= -SAME * size]
     # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
     near = np.abs(critical - marginal) < SPLIT * size
     distinct = [complex(marginal)] if near.any() else []
@@ -496,7 +488,7 @@ def _defect(p: RiccatiProblem) -> str:
 def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
     """Return how many directions of the null space of `shifted` the quadratic form misses."""
     _, sizes, right = la.svd(shifted)
-    null = right[sizes < EDGE * max(1.0, float(sizes[0]))].conj().T
+    null = right[sizes < SAME * max(1.0, float(sizes[0]))].conj().T
     if not null.size:
         return 0
     form = null.conj().T @ weight @ null
@@ -508,10 +500,9 @@ def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
     return int(np.count_nonzero(np.abs(values) < RANK))
 
 
-#: relative change of a standard deviation at which Newton's steps end; and largest accepted change
-#: where rounding of the gain prevents smaller ones: of 12 such filters at 3e-4, 8 were within 1e-6
-#: of the optimum
-_SETTLED_ROOT, _STALLED = 1e-9, 3e-4
+#: largest accepted change of a standard deviation where rounding of the gain prevents smaller ones:
+#: of 12 such filters at 3e-4, 8 were within 1e-6 of the optimum
+_STALLED = 3e-4
 #: number of consecutive steps that need not halve the least change, before quadratic convergence
 _STALLS = 6
 #: range of added sensor noise in decades, relative to the motion in a sample and to their own
@@ -585,7 +576,7 @@ def _newton_in_roots(
         change = float(np.max(np.abs(size - last) / np.where(size > 0, size, 1.0), initial=0.0))
         K, X = _measured(A, C, G, H, L)
         stalls = stalls + 1 if change >= 0.5 * least else 0
-        if change <= (_STALLED if stalls >= _STALLS else _SETTLED_ROOT):
+        if change <= (_STALLED if stalls >= _STALLS else SETTLED):
             return RiccatiRoot(L, K, X, change, taken)
         last, least = size, min(least, change)
     raise SolverError(
