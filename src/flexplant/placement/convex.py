@@ -17,7 +17,7 @@ from ..arrays import FloatArray, IntArray, divisor
 from ..errors import SolverError, attempted
 from ..estimation.filter_models import weigh
 from ..lti.equations import doubled, doubled_riccati, relative, square_root
-from ..lti.riccati import control_dare, riccati_root
+from ..lti.riccati import riccati_root
 from ..store import Value
 from ..tolerances import MOST_STEPS, NEGLIGIBLE, RANK, RESIDUAL, SAME, SETTLED, TINY
 from .criterion import Scorer
@@ -435,24 +435,17 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
     with suppress(SolverError):
         X = doubled_riccati(A, g.T @ g, H, quick=True)[0]
         residual = A.T @ measured(X, g)[1] @ A + H - X
-        # closed loops that are barely stable look converged: `control_dare` distinguishes them
+        # closed loops that are barely stable look converged: `riccati_root` distinguishes them
         if relative(residual, float(np.linalg.norm(X))) <= RESIDUAL:
             return X
     return _certain(A, H, g)
 
 
 def _certain(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
-    """Return X by Newton's steps; in square roots where it has too few digits for these."""
-    one = np.eye(g.shape[0])
-    try:
-        return control_dare(A, g.T, Q=H, R=one).P
-    except SolverError as error:
-        noise = la.block_diag(square_root(H), one)
-        try:
-            L = riccati_root(A.T, g, noise[: len(A)], noise[len(A) :]).L
-        except SolverError:
-            raise error from None
-        return np.asarray(L @ L.T)
+    """Return X by Newton's steps in square roots, which keep the digits of a soft machine."""
+    noise = la.block_diag(square_root(H), np.eye(g.shape[0]))
+    L = riccati_root(A.T, g, noise[: len(A)], noise[len(A) :]).L
+    return np.asarray(L @ L.T)
 
 
 def _square_root(g: FloatArray) -> FloatArray:
