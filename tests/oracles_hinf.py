@@ -158,6 +158,14 @@ def _least(parts, nu, ny, level):
     return least
 
 
+def mu_of_two_blocks(M, size):
+    """mu of a complex response by SLICOT's AB13MD: a full block of that size, and the rest."""
+    rest = max(M.shape) - size
+    square = np.zeros((size + rest,) * 2, dtype=complex)
+    square[: M.shape[0], : M.shape[1]] = M
+    return slycot.ab13md(square, np.array([size, rest]), np.array([2, 2]))[0]
+
+
 #: decay rates of the signals w of `least_cost`, relative to the speed of the loop
 RATES = np.geomspace(1e-5, 1e2, 36)
 

@@ -494,8 +494,8 @@ def _draw_limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> Non
 def _draw_levels(ax: Axes) -> None:
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color=GREY, linestyle=style, linewidth=0.8, zorder=1.0)
-    # below the line, as the axes may end at it, and on the left, where |S| is small and no legend
-    ax.annotate("6 dB", (0.0, 6.0), (3.0, -2.0), xycoords=ax.get_yaxis_transform(),
-                textcoords="offset points", ha="left", va="top", fontsize="x-small", color=GREY,
+    # outside the axes, where neither a curve nor the level of 0 dB crosses it
+    ax.annotate("6 dB", (1.0, 6.0), (2.0, 0.0), xycoords=ax.get_yaxis_transform(),
+                textcoords="offset points", ha="left", va="center", fontsize="x-small", color=GREY,
                 annotation_clip=True)  # fmt: skip
     readable(ax)

@@ -239,13 +239,15 @@ _LITTLE = 1e-11
 class Lmi(Value):
     """Synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
 
-    The smallest gamma is the optimum of one semidefinite program, in states that are balanced by
-    the solutions of least quadratic cost. It is compared with a lower bound that the Riccati
-    equations prove: a program whose optimum is more than 2 % above it is refused. The controller is
-    the central one at a small distance from that gamma, which is taken at most 0.5 % above the
-    bound. Noise, effort and disturbance are added
-    as for `Riccati()`. Suits small plants: the time grows with the sixth power of the number of
-    states, about 10 s at 24.
+    One semidefinite program gives the smallest gamma, in states that are balanced by the solutions
+    of least quadratic cost. What is proved: the eigenvalues of its X and Y show that the gamma can
+    be reached, to the accuracy of the solver, and the Riccati equations show what no controller
+    undercuts. A program whose optimum is more than 2 % above that bound is refused. The controller
+    is not computed from X and Y: next to the optimum ``I - X Y`` is nearly singular, and digits are
+    lost. It is the central controller of the Riccati equations, as for `Riccati()`, at a small
+    distance from that gamma, which is taken at most 0.5 % above the bound. Noise, effort and
+    disturbance are added as for `Riccati()`. Plants of up to 24 states take at most about 10 s; the
+    time grows with the sixth power of the number of states.
 
     Parameters
     ----------

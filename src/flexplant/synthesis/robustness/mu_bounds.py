@@ -36,7 +36,7 @@ _SOUGHT, _STARTS = 8, 10
 #: part of the upper bound from which a lower one is not raised further: no design hangs on less
 _MET = 0.999
 #: relative distance of the level to the largest upper bound found at a frequency
-_ABOVE = 5e-3
+ABOVE = 5e-3
 #: what a bar calls the intervals of frequency that are covered
 INTERVALS = "intervals of frequency"
 #: intervals at most; larger systems are covered by sampling instead of Hamiltonians
@@ -239,7 +239,7 @@ class Cover:
     leveled: Sequence[bool] | None = None
     heights: Heights | None = None
     least: float = 1e-12
-    accuracy: float = _ABOVE
+    accuracy: float = ABOVE
 
     def __post_init__(self) -> None:
         g = self.M
