@@ -292,7 +292,12 @@ def _states(g: StateSpace, s: complex, columns: IntArray) -> ComplexArray:
 
 def elastic(plant: Partition) -> FloatArray:
     """Return the frequencies [Hz] of the modes that oscillate below 0.45 of the rate, in order."""
-    pairs = plant.modal_blocks[plant.n_rigid : plant.realisation.n_modes]
-    freq = natural(pairs)[0] / (2.0 * np.pi)
-    freq = freq[freq > 0]  # unstable pairs do not resonate
-    return np.asarray(freq[freq * plant.dt < 0.45])
+    return oscillations(plant)[0]
+
+
+def oscillations(plant: Partition) -> tuple[FloatArray, FloatArray]:
+    """Return `elastic`, and the damping ratios of these modes."""
+    omega, damping = natural(plant.modal_blocks[plant.n_rigid : plant.realisation.n_modes])
+    freq = omega / (2.0 * np.pi)
+    seen = (freq > 0) & (freq * plant.dt < 0.45)  # unstable pairs do not resonate
+    return np.asarray(freq[seen]), np.asarray(damping[seen])

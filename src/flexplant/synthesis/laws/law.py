@@ -243,13 +243,18 @@ class Law(LawElement):
     @cached_property
     def system(self) -> StateSpace:
         """The system from error to command, sampled where the law is."""
+        sizes = [len(section.matrices[0]) for section in self._sections]
+        blocks = [size for size in sizes if size][::-1]
+        dt = 1.0 / self.rate if self.rate else 0.0
+        return StateSpace(*self.matrices, dt, inputs=["error"], outputs=["command"], blocks=blocks)
+
+    @cached_property
+    def matrices(self) -> Matrices:
+        """A, B, C and D of `system`."""
         a = 2.0 * self.rate
         parts = [section.matrices for section in self._sections]
         # sampled each on its own: states of one size
-        made = chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
-        sizes = [len(part[0]) for part in parts if len(part[0])]
-        dt = 1.0 / self.rate if self.rate else 0.0
-        return StateSpace(*made, dt, inputs=["error"], outputs=["command"], blocks=sizes[::-1])
+        return chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
 
     def response(self, freq: npt.ArrayLike) -> ComplexArray:
         """Return the response (n_freq,), in closed form.

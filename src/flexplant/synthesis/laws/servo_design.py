@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import FloatArray, below_half_rate, between, positive, real_array
+from ...arrays import ComplexArray, FloatArray, below_half_rate, between, positive, real_array
 from ...certificates import Certificate, Verified, stability_check
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.broken import axis_sensitivities
 from ...loop.other_machines import growing_modes, modes_in_words
+from ...lti.interconnection import connect, loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
@@ -23,11 +24,12 @@ from ...plant.axes import driven_axes, elastic
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
+from .controller_elements import Notch
 from .law import Axes, axes_controller, connected
 from .servo_loops import (
+    LEADS,
     POWERS,
     TARGET,
-    WIDE,
     Axis,
     Reading,
     ServoLaw,
@@ -40,7 +42,6 @@ from .servo_loops import (
     reading_of,
     seeing,
     servo_loop,
-    widened,
 )
 
 
@@ -136,7 +137,6 @@ def design_servo(
     task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
     law = task.law(bandwidth)
     task.require_phase(law)
-    law = task.notched(law)
     closed = task.closed(law)
     margin = Verified("modulus margin", closed.modulus_margin, "a sweep of |1 + L| at u")
     certificate = Certificate((stability_check(closed.spectral_radius, sampled=True), margin))
@@ -163,11 +163,13 @@ def design_servo(
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
-    notes = [f"notches at {', '.join(f'{f:.4g}' for f in law.notches)} Hz"] if law.notches else []
+    notches = ", ".join(f"{notch.freq:.4g}" for notch in law.notches)
+    notes = [f"notches at {notches} Hz"] if notches else []
     if observer is None:
         notes.append("certified on the POI itself: observer= certifies the loop that will run")
     lines = ", ".join(
-        f"{name} {axis.line}" for name, axis in zip(law.driven.channels, law.axes, strict=True)
+        f"{name} {axis.line}" + (f" with a lead of {axis.lead:g}" if axis.lead > LEADS[0] else "")
+        for name, axis in zip(law.driven.channels, law.axes, strict=True)
     )
     notes.append(f"lines: {lines}")
     answer = Controller(
@@ -261,14 +263,15 @@ def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
 #: bandwidths that `ServoTask.largest` tries, from 0.19 of the rate down to a part of it below
 #: which loops lose digits, before it halves intervals
 _TRIALS, _SLOWEST = 80, 2e-4
-#: roll-off relative to the bandwidth: on a spring the integrator leaves more phase for it
-_ROLLOFF = {"mass": 8.0, WIDE: 16.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
-#: corner of the integral action relative to the bandwidth; below the zero of a wide lead
-_INTEGRATOR = {WIDE: 0.02}
+#: roll-off relative to the bandwidth: on a spring the integrator leaves more phase for it; that of
+#: a wide lead is its pole
+_ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
+#: corner of the integral action relative to the bandwidth, or with a wide lead to its zero
+_INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 #: the faster corners that are tried instead, and the factor by which they may raise |S| and lower
 #: the frequency up to which |S| of the references is below 1: a tenth, for errors that settle up to
 #: five times sooner
-_FASTER, _COST = (0.1, 0.05), 1.1
+_FASTER, _COST = (0.1, 0.05, 0.02), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
@@ -315,47 +318,54 @@ class ServoTask:
                 )
         gains = np.abs(gains_at(self.plant, driven))
 
-        def of(lines: tuple[str, ...]) -> ServoLaw:
+        def of(lines: tuple[str, ...], lead: float = LEADS[0]) -> ServoLaw:
             each = zip(lines, driven.freq, gains, strict=True)
-            return ServoLaw(driven, tuple(self.axis(n, float(f), float(g)) for n, f, g in each))
+            axes = (self.axis(n, float(f), float(g), lead) for n, f, g in each)
+            return ServoLaw(driven, tuple(axes))
 
         tried = [of(lines) for lines in combinations(lines_of(self.plant, driven))]
         able = [one for one in tried if self.phase_margins(one).min() > 0.0]
         if not able:
             return tried[0]
-        best = self._best(able)
-        wide = of(widened([axis.line for axis in best.axes]))
+        lines = tuple(axis.line for axis in self._best(able).axes)
+        best = self.notched(of(lines))
         modes, lowest = elastic(self.plant), float(driven.freq.min())
-        if wide == best or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
+        if "mass" not in lines or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
             return best
-        ends = [self.notched(best), self.notched(wide)]
-        if self._best(ends) is ends[0]:
-            return best
-        wide = self._settling_soon(wide)
-        return wide if self._suppresses(wide) or not self._suppresses(best) else best
+        for lead in LEADS[1:]:
+            # the widest leads only where the others do not serve: they cost most noise
+            if lead != LEADS[1] and self._holds(best, TARGET):
+                break
+            wide = self.notched(of(lines, lead))
+            if self._best([best, wide]) is wide:
+                wide = self._settling_soon(wide)
+                best = wide if self._suppresses(wide) or not self._suppresses(best) else best
+        return best
+
+    def _holds(self, law: ServoLaw, peak: float) -> bool:
+        """Return whether the loop of a law is stable with |S| at u below a peak, on the grid."""
+        return self.loop.peak(law)[0] <= peak and self.radius(law) < 1.0
 
     def _suppresses(self, law: ServoLaw) -> bool:
         """Return whether every axis suppresses errors well below its bandwidth."""
         low = law.driven.freq / _WELL_BELOW
         plant = gains_at(self.plant, law.driven, low)
-        laws = np.array([a.law.at(np.array([f]))[0] for a, f in zip(law.axes, low, strict=True)])
-        return bool(np.all(np.abs(1.0 + laws * plant) >= 1.0 / _SUPPRESSED))
+        loops = np.diag(law.at(low)) * plant
+        return bool(np.all(np.abs(1.0 + loops) >= 1.0 / _SUPPRESSED))
 
     def _settling_soon(self, law: ServoLaw) -> ServoLaw:
         """Return a law of wide leads with the fastest integral action that costs little margin."""
-        if self.integrator is not None:
+        peak = self.loop.peak(law)[0]
+        if self.integrator is not None or peak > TARGET:
             return law
-        plain = self.notched(law)
-        most = _COST * self.loop.peak(plain)[0]
         for part in _FASTER:
-            axes = (
-                replace(a, integrator=part * a.bandwidth) if a.line == WIDE else a for a in law.axes
-            )
+            axes = (replace(a, integrator=max(a.integrator, part * a.bandwidth)) for a in law.axes)
             faster = law._replace(axes=tuple(axes))
-            ended = self.notched(faster)
-            if self.loop.peak(ended)[0] > most or not self.closed(ended).is_stable:
+            if faster.axes == law.axes:
+                break
+            if not self._holds(faster, _COST * peak):
                 continue
-            if suppressed_up_to(self.closed(ended)) >= suppressed_up_to(self.closed(plain)) / _COST:
+            if suppressed_up_to(self.closed(faster)) >= suppressed_up_to(self.closed(law)) / _COST:
                 return faster
         return law
 
@@ -364,18 +374,21 @@ class ServoTask:
         if len(laws) == 1:
             return laws[0]
         rising = sorted(laws, key=lambda law: self.loop.peak(law)[0])
-        return next((law for law in rising if self.closed(law).is_stable), rising[0])
+        stable = (law for law in rising if self.radius(law) < 1.0)
+        return next(stable, min(rising, key=self.radius))
 
-    def axis(self, line: str, bandwidth: float, gain: float) -> Axis:
+    def axis(self, line: str, bandwidth: float, gain: float, lead: float) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""
-        usual = min(_ROLLOFF[line] * bandwidth, 0.4 * self.rate)
+        wide = line == "mass" and lead != LEADS[0]
+        usual = min((lead if wide else _ROLLOFF[line]) * bandwidth, 0.4 * self.rate)
         rolloff = usual if self.rolloff is None else self.rolloff
-        own = _INTEGRATOR.get(line, 0.1) * bandwidth
+        own = (_BELOW_ZERO / lead if wide else _INTEGRATOR) * bandwidth
         slow = own if self.integrator is None else self.integrator
         for name, freq in (("rolloff", rolloff), ("integrator", slow)):
             below_half_rate(freq, name, self.rate)
-        notches = self.notches or ()
-        return Axis(line, bandwidth, float(rolloff), float(slow), gain, self.rate, notches)
+        notches = tuple(Notch(freq) for freq in self.notches or ())
+        corners = float(rolloff), float(slow)
+        return Axis(line, bandwidth, *corners, gain, self.rate, lead if wide else LEADS[0], notches)
 
     @cached_property
     def notched(self) -> Callable[[ServoLaw], ServoLaw]:
@@ -386,16 +399,19 @@ class ServoTask:
             if self.notches is not None:
                 return law
             if law.axes not in kept:
-                kept[law.axes] = self.loop.notched(law, lambda one: self.closed(one).is_stable)
+                kept[law.axes] = self.loop.notched(law, self.poles)
             return kept[law.axes]
 
         return found
 
     def phase_margins(self, law: ServoLaw) -> FloatArray:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
-        # hold and delay turn a line as they turn the plant; its modes are not in it
+        # hold and delay turn a line as they turn the plant; its modes are not in it, and the
+        # notches at them neither
+        if self.notches is None:
+            law = law._replace(axes=tuple(replace(axis, notches=()) for axis in law.axes))
         late = np.array([2.0 * np.pi * a.bandwidth for a in law.axes]) * self.plant.dt
-        turned = np.array([a.law.at(np.array([a.bandwidth]))[0] for a in law.axes])
+        turned = np.diag(law.at(law.driven.freq))
         lines = np.array([POWERS.get(a.line, 1.0) for a in law.axes])
         own = np.angle(turned * 1j ** -(lines - 1.0)) - 0.5 * np.pi
         return np.asarray(own - late * (0.5 + self.plant.delay) + np.pi)
@@ -430,6 +446,33 @@ class ServoTask:
         return found
 
     @cached_property
+    def path(self) -> StateSpace:
+        """From u to what the servo reads."""
+        reads = list(self.reading.reads.values())
+        if self.observer is None:
+            return self.plant.system.select(self.reading.channels, self.plant.u)
+        direct = [one for one in reads if one in self.plant.y]
+        read = [one for one in self.plant.y if one in (*self.observer.inputs, *direct)]
+        plant = self.plant.system.select(read, self.plant.u)
+        return connect([plant, self.observer], self.plant.u, reads)
+
+    @cached_property
+    def poles(self) -> Callable[[ServoLaw], ComplexArray]:
+        """The function of a law that gives the poles of its loop."""
+        kept: dict[tuple[Axis, ...], ComplexArray] = {}
+
+        def found(law: ServoLaw) -> ComplexArray:
+            if law.axes not in kept:
+                kept[law.axes] = loop_poles(self.path, StateSpace(*law.matrices, self.plant.dt))
+            return kept[law.axes]
+
+        return found
+
+    def radius(self, law: ServoLaw) -> float:
+        """Return the spectral radius of the loop of a law."""
+        return float(np.abs(self.poles(law)).max())
+
+    @cached_property
     def closed(self) -> Callable[[ServoLaw], ClosedLoop]:
         """The function of a law that gives the loop that will run."""
         plant = self.plant
@@ -459,9 +502,8 @@ class ServoTask:
             law = self.law(bandwidth)
             if self.phase_margins(law).min() <= 0.0:
                 return False
-            law = self.notched(law)
             size, at = self.loop.peak(law)
-            if size < best[0] and self.closed(law).is_stable:
+            if size < best[0] and self.radius(law) < 1.0:
                 best = size, at, bandwidth
             if size > peak:
                 return False

@@ -13,32 +13,30 @@ from ...arrays import ComplexArray, FloatArray
 from ...errors import LabelError
 from ...loop.blocks import as_block
 from ...loop.broken import inverted, largest_sensitivity
+from ...lti.blocks_of_states import Matrices
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
-from ...plant.axes import DrivenAxes, complex_gain, elastic, real_gain
+from ...plant.axes import DrivenAxes, complex_gain, oscillations
 from .controller_elements import Integrator, LowPass, Notch, Pid
-from .law import Law, tustin_s
+from .law import Law, decoupled, tustin_s
 
-#: a mass line whose lead is wide: where a mode lies just above the bandwidth, its notch takes phase
-WIDE = "mass, wide lead"
-#: the lead's zero lies this factor below the bandwidth, its pole above: |S| of a free mass then
-#: peaks near 4 dB with the roll-off and integrator of `design_servo`. Random searches over PID,
-#: roll-off and notches for the largest frequency with |S| < 1 end at wide leads: 16 served a ball
-#: screw and a flexible joint
-_LEAD = {"mass": 4.0, WIDE: 16.0}
+#: the lead of a mass line: its zero lies this factor below the bandwidth, its pole above. With 4
+#: |S| of a free mass peaks near 4 dB with the roll-off and integrator of `design_servo`. Where a
+#: mode lies just above the bandwidth its notch takes phase, which wider leads give back
+LEADS = (4.0, 16.0, 64.0)
 
 
 #: highest corner of a law, as a fraction of the rate
 _HIGHEST = 0.4
-#: gain at a notch's centre, and damping ratio of its poles
-_DEPTH, _WIDTH = 0.05, 0.3
+#: shapes of laws that are kept: those that one bandwidth tries
+_SHAPES = 64
 
 
 #: lines on which an axis may lie, by the power of 1 / s of its response: a mass that is free (or
 #: above its springs), a damper, a spring (or a mass below its springs' frequency)
-POWERS = {"mass": 2.0, WIDE: 2.0, "damper": 1.0, "spring": 0.0}
+POWERS = {"mass": 2.0, "damper": 1.0, "spring": 0.0}
 
 
 #: a line is tried when slope and phase of the response are at most this much further from it than
@@ -55,10 +53,9 @@ _STEP, _BELOW, _VANISHED = 1.05, 1e-3, 1e-2
 class Axis:
     """The law of an axis, sampled by Tustin's rule, with which its loop crosses 1 at the bandwidth.
 
-    On a mass line ``(1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` with r = 4, or 16
-    where the lead is wide, on that of a damper
-    ``(1 + w_i / s) F(s)``, of a spring ``F(s) / s``, of a response that vanishes at rest ``F(s)``;
-    F is a second-order low-pass and the notches.
+    On a mass line ``(1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` with the lead r, on
+    that of a damper ``(1 + w_i / s) F(s)``, of a spring ``F(s) / s``, of a response that vanishes
+    at rest ``F(s)``; F is a second-order low-pass and the notches.
     """
 
     line: str
@@ -68,56 +65,57 @@ class Axis:
     #: of the plant at the bandwidth, decoupled: exact
     gain: float
     rate: float
-    notches: tuple[float, ...] = ()
+    lead: float = LEADS[0]
+    notches: tuple[Notch, ...] = ()
 
     @cached_property
     def law(self) -> Law:
         """Error to command."""
-        notches = (Notch(freq, _DEPTH, _WIDTH) for freq in self.notches)
-        factors = (*self._action, LowPass(self.rolloff), *notches)
-        shape = Law(factors, rate=self.rate, prewarped=False)
-        at = abs(shape.at(np.array([self.bandwidth]))[0]) * self.gain
-        return shape * float(1.0 / at)
+        return self.shape * (1.0 / self.gain)
 
     @property
-    def _action(self) -> tuple[Pid | Integrator, ...]:
-        if self.line in _LEAD:
-            lead = _LEAD[self.line]
-            zero, pole = self.bandwidth / lead, min(self.bandwidth * lead, _HIGHEST * self.rate)
+    def shape(self) -> Law:
+        """The law of a plant of gain 1 at the bandwidth, which axes have in common."""
+        return _shape(replace(self, gain=1.0))
+
+    @property
+    def action(self) -> tuple[Pid | Integrator, ...]:
+        """Integral action and lead."""
+        if self.line == "mass":
+            zero = self.bandwidth / self.lead
+            pole = min(self.bandwidth * self.lead, _HIGHEST * self.rate)
             return (Pid.corners(1.0, integrator=self.integrator, zero=zero, pole=pole),)
         if self.line == "damper":
             return (Integrator(self.integrator),)
         return (Pid(0.0, i=1.0),) if self.line == "spring" else ()
 
 
+@lru_cache(maxsize=_SHAPES)
+def _shape(axis: Axis) -> Law:
+    law = Law((*axis.action, LowPass(axis.rolloff), *axis.notches), rate=axis.rate)
+    return law * float(1.0 / abs(law.at(np.array([axis.bandwidth]))[0]))
+
+
 def gains_at(
-    plant: StandardPlant, axes: DrivenAxes, freq: FloatArray | None = None
+    plant: StandardPlant, axes: DrivenAxes, freq: FloatArray | ComplexArray | None = None
 ) -> ComplexArray:
     """Return the responses (r,) of the decoupled axes, at their frequencies [Hz] or at others."""
-    at = axes.freq if freq is None else freq
-    found = [
-        (complex_gain(plant.system, 2j * np.pi * f, [name], axes.actuators) @ axes.T[:, i])[0]
-        for i, (name, f) in enumerate(zip(axes.channels, at, strict=True))
-    ]
-    return np.array(found)
+    at = 2j * np.pi * (axes.freq if freq is None else freq)
+    gains = {s: complex_gain(plant.system, s, axes.channels, axes.actuators) for s in set(at)}
+    return np.array([gains[s][i] @ axes.T[:, i] for i, s in enumerate(at)])
 
 
 def lines_of(plant: StandardPlant, axes: DrivenAxes) -> list[tuple[str, ...]]:
     """Return the lines on which each axis may lie, the most likely first."""
     phases = np.angle(gains_at(plant, axes)) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
-    found: list[tuple[str, ...]] = []
-    for i, (name, f) in enumerate(zip(axes.channels, axes.freq, strict=True)):
-        sigmas = 2.0 * np.pi * f * np.array([_BELOW, 1.0 / _STEP, 1.0, _STEP])
-        sizes = [
-            abs(float((real_gain(plant.system, s, [name], axes.actuators) @ axes.T[:, i])[0]))
-            for s in sigmas
-        ]
-        if sizes[0] < _VANISHED * sizes[2]:
-            found.append(("speed",))
-            continue
-        slope = -np.log(sizes[3] / sizes[1]) / (2.0 * np.log(_STEP))
-        found.append(_likely(float(slope), float(phases[i])))
-    return found
+    # on the real axis, s = sigma
+    real = [gains_at(plant, axes, -1j * axes.freq * step) for step in (_BELOW, 1 / _STEP, 1, _STEP)]
+    rest, below, there, above = np.abs(np.real(real))
+    slopes = -np.log(above / below) / (2.0 * np.log(_STEP))
+    return [
+        ("speed",) if rest[i] < _VANISHED * there[i] else _likely(float(slopes[i]), float(phase))
+        for i, phase in enumerate(phases)
+    ]
 
 
 def _likely(slope: float, phase: float) -> tuple[str, ...]:
@@ -127,7 +125,6 @@ def _likely(slope: float, phase: float) -> tuple[str, ...]:
     off = {
         line: abs(slope - power) + abs(turned / (0.5 * np.pi) + power)
         for line, power in POWERS.items()
-        if line != WIDE
     }
     nearest = min(off.values())
     order = sorted(off, key=off.__getitem__)
@@ -146,19 +143,20 @@ def combinations(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(tried))
 
 
-def widened(lines: Sequence[str]) -> tuple[str, ...]:
-    """Return lines with wide leads on the mass lines."""
-    return tuple(WIDE if line == "mass" else line for line in lines)
-
-
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0
 #: notches that are placed at most, modes that are tried for each, and the least gain of one
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
+#: damping ratios of a notch's poles that are tried; its zeros have the damping of the mode
+_WIDTHS = (0.3, 0.45)
+#: fraction of it at which notching ends: the grid misses the top of a resonance by up to 2 %
+_BELOW_TARGET = 0.98
 #: points where |S| is at least this fraction of its peak are judged first for a further notch
 _HIGH = 0.5
 #: loops of this number of plants are kept: their designs at other bandwidths begin with them
 _KEPT = 8
+#: distance of a growing pole from the mode that it belongs to, relative to its frequency
+_DRIVEN = 0.3
 #: loop gain at a resonance below which a notch there serves nothing
 _QUIET = 0.3
 
@@ -170,26 +168,37 @@ class ServoLaw(NamedTuple):
     axes: tuple[Axis, ...]
 
     @property
-    def notches(self) -> tuple[float, ...]:
-        """The notches [Hz], which all axes have in common."""
+    def notches(self) -> tuple[Notch, ...]:
+        """The notches, which all axes have in common."""
         return self.axes[0].notches
 
-    def notched(self, freq: float) -> ServoLaw:
+    def notched(self, notch: Notch) -> ServoLaw:
         """Return the laws with a further notch."""
         return self._replace(
-            axes=tuple(replace(axis, notches=(*axis.notches, freq)) for axis in self.axes)
+            axes=tuple(replace(axis, notches=(*axis.notches, notch)) for axis in self.axes)
         )
 
-    def changed_by(self, centre: float, freq: FloatArray) -> ComplexArray:
+    def changed_by(self, notch: Notch, freq: FloatArray) -> ComplexArray:
         """Return the factors (n_freq, r) by which a further notch changes the responses."""
-        bandwidths = np.array([axis.bandwidth for axis in self.axes])
-        section = Notch(centre, _DEPTH, _WIDTH).section
-        gain = section.gain(tustin_s(np.append(freq, bandwidths), self.axes[0].rate))
+        bandwidths, rate = np.array([axis.bandwidth for axis in self.axes]), self.axes[0].rate
+        gain = notch.section.at(rate).gain(tustin_s(np.append(freq, bandwidths), rate))
         return np.asarray(gain[: freq.size, None] / np.abs(gain[freq.size :]))
 
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the responses (n_freq, r) of the laws."""
-        return np.stack([axis.law.at(freq) for axis in self.axes], axis=-1)
+        shapes = [axis.shape for axis in self.axes]
+        found = {one: one.at(freq) for one in dict.fromkeys(shapes)}
+        each = zip(shapes, self.axes, strict=True)
+        return np.stack([found[one] / axis.gain for one, axis in each], axis=-1)
+
+    @property
+    def matrices(self) -> Matrices:
+        """A, B, C and D from what the servo reads to the actuators."""
+        parts = []
+        for axis in self.axes:
+            A, B, C, D = axis.shape.matrices
+            parts.append((A, B, C / axis.gain, D / axis.gain))
+        return decoupled(parts, self.driven.T, np.eye(len(self.axes)))
 
 
 @dataclass(frozen=True)
@@ -204,7 +213,9 @@ class ServoLoop:
     #: E_y G (n_freq, r, nu) and E_u (n_freq, r, nu)
     moved: ComplexArray
     own: ComplexArray | None
+    #: of the modes: frequencies [Hz] and damping ratios
     modes: FloatArray
+    damping: FloatArray
     plant: StandardPlant
 
     def gain(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> ComplexArray:
@@ -222,25 +233,52 @@ class ServoLoop:
         """Return sigma_max(S_u) at some points; of an unstable loop too, so check that."""
         return largest_sensitivity(self.gain(T, at, some), self._mixed)
 
+    @cached_property
+    def swept(self) -> Callable[[ServoLaw], tuple[ComplexArray, FloatArray]]:
+        """The function of a law that gives its responses and sigma_max(S_u) over the grid."""
+
+        @lru_cache(maxsize=_SHAPES)
+        def found(law: ServoLaw) -> tuple[ComplexArray, FloatArray]:
+            at = law.at(self.freq)
+            return at, self._sizes(law.driven.T, at)
+
+        return found
+
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
-        size = self._sizes(law.driven.T, law.at(self.freq))
+        size = self.swept(law)[1]
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
     def _best_notch(
-        self, law: ServoLaw, at: ComplexArray, size: FloatArray, centres: Sequence[float]
-    ) -> tuple[int, ComplexArray, FloatArray]:
-        """Return which further notch gives the lowest peak, its responses and its |S|."""
+        self, law: ServoLaw, at: ComplexArray, size: FloatArray, modes: Sequence[int]
+    ) -> tuple[Notch, float]:
+        """Return the further notch that gives the lowest peak of |S|, and that peak.
+
+        It is a narrow one where that brings |S| below 6 dB: wide ones take more phase.
+        """
+        narrow, *wider = _WIDTHS
+        best = self._lowest(law, at, size, [self._inverse(mode, narrow) for mode in modes])
+        for width in wider:
+            if best[1] <= _BELOW_TARGET * TARGET:
+                break
+            other = replace(best[0], depth=best[0].depth * best[0].width / width, width=width)
+            best = min(best, self._lowest(law, at, size, [other]), key=lambda one: one[1])
+        return best
+
+    def _lowest(
+        self, law: ServoLaw, at: ComplexArray, size: FloatArray, notches: Sequence[Notch]
+    ) -> tuple[Notch, float]:
+        """Return the notch with the lowest peak, and that peak."""
         T, high = law.driven.T, np.flatnonzero(size >= _HIGH * size.max())
-        tried = [at * law.changed_by(freq, self.freq) for freq in centres]
+        tried = [at * law.changed_by(notch, self.freq) for notch in notches]
         least = np.array([self._sizes(T, one, high).max() for one in tried])
-        best, lower = 0, np.full(1, np.inf)
+        best, lower = 0, np.inf
         for i in np.argsort(least, kind="stable").tolist():
-            if least[i] < lower.max():  # else too high already where the loop is high without it
-                found = self._sizes(T, tried[i])
-                best, lower = (i, found) if found.max() < lower.max() else (best, lower)
-        return best, tried[best], lower
+            if least[i] < lower:  # else too high already where the loop is high without it
+                found = float(self._sizes(T, tried[i]).max())
+                best, lower = (i, found) if found < lower else (best, lower)
+        return notches[best], lower
 
     @cached_property
     def _near(self) -> list[slice]:
@@ -248,34 +286,52 @@ class ServoLoop:
         ends = np.searchsorted(self.freq, [0.98 * self.modes, 1.02 * self.modes])
         return [slice(*pair) for pair in ends.T.tolist()]
 
-    def resonant(self, law: ServoLaw, at: ComplexArray) -> FloatArray:
-        """Return the modes [Hz] above the bandwidth with loop gain, the largest first."""
+    def resonant(self, law: ServoLaw, at: ComplexArray) -> list[int]:
+        """Return the modes above the bandwidth with loop gain and no notch, the largest first."""
         through = self.moved if self.own is None else self.moved + self.own
         size = np.abs(at).max(axis=1) * np.linalg.norm(law.driven.T @ through, axis=(1, 2))
         peaks = np.array([size[near].max(initial=0.0) for near in self._near])
         # below the bandwidths a notch would take the gain that suppresses the error
         peaks[self.modes < law.driven.freq.min()] = 0.0
+        done = np.isin(self.modes, [notch.freq for notch in law.notches])
+        peaks[done | (self.damping > _WIDTHS[0])] = 0.0
         order = np.argsort(-peaks, kind="stable")
-        return np.asarray(self.modes[order][peaks[order] > _QUIET])
+        return [int(i) for i in order[peaks[order] > _QUIET]]
 
-    def notched(self, law: ServoLaw, stable: Callable[[ServoLaw], bool]) -> ServoLaw:
+    def _inverse(self, mode: int, width: float) -> Notch:
+        """Return the notch whose zeros are the poles of a mode."""
+        return Notch(float(self.modes[mode]), float(self.damping[mode]) / width, width)
+
+    def notched(self, law: ServoLaw, poles: Callable[[ServoLaw], ComplexArray]) -> ServoLaw:
         """Return the law with notches at the modes where they bring |S| at u down."""
-        # while |S| is above 6 dB or the loop unstable: the one of the largest that lowers it most
-        at = law.at(self.freq)
-        size = self._sizes(law.driven.T, at)
+        inside = poles(law)
         for _ in range(_NOTCHES):
-            peak = size.max()
-            if peak <= TARGET and stable(law):
+            at, size = self.swept(law)
+            stable = np.abs(inside).max() < 1.0
+            if stable and size.max() <= _BELOW_TARGET * TARGET:
                 break
-            left = [f for f in self.resonant(law, at).tolist() if f not in law.notches]
+            left = self.resonant(law, at)
+            left = left[:_TRIED] if stable else self._driven(left, inside)
             if not left:
                 break
-            tried = left[:_TRIED] if peak > TARGET else left[:1]
-            best, after, lower = self._best_notch(law, at, size, tried)
-            if TARGET < peak < lower.max() / _GAIN and stable(law):
+            notch, lower = self._best_notch(law, at, size, left)
+            further = law.notched(notch)
+            outside = poles(further)
+            # of an unstable loop |S| says little: a notch is to slow the growth
+            if np.abs(outside).max() >= max(1.0, np.abs(inside).max()):
                 break
-            law, at, size = law.notched(tried[best]), after, lower
+            if stable and lower > _GAIN * size.max():
+                break
+            law, inside = further, outside
         return law
+
+    def _driven(self, modes: list[int], poles: ComplexArray) -> list[int]:
+        """Return the mode that an unstable loop drives, next to the pole that grows most."""
+        pole = poles[np.argmax(np.abs(poles))]
+        grows = abs(np.angle(pole)) / (2.0 * np.pi * self.plant.dt)
+        off = [abs(self.modes[mode] - grows) for mode in modes]
+        near = [mode for mode, one in zip(modes, off, strict=True) if one == min(off)]
+        return [mode for mode in near if abs(self.modes[mode] - grows) < _DRIVEN * grows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,7 +392,7 @@ def servo_loop(
         moved[:, at] = E[..., : len(read)] @ _stack(plant.system.select(read, plant.u), grid)
         columns = [plant.u.index(name) for name in given]
         own[np.ix_(range(grid.size), at, columns)] = E[..., len(read) :]
-    return ServoLoop(grid, moved, own if given else None, elastic(known), plant)
+    return ServoLoop(grid, moved, own if given else None, *oscillations(known), plant)
 
 
 def _stack(system: StateSpace, grid: FloatArray) -> ComplexArray:
