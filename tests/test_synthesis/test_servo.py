@@ -46,20 +46,20 @@ def at(system, freq, inputs):
 
 
 def pid(freq, bandwidth, *, rolloff=None, integrator=None, notches=(), rate=RATE):
-    """Closed form of one axis, Tustin's s, crossing of the double integrator at the bandwidth."""
+    """Closed form of one axis: Tustin's s, roll-off and notches stay where they are asked."""
+
+    def warped(f):
+        return 2 * rate * np.tan(np.pi * f / rate)
 
     def shape(f):
-        s = 2 * rate * 1j * np.tan(np.pi * f / rate)
-        w = (
-            2
-            * np.pi
-            * np.array([bandwidth, rolloff or 8 * bandwidth, integrator or bandwidth / 10])
-        )
-        p = s / w[1]
-        value = (1 + w[2] / s) * (1 + 4 * s / w[0]) / (1 + s / (4 * w[0]))
+        s = 1j * warped(f)
+        w = 2 * np.pi * bandwidth
+        p = s / warped(rolloff or 8 * bandwidth)
+        slow = 2 * np.pi * (integrator or bandwidth / 10)
+        value = (1 + slow / s) * (1 + 4 * s / w) / (1 + s / (4 * w))
         value = value / (p**2 + np.sqrt(2) * p + 1)
         for f0 in notches:
-            q = s / (2 * np.pi * f0)
+            q = s / warped(f0)
             value = value * (q**2 + 2 * 0.05 * 0.3 * q + 1) / (q**2 + 2 * 0.3 * q + 1)
         return value
 
