@@ -163,8 +163,8 @@ def design_servo(
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
-    notches = ", ".join(f"{notch.freq:.4g}" for notch in law.notches)
-    notes = [f"notches at {notches} Hz"] if notches else []
+    centres = ", ".join(f"{notch.freq:.4g}" for notch in law.notches)
+    notes = [f"notches at {centres} Hz"] if centres else []
     if observer is None:
         notes.append("certified on the POI itself: observer= certifies the loop that will run")
     lines = ", ".join(

@@ -30,8 +30,6 @@ LEADS = (4.0, 16.0, 64.0)
 
 #: highest corner of a law, as a fraction of the rate
 _HIGHEST = 0.4
-#: shapes of laws that are kept: those that one bandwidth tries
-_SHAPES = 64
 
 
 #: lines on which an axis may lie, by the power of 1 / s of its response: a mass that is free (or
@@ -90,7 +88,7 @@ class Axis:
         return (Pid(0.0, i=1.0),) if self.line == "spring" else ()
 
 
-@lru_cache(maxsize=_SHAPES)
+@lru_cache
 def _shape(axis: Axis) -> Law:
     law = Law((*axis.action, LowPass(axis.rolloff), *axis.notches), rate=axis.rate)
     return law * float(1.0 / abs(law.at(np.array([axis.bandwidth]))[0]))
@@ -108,8 +106,8 @@ def gains_at(
 def lines_of(plant: StandardPlant, axes: DrivenAxes) -> list[tuple[str, ...]]:
     """Return the lines on which each axis may lie, the most likely first."""
     phases = np.angle(gains_at(plant, axes)) + np.pi * axes.freq * plant.dt * (1 + 2 * plant.delay)
-    # on the real axis, s = sigma
-    real = [gains_at(plant, axes, -1j * axes.freq * step) for step in (_BELOW, 1 / _STEP, 1, _STEP)]
+    steps = np.array([_BELOW, 1.0 / _STEP, 1.0, _STEP])[:, None]
+    real = [gains_at(plant, axes, np.asarray(one)) for one in -1j * steps * axes.freq]
     rest, below, there, above = np.abs(np.real(real))
     slopes = -np.log(above / below) / (2.0 * np.log(_STEP))
     return [
@@ -237,7 +235,7 @@ class ServoLoop:
     def swept(self) -> Callable[[ServoLaw], tuple[ComplexArray, FloatArray]]:
         """The function of a law that gives its responses and sigma_max(S_u) over the grid."""
 
-        @lru_cache(maxsize=_SHAPES)
+        @lru_cache
         def found(law: ServoLaw) -> tuple[ComplexArray, FloatArray]:
             at = law.at(self.freq)
             return at, self._sizes(law.driven.T, at)
