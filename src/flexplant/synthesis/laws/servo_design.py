@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ from ...lti.interconnection import connect, loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
-from ...plant.axes import driven_axes, elastic
+from ...plant.axes import DrivenAxes, driven_axes, elastic
 from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
@@ -268,13 +268,16 @@ _TRIALS, _SLOWEST = 80, 2e-4
 _ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
 #: corner of the integral action relative to the bandwidth, or with a wide lead to its zero
 _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
-#: the faster corners that are tried instead, and the factor by which they may raise |S| and lower
-#: the frequency up to which |S| of the references is below 1: a tenth, for errors that settle up to
-#: five times sooner
-_FASTER, _COST = (0.1, 0.05, 0.02), 1.1
+#: faster corners relative to the bandwidth. Up to that of the usual lead the fastest is taken that
+#: raises |S| and lowers the frequency up to which |S| of the references is below 1 by at most this
+#: factor: a tenth, for errors that settle up to five times sooner. Those above it are for axes on
+#: springs that the loop would follow too little otherwise
+_CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
+#: difference of the logarithms of an axis's gains from which one at a resonance is suspected
+_RESONANT = 0.2
 #: wide leads are tried where a mode lies above the bandwidth within this factor
 _NEAR = 4.0
 
@@ -316,7 +319,16 @@ class ServoTask:
                     f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
-        gains = np.abs(gains_at(self.plant, driven))
+        exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
+        best = self._law(driven, exact)
+        # next to a resonance the response says little of the axis: that on the real axis does
+        if np.abs(np.log(exact / smooth)).max() < _RESONANT or self._serves(best):
+            return best
+        other = self._law(driven, smooth)
+        return other if self._serves(other) else best
+
+    def _law(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
+        """Return the laws of axes whose plant has these gains at the bandwidths."""
 
         def of(lines: tuple[str, ...], lead: float = LEADS[0]) -> ServoLaw:
             each = zip(lines, driven.freq, gains, strict=True)
@@ -328,7 +340,7 @@ class ServoTask:
         if not able:
             return tried[0]
         lines = tuple(axis.line for axis in self._best(able).axes)
-        best = self.notched(of(lines))
+        best = self._settling(self.notched(of(lines)))
         modes, lowest = elastic(self.plant), float(driven.freq.min())
         if "mass" not in lines or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
             return best
@@ -338,35 +350,49 @@ class ServoTask:
                 break
             wide = self.notched(of(lines, lead))
             if self._best([best, wide]) is wide:
-                wide = self._settling_soon(wide)
+                wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
         return best
+
+    def _serves(self, law: ServoLaw) -> bool:
+        """Return whether a law holds 6 dB and follows its references."""
+        return self._holds(law, TARGET) and self._suppresses(law, followed=True)
 
     def _holds(self, law: ServoLaw, peak: float) -> bool:
         """Return whether the loop of a law is stable with |S| at u below a peak, on the grid."""
         return self.loop.peak(law)[0] <= peak and self.radius(law) < 1.0
 
-    def _suppresses(self, law: ServoLaw) -> bool:
-        """Return whether every axis suppresses errors well below its bandwidth."""
+    def _suppresses(self, law: ServoLaw, followed: bool = False) -> bool:
+        """Return whether every axis, or that with a reference, suppresses errors at a twentieth."""
         low = law.driven.freq / _WELL_BELOW
         plant = gains_at(self.plant, law.driven, low)
-        loops = np.diag(law.at(low)) * plant
-        return bool(np.all(np.abs(1.0 + loops) >= 1.0 / _SUPPRESSED))
+        far = np.abs(1.0 + np.diag(law.at(low)) * plant) >= 1.0 / _SUPPRESSED
+        free = [followed and name not in self.reading.references for name in self.channels]
+        return bool(np.all(far | free))
 
-    def _settling_soon(self, law: ServoLaw) -> ServoLaw:
-        """Return a law of wide leads with the fastest integral action that costs little margin."""
-        peak = self.loop.peak(law)[0]
-        if self.integrator is not None or peak > TARGET:
+    def _settling(self, law: ServoLaw) -> ServoLaw:
+        """Return a law with integral action as fast as suppresses errors and costs little |S|."""
+        if self.integrator is not None or not self._holds(law, TARGET):
             return law
-        for part in _FASTER:
-            axes = (replace(a, integrator=max(a.integrator, part * a.bandwidth)) for a in law.axes)
-            faster = law._replace(axes=tuple(axes))
-            if faster.axes == law.axes:
+
+        def faster(parts: Iterable[float]) -> Iterator[ServoLaw]:
+            for part in parts:
+                axes = (
+                    replace(a, integrator=max(a.integrator, part * a.bandwidth)) for a in law.axes
+                )
+                yield law._replace(axes=tuple(axes))
+
+        if not self._suppresses(law):
+            able = (one for one in faster(reversed(_CORNERS)) if self._suppresses(one))
+            return next((one for one in able if self._holds(one, TARGET)), law)
+        most, up_to = _COST * self.loop.peak(law)[0], None
+        for one in faster(part for part in _CORNERS if part <= _INTEGRATOR):
+            if one.axes == law.axes:
                 break
-            if not self._holds(faster, _COST * peak):
-                continue
-            if suppressed_up_to(self.closed(faster)) >= suppressed_up_to(self.closed(law)) / _COST:
-                return faster
+            if self._holds(one, most):
+                up_to = up_to or suppressed_up_to(self.closed(law))
+                if suppressed_up_to(self.closed(one)) >= up_to / _COST:
+                    return one
         return law
 
     def _best(self, laws: Sequence[ServoLaw]) -> ServoLaw:
@@ -375,7 +401,7 @@ class ServoTask:
             return laws[0]
         rising = sorted(laws, key=lambda law: self.loop.peak(law)[0])
         stable = (law for law in rising if self.radius(law) < 1.0)
-        return next(stable, min(rising, key=self.radius))
+        return next(stable, None) or min(rising, key=self.radius)
 
     def axis(self, line: str, bandwidth: float, gain: float, lead: float) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""
@@ -505,7 +531,7 @@ class ServoTask:
             size, at = self.loop.peak(law)
             if size < best[0] and self.radius(law) < 1.0:
                 best = size, at, bandwidth
-            if size > peak:
+            if size > peak or not self._suppresses(law, followed=True):
                 return False
             closed = self.closed(law)
             # the loop on the evaluation model, which costs most, only if the smaller loop is good
