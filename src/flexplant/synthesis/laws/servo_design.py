@@ -276,7 +276,7 @@ _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
-#: difference of the logarithms of an axis's gains from which one at a resonance is suspected
+#: distance of a mode from a bandwidth, in logarithms, within which it resonates there
 _RESONANT = 0.2
 #: wide leads are tried where a mode lies above the bandwidth within this factor
 _NEAR = 4.0
@@ -319,12 +319,12 @@ class ServoTask:
                     f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
-        exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
-        best = self._law(driven, exact)
-        # next to a resonance the response says little of the axis: that on the real axis does
-        if np.abs(np.log(exact / smooth)).max() < _RESONANT or self._serves(best):
+        best = self._law(driven, np.abs(gains_at(self.plant, driven)))
+        modes = elastic(self.plant)[:, None]
+        if not np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT) or self._serves(best):
             return best
-        other = self._law(driven, smooth)
+        # next to a resonance the response says little of the axis: that on the real axis does
+        other = self._law(driven, (2.0 * np.pi * driven.freq) ** -2.0)
         return other if self._serves(other) else best
 
     def _law(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
