@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -124,8 +123,8 @@ class SolvedController(NamedTuple):
     D: FloatArray
     gamma: float
     lower: float
-    #: numbers for the certificate, and sentences, on how it was found
-    certificate: Mapping[str, float] = MappingProxyType({})
+    #: figures for the certificate, and sentences, on how it was found
+    checks: tuple[Verified, ...] = ()
     notes: tuple[str, ...] = ()
 
 

@@ -122,7 +122,7 @@ class _LeastH2(Design):
             "H2 by two Riccati equations",
             gamma=certificate["H2 norm"],
             lower=None if found.notes else min(certificate["claim"], certificate["H2 norm"]),
-            certificate=certificate | found.certificate,
+            certificate=Certificate((*certificate.checks, *found.checks)),
             notes=found.notes,
         )
 
@@ -140,7 +140,7 @@ def _solve_regular(p: Prepared) -> SolvedController:
         estimate = solve_filter(p.A, p.C2, Q=p.B1 @ p.B1.T, R=p.D21 @ p.D21.T, S=p.B1 @ p.D21.T)
     except (SolverError, ModelError) as error:
         raise AssumptionError(f"no optimal estimate of the states from y: {error}") from error
-    residual = {"residual of the Riccati equations": max(control.residual, estimate.residual)}
+    residual = max(control.residual, estimate.residual)
     X, F, Y, L = control.P, -control.gain, estimate.P, -estimate.gain
     R, S = p.D12.T @ p.D12, p.D21 @ p.D21.T
     L0: FloatArray = np.zeros((len(F), L.shape[1]))
@@ -152,7 +152,8 @@ def _solve_regular(p: Prepared) -> SolvedController:
     square += np.sum(R * (F @ Y @ F.T - L0 @ S @ L0.T))
     cost = float(np.sqrt(max(square, 0.0)))
     A = p.A + p.B2 @ F + L @ p.C2 - p.B2 @ L0 @ p.C2
-    return SolvedController(A, p.B2 @ L0 - L, F - L0 @ p.C2, L0, cost, cost, residual)
+    checks = (Verified("residual of the Riccati equations", residual),)
+    return SolvedController(A, p.B2 @ L0 - L, F - L0 @ p.C2, L0, cost, cost, checks)
 
 
 #: why a loop that solves its Riccati equations is not stable in rounding

@@ -146,12 +146,14 @@ def reduce_controller(
         required(before, after, allowed, "Choose a higher order, leave order out, or raise loss.")
     else:
         found, error, after = _fewest_states(given, problem, before, allowed)
-    was = {f"{name} before": value for name, value in before.certificate.items()}
+    was = before.named("before")
     answer = Controller(
         found,
         f"reduced from {K.n_states} states, coprime factors weighted by the loop",
         gamma=None if np.isnan(after.gamma) else after.gamma,
-        certificate=after.certificate | was | {"weighted error": error},
+        certificate=Certificate(
+            (*after.certificate.checks, *was, Verified("weighted error", error))
+        ),
     )
     return with_left_out(answer, given)
 
@@ -247,6 +249,11 @@ class LoopFacts(NamedTuple):
     def why(self) -> str:
         """The least stable pole, in words."""
         return f"{stability_name(self.sampled)} {self.stability:.6g}, at {self.freq:.4g} Hz"
+
+    def named(self, when: str) -> tuple[Verified, ...]:
+        """Return the figures under names of when they hold, without limits."""
+        found = self.certificate.items()
+        return tuple(Verified(f"{what} {when}", figure) for what, figure in found)
 
     @property
     def certificate(self) -> Certificate:
@@ -364,11 +371,10 @@ def discretise_controller(
         before, after, positive(loss, "loss", zero=True),
         "Raise the rate, shorten the delay, lower the bandwidth, or design on the sampled plant.",
     )  # fmt: skip
-    continuous = {f"{name} continuous": v for name, v in before.certificate.items()}
     answer = Controller(
         found,
         f"discretised at {1.0 / given.dt:g} Hz by the bilinear map"
         + ("" if prewarp is None else f", exact at {prewarp:g} Hz"),
-        certificate=after.certificate | continuous,
+        certificate=Certificate((*after.certificate.checks, *before.named("continuous"))),
     )
     return with_left_out(answer, given)

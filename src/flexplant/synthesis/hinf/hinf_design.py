@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...certificates import Certificate, Verified
 from ...errors import CertificateError, ModelError, SolverError, counted, short
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
@@ -195,7 +196,7 @@ class HinfDesign(Design):
             f"H-infinity by {name}",
             gamma=gamma,
             lower=lower,
-            certificate=certificate | found.certificate,
+            certificate=Certificate((*certificate.checks, *found.checks)),
             reached=reached_norms(plant, loop, respond),
             notes=found.notes,
             tried={f"{name}()": gamma},
@@ -242,8 +243,9 @@ class TolerantDesign(Design):
         scales = {one.mode: one.D for one in channels}
         stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, self.uncertain)]
         share = tolerated(stated, with_mode_channels(plant, stated), K)
+        checks = *answer.certificate.checks, Verified(TOLERATED, share, "real mu over a grid")
         return answer.replace(
-            certificate=answer.certificate | {TOLERATED: share},
+            certificate=Certificate(checks),
             reached={},  # of the weights, without the channels of modes
             tried={"before the scales were evened out": first, "after": answer.gamma},
             notes=(

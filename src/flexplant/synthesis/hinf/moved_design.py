@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import FloatArray, number
-from ...certificates import Certificate
+from ...certificates import Certificate, Verified
 from ...errors import CertificateError, FlexplantError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
@@ -76,8 +76,8 @@ class PlantRange:
         self, norm_of: Callable[[AnyPlant], float], norms: Sequence[float]
     ) -> Certificate:
         """Return the norm at each position, the worst one, and the worst half way between two."""
-        found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
-        found["worst position"] = float(self.places[int(np.argmax(norms))])
+        found = [(f"norm at {x:.6g}", norm) for x, norm in zip(self.places, norms, strict=True)]
+        found.append(("worst position", float(self.places[int(np.argmax(norms))])))
         worst = (0.0, np.nan)
         for x, plant in self.between.items():
             try:
@@ -88,8 +88,9 @@ class PlantRange:
                     "positions."
                 ) from error
         if np.isfinite(worst[1]):
-            found |= {"norm between positions": worst[0], "worst position between": worst[1]}
-        return Certificate.of(found, route="the loop closed at each position")
+            found += [("norm between positions", worst[0]), ("worst position between", worst[1])]
+        route = "the loop closed at each position"
+        return Certificate(tuple(Verified(what, figure, route) for what, figure in found))
 
 
 def _mean(plants: Sequence[AnyPlant]) -> AnyPlant:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import ComplexArray
+from ...certificates import Verified
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.blocks_of_states import Matrices
 from ...lti.interconnection import lft
@@ -266,9 +267,9 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
         f"{lack.words}. Designed with noise of {one.level:.0e} on each sensor and as much "
         "effort of each actuator, relative to the plant's own channels, and verified without them"
     )
-    certificate = {ADDED: one.level}
+    checks = [Verified(ADDED, one.level)]
     if finer is not one:
-        certificate["gamma with a tenth of it"] = finer.gamma
+        checks.append(Verified("gamma with a tenth of it", finer.gamma))
         cost = 100 * (one.gamma / finer.gamma - 1.0) if finer.gamma else 0.0
         note += f"; a tenth of it gives a gamma {max(cost, 0.0):.2g} % smaller"
     notes = [note + "."]
@@ -279,4 +280,4 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
             f"{_remedy(lack.ranks)[:-1]} to get a slower one."
         )
     K = one.K
-    return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, certificate, tuple(notes))
+    return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, tuple(checks), tuple(notes))

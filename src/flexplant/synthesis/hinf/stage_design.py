@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import positive
+from ...certificates import Certificate, Verified
 from ...errors import InfeasibleError, ModelError, SolverError
 from ...loop import ClosedLoop, close_loop
 from ...loop.machine_figures import axis_bandwidths
@@ -203,11 +204,14 @@ class _StageTask(Design):
         """Return the controller with the checks of its weighted loop, and what was tried."""
         best: _StageTry = solution.found
         answer = verified(best.design, best.solution)
-        drawn = {f"least modulus margin of {_DRAWS} machines drawn": best.drawn}
+        checks = (
+            Verified(f"least modulus margin of {_DRAWS} machines drawn", best.drawn),
+            Verified("weights for Hz", best.bandwidth),
+        )
         return answer.replace(
             system=solution.K,
             method="H-infinity of a stage",
-            certificate=answer.certificate | drawn | {"weights for Hz": best.bandwidth},
+            certificate=Certificate((*answer.certificate.checks, *checks)),
             tried={f"{f:.4g} Hz": margin for f, margin in self.tried.items()},
             reached={},
         )

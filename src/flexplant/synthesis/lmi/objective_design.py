@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import below_half_rate, positive, whole
-from ...certificates import Certificate
+from ...certificates import Certificate, Verified
 from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted, short
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
@@ -153,8 +153,13 @@ class _ObjectiveDesign(Design):
             K,
             "several objectives by LMIs",
             gamma=reached[repr(self.minimize)],
-            certificate=Certificate.of({"LMI optimum": claim, "LMI bound": bound})
-            | Certificate.of(reached, route="the closed loop"),
+            certificate=Certificate(
+                (
+                    Verified("LMI optimum", claim, "Clarabel"),
+                    Verified("LMI bound", bound, "Clarabel"),
+                    *(Verified(what, one, "the closed loop") for what, one in reached.items()),
+                )
+            ),
             reached=reached,
         )
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import FloatArray, whole
-from ...certificates import Certificate
+from ...certificates import Certificate, Verified
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -168,7 +168,7 @@ class _DkIteration(Design):
     def prepare(self, plant: UncertainPlant[Any]) -> UncertainPlant[Any]:
         return plant  # each step prepares a problem of its own
 
-    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, dict[str, float]]:
+    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
         steps = _filter_steps(problem, self.w, self.z, self.method, self.most, self.order)
         return _best_step(steps, self.most + 1, _SETTLED, self.progress)
 
@@ -179,19 +179,19 @@ class _DkIteration(Design):
     def certify(self, solution: Solution) -> Controller:
         best, found = solution.found
         mu, freq = performance_bound(best.after, ABOVE)  # steps are compared less closely
-        figures = {"mu": mu, "at Hz": freq} | found
+        checks = Verified("mu", mu, STEPS_OF_MU), Verified("at Hz", freq, STEPS_OF_MU), *found
         return Controller(
             solution.K,
             f"D-K iteration, {counted(len(found), 'step')}",
             gamma=mu,
-            certificate=Certificate.of(figures, route=STEPS_OF_MU),
+            certificate=Certificate(checks),
         )
 
 
 class _ModeIteration(_DkIteration):
     """The same with one channel a mode and constant scales."""
 
-    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, dict[str, float]]:
+    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
         # step k solves the H-infinity problem of Deltas and weights divided by the mu of the step
         # before: at a fixed point the norm is 1 and mu what it was divided by
         weighted = _performance_plant(problem.plant, self.w, self.z)
@@ -208,26 +208,28 @@ class _ModeIteration(_DkIteration):
     def certify(self, solution: Solution) -> Controller:
         best, found = solution.found
         ratio = _corner_ratio(solution.plant, best, self.w, self.z)
-        figures = {"mu": best.mu} | found | {"largest gain of machines over mu": ratio}
+        route = "machines at corners, each closed exactly"
+        corners = Verified("largest gain of machines over mu", ratio, route)
+        checks = Verified("mu", best.mu, STEPS_OF_MU), *found, corners
         return Controller(
             solution.K,
             f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
             gamma=best.mu,
-            certificate=Certificate.of(figures, route=STEPS_OF_MU),
+            certificate=Certificate(checks),
         )
 
 
 def _best_step(
     steps: Iterator[_DkStep], most: int, settled: float, progress: bool | None
-) -> tuple[_DkStep, dict[str, float]]:
+) -> tuple[_DkStep, list[Verified]]:
     """Return the step of the smallest mu, and mu of each; they end where mu falls no further."""
     best: _DkStep | None = None
-    found: dict[str, float] = {}
+    found: list[Verified] = []
     with Progress(most, "steps of D-K", progress=progress, even=False) as bar:
         try:
             for step in steps:
                 bar.advance()
-                found[f"mu of step {step.number}"] = step.mu
+                found.append(Verified(f"mu of step {step.number}", step.mu, STEPS_OF_MU))
                 known = np.inf if best is None or step.number < 2 else best.mu
                 if best is None or step.mu < best.mu:
                     best = step

@@ -215,12 +215,18 @@ class _Structured(Design):
             )
         radius = NEGLIGIBLE * max(1.0, float(np.linalg.norm(found.x)))
         slope, decrease = decrease_left(search.pieces(found.x), radius)
-        certificate = each[worst] | {"slope": slope, "radius": radius}
-        certificate |= Certificate((Verified("decrease left", decrease, "a linear model", CLOSE),))
+        route = "a linear model"
+        found_left = (
+            Verified("slope", slope, route),
+            Verified("radius", radius),
+            Verified("decrease left", decrease, route, CLOSE),
+        )
+        certificate = Certificate((*each[worst].checks, *found_left))
         if self.moving is not None:
             certificate |= self.moving.certified(lambda plant: on(plant)["norm"], norms)
         elif len(plants) > 1:
-            certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
+            each_norm = (Verified(f"norm of plant {i}", one) for i, one in enumerate(norms, 1))
+            certificate |= Certificate(tuple(each_norm))
         notes = search.notes
         if decrease > CLOSE:
             notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
@@ -336,17 +342,18 @@ def _verified_loop(
     if _measure_word(objectives) == "H-infinity":
         return certified_norm(loop, claim)
     least = required_stability(loop)
-    found, norm = {}, 0.0
+    found, norm = [], 0.0
     for one in objectives:
         w, z = one.chosen(plant)
-        found[repr(one)] = one.measured(loop.select(z, w))
-        norm = max(norm, found[repr(one)] / (one.below or 1.0))
+        value = one.measured(loop.select(z, w))
+        found.append(Verified(repr(one), value, "measured on the closed loop"))
+        norm = max(norm, value / (one.below or 1.0))
     checks = (
         Verified("norm", norm, "objectives of the closed loop", claim * (1.0 + _AGREEMENT)),
         stability_check(least, loop.dt),
         Verified("claim", claim, "the search in scaled time"),
     )
-    return Certificate(checks) | Certificate.of(found, route="measured on the closed loop")
+    return Certificate((*checks, *found))
 
 
 class _End(NamedTuple):
