@@ -169,7 +169,7 @@ def _fewest_states(
         nonlocal best, lost
         try:
             found, error = problem.truncated(order)
-        except FlexplantError as failure:
+        except FlexplantError as failure:  # this order has no factors: another may
             lost = str(failure)
             return False
         after = loop_facts(plant, found)

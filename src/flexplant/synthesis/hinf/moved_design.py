@@ -238,7 +238,7 @@ def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
     for one in plants:
         try:
             worst = max(worst, _position_norm(one, K))
-        except FlexplantError:
+        except FlexplantError:  # a loop that is not stable has no norm
             return np.inf
         if worst > least:
             break

@@ -211,10 +211,10 @@ def made_regular(
     for level in LEVELS:
         try:
             found.append(_with_level(Regularised(problem, level, bool(lack.modes)), solve, norm))
-        except FlexplantError:
+        except FlexplantError:  # rounding hides what is smaller
             if not found:
                 raise
-            break  # rounding hides what is smaller
+            break
         if len(found) > 1 and found[-2].settles(found[-1]):
             break
     _require_positive_infimum(problem, found, lack)

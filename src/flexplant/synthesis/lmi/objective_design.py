@@ -229,7 +229,7 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
         for rate in rates:
             try:
                 values[rate] = problem.smallest(rate)
-            except (SolverError, InfeasibleError) as error:
+            except (SolverError, InfeasibleError) as error:  # no such rate: others have one
                 failures.append(error)
 
     specs = (problem.minimize, *problem.subject_to)
@@ -283,7 +283,7 @@ def require_reachable(plant: AnyPlant, subject_to: Sequence[Any]) -> None:
             plant.system.select([*z, *plant.y], [*w, *plant.u]), u=plant.u, y=plant.y
         )
         best = None
-        with attempted(f"the best controller for {spec!r} alone"):
+        with attempted(f"the best controller for {spec!r} alone"):  # else nothing is refuted
             best = design_h2(alone) if isinstance(spec, H2) else design_hinf(alone, Riccati())
         if best is None:
             continue

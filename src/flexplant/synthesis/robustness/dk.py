@@ -143,9 +143,8 @@ def design_mu(
     states = whole(order, "order", minimum=0)
     given = w, z, method, most, states, progress
     if uncertain.is_of_frequencies:
-        with attempted(
-            "mode by mode", _NoStepError
-        ):  # the general way shows what one channel does not
+        # the general way serves where no disturbance moves the modes, or one channel shows no mu
+        with attempted("mode by mode", _NoStepError):
             return designed(_ModeIteration(*given), uncertain, uncertain.plant)
     return designed(_DkIteration(*given), uncertain, uncertain.plant)
 
@@ -235,7 +234,7 @@ def _best_step(
                     best = step
                 if step.mu > (1.0 - settled) * known:
                     break
-        except FlexplantError:
+        except FlexplantError:  # D of a loop near its optimum may be too badly conditioned
             if best is None:
                 raise
     if best is None:
@@ -415,11 +414,7 @@ def _mode_steps(
     """Yield controllers, each for Deltas and weights over the mu of the step before."""
     level = 1.0
     for number in range(1, most + 1):
-        step = None
-        with attempted(f"step {number} of the D-K iteration"):
-            step = _dk_iteration(weighted, number, channels, level, method)
-        if step is None:
-            return
+        step = _dk_iteration(weighted, number, channels, level, method)
         yield step
         level, channels = min(step.mu, 2.0 * level), step.after
 

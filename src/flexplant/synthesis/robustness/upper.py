@@ -121,7 +121,7 @@ def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
     still = np.setdiff1d(np.arange(scalings.w), moving)
     try:
         root = la.cho_factor(fixed[np.ix_(still, still)])
-    except la.LinAlgError:
+    except la.LinAlgError:  # not positive definite
         return float("inf")
     across = fixed[np.ix_(still, moving)]
     schur = _half(across.conj().T @ la.cho_solve(root, across) - fixed[np.ix_(moving, moving)])
@@ -302,7 +302,7 @@ def _barrier(W: ComplexArray, scalings: Scalings, x: FloatArray, level: float) -
             total -= 2.0 * float(
                 np.sum(np.log(np.linalg.cholesky(matrix).diagonal(0, -2, -1).real))
             )
-        except np.linalg.LinAlgError:
+        except np.linalg.LinAlgError:  # not positive definite
             return float("inf")
     return total if np.isfinite(total) else float("inf")
 
