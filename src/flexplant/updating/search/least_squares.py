@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, TypeAlias
 
@@ -88,16 +87,7 @@ class TrustRegion(UpdateMethod):
     ) -> SearchEnd:
         """Return where the search from `start` ends; see `UpdateMethod.search`."""
         most = whole(most or self.steps, "most")  # the step counter raises it
-        bounded = objective.lower, objective.upper
-        # steps that avoid bounds cost 50 % more where no bound is active
-        if np.any(np.isfinite(bounded)):
-            free = np.full(start.size, np.inf)
-            with suppress(ModelError, np.linalg.LinAlgError):
-                found = self._fitted(objective, start, -free, free, most, tolerance)
-                inside = np.all(found.p >= objective.lower) and np.all(found.p <= objective.upper)
-                if found.converged and inside:
-                    return found
-        return self._fitted(objective, start, *bounded, most, tolerance)
+        return self._fitted(objective, start, objective.lower, objective.upper, most, tolerance)
 
     def _fitted(
         self,
