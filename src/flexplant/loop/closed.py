@@ -580,8 +580,7 @@ def close_loop(
         warn(
             f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, so "
             "that margin, bandwidth and norms do not exist. Check the sign (u = K y), lower the "
-            "bandwidth, or "
-            "notch the mode at that frequency."
+            "bandwidth, or notch the mode at that frequency."
         )
     elif loop.is_stable and found is not None and not found.is_stable:
         warn(

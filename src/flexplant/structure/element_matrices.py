@@ -45,6 +45,52 @@ def beam_mass(length: float) -> FloatArray:
     return _mirror_upper(half * h / 420)
 
 
+# The shear of an edge is constant and the slope of the section along it quadratic: between ends
+# that turn by t1, t2 and move by z1, z2 over a length L,
+#     shear = (1 - f) d,  slope = linear + 6 s (1 - s) f d,  d = (z2 - z1) / L - (t1 + t2) / 2,
+# with f = 1 / (1 + 12 B / (G L^2)), B the bending and G the shear stiffness, which makes an edge an
+# exact Timoshenko beam ([FriedmanKosmatka1993]_). In a plate both carry over linearly to the
+# opposite edge: the element of [Katili1993]_ on a rectangle. f = 1 is an edge that does not shear.
+
+#: number of points in each direction, which integrates products of two cubics exactly
+POINTS = 4
+
+
+def edge_share(softness: Any, length: float) -> Any:
+    """Return f of an edge whose bending stiffness is `softness` [m^2] of its shear stiffness."""
+    return 1.0 / (1.0 + 12.0 * np.asarray(softness) / length**2)
+
+
+def beam_parts(s: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Return the parts (2, p, 4) of deflection and slope of the section that f^0 and f^1 weigh."""
+    s, one = np.asarray(s, dtype=np.float64)[:, None], np.ones((np.size(s), 1))
+    excess = np.array([-1.0 / length, -0.5, 1.0 / length, -0.5])
+    bow = -0.5 * length * s * (1.0 - s) * np.array([0.0, -1.0, 0.0, 1.0])
+    z = np.hstack([1.0 - s, 0.0 * s, s, 0.0 * s]) + bow
+    slope = np.hstack([0.0 * s, 1.0 - s, 0.0 * s, s])
+    cubic = length * s * (1.0 - s) * (2.0 * s - 1.0)
+    return (np.stack([z, cubic * excess]), np.stack([slope * one, 6.0 * s * (1.0 - s) * excess]))
+
+
+def beam_terms(length: float) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+    """Return masses and rotary inertias (4, 4) by powers 0, 1, 2 of f, and what (1 - f) weighs.
+
+    A beam's stiffness is ``B (f K + (1 - f) K1)`` with K of a beam that does not shear.
+    """
+    points, weights = np.polynomial.legendre.leggauss(POINTS)
+    z, slope = beam_parts(0.5 * (points + 1.0), length)
+    area = 0.5 * length * weights[:, None]
+    turning = np.array([0.0, -1.0, 0.0, 1.0])
+    return _powers(z, area), _powers(slope, area), np.outer(turning, turning) / length
+
+
+def _powers(parts: FloatArray, area: FloatArray) -> list[FloatArray]:
+    """Return the integrals of a product of two parts, by the power of f that weighs them."""
+    first, second = parts
+    both = first.T @ (area * second)
+    return [first.T @ (area * first), both + both.T, second.T @ (area * second)]
+
+
 def plate_terms(s: Any, t: Any, dp: int, dq: int) -> FloatArray:
     """Return the d^dp/ds^dp d^dq/dt^dq derivatives (..., 12) of the terms s^p t^q."""
     return _monomials(_P, s, dp) * _monomials(_Q, t, dq)

@@ -14,8 +14,15 @@ from ..arrays import FloatArray, real_array
 from ..errors import LabelError, require_known
 from ..labels import Interpolation
 from ..tolerances import SAME
-from .element_matrices import Grid, brick_shape, brick_slopes, plate_coefficients, plate_terms
-from .thick_elements import beam_parts, edge_share
+from .element_matrices import (
+    Grid,
+    beam_parts,
+    brick_shape,
+    brick_slopes,
+    edge_share,
+    plate_coefficients,
+    plate_terms,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

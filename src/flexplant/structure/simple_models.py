@@ -17,8 +17,10 @@ from .element_matrices import (
     Grid,
     beam_mass,
     beam_stiffness,
+    beam_terms,
     brick_mass,
     brick_stiffness,
+    edge_share,
     plate_mass,
     plate_stiffness,
 )
@@ -26,7 +28,6 @@ from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisso
 from .model import FEModel
 from .shapes import BeamShape, BlockShape
 from .shapes import PlateShape as PlateShape
-from .thick_elements import beam_terms, edge_share
 
 
 def chain(

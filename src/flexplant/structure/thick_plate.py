@@ -4,16 +4,134 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..arrays import FloatArray, positive
-from .element_matrices import Grid
+from .element_matrices import PLATE_CORNERS, POINTS, Grid, edge_share
 from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of
 from .model import FEModel
 from .shapes import PlateShape
-from .thick_elements import edge_share, plate_parts, plate_terms
+
+
+class PlateParts(NamedTuple):
+    """Fields of an element at p points, in terms of its DOFs z, rx, ry at four corners.
+
+    The first axis of (3, p, 12) holds the parts that 1, f along x and f along y weigh.
+    """
+
+    z: FloatArray
+    #: slopes dz/dx and dz/dy of the section
+    slopes: tuple[FloatArray, FloatArray]
+    #: their derivatives along the same axis, and the twist, the sum of the other two
+    curvatures: tuple[FloatArray, FloatArray, FloatArray]
+    #: (p, 12): the shear along x and y, over 1 - f of that direction
+    shears: tuple[FloatArray, FloatArray]
+
+
+def plate_parts(s: Any, t: Any, a: float, b: float) -> PlateParts:
+    """Return the fields of an element a x b at points s, t (p,) between 0 and 1."""
+    place = [np.reshape(np.asarray(one, dtype=np.float64), (-1, 1)) for one in (s, t)]
+    # the weights (p, 2) of an edge along x are those of its two places in y
+    at_y, at_x = across = [np.hstack([1.0 - one, one]) for one in place[::-1]]
+    lengths, count = (a, b), len(place[0])
+    low_high = np.array([-1.0, 1.0])
+    corner = at_x[:, [0, 1, 0, 1]] * at_y[:, [0, 0, 1, 1]]
+    along = (
+        at_y[:, [0, 0, 1, 1]] * low_high[[0, 1, 0, 1]] / a,
+        at_x[:, [0, 1, 0, 1]] * low_high[[0, 0, 1, 1]] / b,
+    )
+
+    def spread(values: FloatArray, column: int, sign: float = 1.0) -> FloatArray:
+        found = np.zeros((count, 4, 3))
+        found[:, :, column] = sign * values
+        return found.reshape(count, 12)
+
+    z, twist = (np.zeros((3, count, 12)) for _ in range(2))
+    z[0] = spread(corner, 0)
+    slopes, bends, shears = [], [], []
+    for axis in range(2):
+        # the two edges along an axis, by their corners; the DOF of their slope and its sign
+        edges = [(i, i + 1 + axis) for i in np.flatnonzero(PLATE_CORNERS[:, axis] == 0).tolist()]
+        column, sign = 2 - axis, 2.0 * axis - 1.0
+        x, length, other, blend = place[axis], lengths[axis], 1 - axis, across[axis]
+        excess, turn = _edge_rows(edges, column, sign, length)
+        bubble = 6.0 * x * (1.0 - x)
+        z[0] -= length / 12.0 * bubble * (blend @ turn)
+        z[1 + axis] = length / 6.0 * bubble * (2.0 * x - 1.0) * (blend @ excess)
+        slope, bend = (np.zeros((3, count, 12)) for _ in range(2))
+        slope[0], slope[1 + axis] = spread(corner, column, sign), bubble * (blend @ excess)
+        bend[0] = spread(along[axis], column, sign)
+        bend[1 + axis] = 6.0 * (1.0 - 2.0 * x) / length * (blend @ excess)
+        twist[0] += spread(along[other], column, sign)
+        twist[1 + axis] = bubble * (low_high @ excess) / lengths[other]
+        slopes.append(slope)
+        bends.append(bend)
+        shears.append(blend @ excess)
+    return PlateParts(
+        z, (slopes[0], slopes[1]), (bends[0], bends[1], twist), (shears[0], shears[1])
+    )
+
+
+def _edge_rows(
+    edges: Sequence[tuple[int, int]], column: int, sign: float, length: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return (2, 12) each: chord less mean slope of two edges, and how far their ends turn."""
+    excess, turn = np.zeros((2, 4, 3)), np.zeros((2, 4, 3))
+    for k, (start, end) in enumerate(edges):
+        excess[k, [start, end], 0] = np.array([-1.0, 1.0]) / length
+        excess[k, [start, end], column] = -0.5 * sign
+        turn[k, [start, end], column] = np.array([-sign, sign])
+    return excess.reshape(2, 12), turn.reshape(2, 12)
+
+
+#: element matrices and their weights: numbers or fields (ny, nx)
+Terms: TypeAlias = list[tuple[FloatArray, Any]]
+
+
+def plate_terms(
+    a: float, b: float, softness: Any, *, mass: Any, rotary: Any, bending: Any, nu: Any
+) -> tuple[Terms, Terms]:
+    """Return the terms of M and K of plate elements a x b.
+
+    `softness` is the bending stiffness over the shear stiffness, `mass` that per area, `rotary` the
+    inertia ``rho h^3 / 12`` and `bending` the stiffness ``E h^3 / 12 (1 - nu^2)``.
+    """
+    line, weights = np.polynomial.legendre.leggauss(POINTS)
+    s, t = (one.ravel() for one in np.meshgrid(0.5 * (line + 1.0), 0.5 * (line + 1.0)))
+    area = 0.25 * a * b * np.outer(weights, weights).reshape(-1, 1)
+    parts = plate_parts(s, t, a, b)
+    xx, yy, xy = parts.curvatures
+    f = (1.0, edge_share(softness, a), edge_share(softness, b))
+    M: Terms = []
+    K: Terms = []
+    for i, j in combinations_with_replacement(range(3), 2):
+
+        def of(one: FloatArray, other: FloatArray, i: int = i, j: int = j) -> FloatArray:
+            both = one[i].T @ (area * other[j]) + (one[j].T @ (area * other[i]) if i != j else 0.0)
+            return np.asarray(0.5 * (both + both.T))
+
+        weight = f[i] * f[j]
+        M.append((of(parts.z, parts.z), weight * mass))
+        along_x, along_y = parts.slopes
+        M.append((of(along_x, along_x) + of(along_y, along_y), weight * rotary))
+        K.append((of(xx, xx) + of(yy, yy) + 0.5 * of(xy, xy), weight * bending))
+        K.append((2.0 * of(xx, yy) - 0.5 * of(xy, xy), weight * bending * nu))
+    for one, share, length in zip(parts.shears, f[1:], (a, b), strict=True):
+        # the shear stiffness times (1 - f)^2, also where it is infinite
+        scaled = 12.0 / length**2 * share
+        own = one.T @ (area * one)
+        K.append((0.5 * (own + own.T), bending * softness * scaled**2))
+    return _collected(M), _collected(K)
+
+
+def _collected(terms: Terms) -> Terms:
+    """Return the sum of the terms where all weights are numbers."""
+    if any(np.ndim(weight) for _, weight in terms):
+        return terms
+    return [(np.asarray(sum(weight * matrix for matrix, weight in terms)), 1.0)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
