@@ -11,8 +11,20 @@ from itertools import product
 import pytest
 
 from flexplant.errors import FlexplantError
-from flexplant.synthesis import Lmi
-from test_synthesis.test_textbook_plants import KINDS, judged, least_h2, shaped_loop
+from flexplant.synthesis import Lmi, design_hinf
+from flexplant.synthesis.hinf.lower_bound import relaxed_bound
+from flexplant.synthesis.preparation import prepared
+from test_synthesis.test_riccati_synthesis import compleib, problems
+from test_synthesis.test_textbook_plants import (
+    KINDS,
+    himat,
+    judged,
+    least_h2,
+    oracle,
+    posed,
+    problem,
+    shaped_loop,
+)
 
 SEEDS = range(*map(int, os.environ.get("TEXTBOOK_SEEDS", "0 8").split()))
 
@@ -63,3 +75,26 @@ def test_the_least_h2_norms(capsys):
     with capsys.disabled():
         print(f"\ndesign_h2: {found[True]} of {sum(found.values())} right")
     assert not found[False]
+
+
+@pytest.mark.benchmark
+def test_lower_bounds(capsys):
+    """None is above the optimum by more than 0.3 %: the relaxed problem's, and those of designs.
+
+    Of the collected plants the optimum is the best known one, of the others SLICOT's.
+    """
+    given = {name: (compleib(name), best) for name, best in problems().items()}
+    for p in (himat(), *(problem(kind, seed) for kind, seed in product(KINDS, SEEDS[:2]))):
+        P = posed(p)
+        given[f"{p.kind} {len(given)}"] = (P.system, P.u, P.y), oracle.smallest_norm(p)
+    relaxed, lower = {}, {}
+    for name, ((P, u, y), best) in given.items():
+        ready = prepared(P, u, y)
+        relaxed[name] = max(relaxed_bound(ready, k * best, 0.0) for k in (1.02, 1.05, 1.5)) / best
+        found = design_hinf(P, u=u, y=y, progress=False)
+        lower[name] = found.lower / best
+    with capsys.disabled():
+        for kind, bounds in (("relaxed problem", relaxed), ("design_hinf", lower)):
+            most = max(bounds, key=bounds.get)
+            print(f"\n{kind}: largest bound over the optimum {bounds[most]:.5f} ({most})")
+    assert max(*relaxed.values(), *lower.values()) <= 1.003
