@@ -401,8 +401,9 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
 
 def _lengths(columns: FloatArray, weight: FloatArray | None = None) -> FloatArray:
     """Return the lengths of columns whose squared entries have weights."""
-    one = np.ones(len(columns)) if weight is None else weight
-    return np.asarray(np.sqrt(np.einsum("i,ij,ij->j", one, columns, columns)))
+    if weight is None:
+        return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
+    return np.asarray(np.sqrt(weight @ columns**2))
 
 
 def rigid_residual(model: FEModel) -> float:
