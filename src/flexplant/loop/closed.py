@@ -430,14 +430,13 @@ class ClosedLoop(Value):
         CertificateError
             When two Lyapunov equations give different variances.
         """
-        row, noises = self._noises(channel)
-        variances, _ = source_variances(self.monitored, row, noises)
+        variances, _ = source_variances(self.monitored, *self._noises(channel))
         return float(np.sqrt(variances.sum()))
 
     def drawn_rms(self, channel: str) -> float:
         """Return the same by one route: for a machine that is drawn around a verified loop."""
-        row, noises = self._noises(channel)
-        return float(np.sqrt(unverified_variances(self.monitored, row, noises).sum()))
+        variances = unverified_variances(self.monitored, *self._noises(channel))
+        return float(np.sqrt(variances.sum()))
 
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a signal under all white noises.

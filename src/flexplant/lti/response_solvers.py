@@ -32,12 +32,12 @@ def responder(g: StateSpace) -> Responder:
     """Return the function of frequency [Hz] that gives the responses, prepared once and kept."""
     known = g.__dict__.get(_KEPT)
     if known is None:
-        part = Part(g.A, g.B, g.C, g.dt, g.blocks)
+        part = Subsystem(g.A, g.B, g.C, g.dt, g.blocks)
         known = g.__dict__[_KEPT] = _responder(part, g.D)
     return known
 
 
-def _responder(g: Part, D: FloatArray) -> Responder:
+def _responder(g: Subsystem, D: FloatArray) -> Responder:
     n = len(g.A)
     if not n or not D.size:
         return lambda freq: np.repeat(D[:, :, None], freq.size, axis=2).astype(np.complex128)
@@ -74,7 +74,7 @@ def remembered(find: Responder) -> Responder:
     return found
 
 
-def points(g: StateSpace | Part, freq: FloatArray) -> ComplexArray:
+def points(g: StateSpace | Subsystem, freq: FloatArray) -> ComplexArray:
     """Return the points s, or z, of frequencies [Hz]."""
     omega = 2 * np.pi * freq
     return np.asarray(np.exp(1j * omega * g.dt) if g.dt else 1j * omega)
@@ -103,7 +103,7 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
     return np.asarray(logs[np.isfinite(logs)] / g.dt)
 
 
-def _solver(g: Part) -> tuple[Solver, int, int]:
+def _solver(g: Subsystem) -> tuple[Solver, int, int]:
     """Return a solver, its number of frequencies together times states, and least parts of a grid.
 
     The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
@@ -120,7 +120,7 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     return _among_others(g, first, end, blocks), CACHED // (m + 2), PARTS
 
 
-def _modal(g: Part) -> Solver:
+def _modal(g: Subsystem) -> Solver:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
     # blocks m I + N with N^2 = q I (Cayley-Hamilton), m half the trace:
     # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`: no cancellation near s = m,
@@ -177,7 +177,7 @@ def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     return slice(None) if some.all() else some
 
 
-def _among_others(g: Part, first: int, end: int, blocks: Sequence[int]) -> Solver:
+def _among_others(g: Subsystem, first: int, end: int, blocks: Sequence[int]) -> Solver:
     """Modes, the states from `first` to `end`, between others that see them and that drive them."""
     # with A = [[A_h, A_hm, A_ht], [0, A_m, A_mt], [0, 0, A_t]], head (filters of sensors, weights
     # of z) and tail (those of amplifiers, delay lines) are solved for all their states, and the
@@ -188,9 +188,9 @@ def _among_others(g: Part, first: int, end: int, blocks: Sequence[int]) -> Solve
     inputs = np.hstack([g.B[own], g.A[own, t]])
     used = np.flatnonzero(inputs.any(axis=0))
     outputs = np.vstack([g.C[:, own], g.A[h, own]])
-    modes = _modal(Part(g.A[own, own], inputs[:, used], outputs, g.dt, blocks))
-    head, *_ = dense_solver(Part(g.A[h, h], np.eye(first), g.C[:, h], g.dt))
-    tail, *_ = dense_solver(Part(g.A[t, t], g.B[t], np.eye(n - end), g.dt))
+    modes = _modal(Subsystem(g.A[own, own], inputs[:, used], outputs, g.dt, blocks))
+    head, *_ = dense_solver(Subsystem(g.A[h, h], np.eye(first), g.C[:, h], g.dt))
+    tail, *_ = dense_solver(Subsystem(g.A[t, t], g.B[t], np.eye(n - end), g.dt))
     beside = np.block([[np.zeros((p, m)), g.C[:, t]], [g.B[h], g.A[h, t]]])
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
@@ -226,7 +226,7 @@ _Channels: TypeAlias = list[tuple[IntArray, IntArray]]
 _Gains: TypeAlias = Callable[[ComplexArray], list[ComplexArray]]
 
 
-class Part(NamedTuple):
+class Subsystem(NamedTuple):
     """A, B, C, sampling time and blocks of a part of a system."""
 
     A: FloatArray
@@ -236,7 +236,7 @@ class Part(NamedTuple):
     blocks: Sequence[int] | None = None
 
 
-def dense_solver(g: Part) -> tuple[Solver, int, int]:
+def dense_solver(g: Subsystem) -> tuple[Solver, int, int]:
     """Return what solves for any A, how many frequencies at a time, times states, and least parts.
 
     Parts that share no state, such as the axes of a servo, each with its own channels; those of one

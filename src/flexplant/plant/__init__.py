@@ -115,7 +115,7 @@ from .remade import MachineParts as MachineParts
 from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
-from .slow_zeros import SlowZeros as SlowZeros
+from .inverse_zeros import SlowZeros as SlowZeros
 from .standard import AnyPlant as AnyPlant
 from .standard import StandardPlant as StandardPlant
 from .standard import assemble_plant as assemble_plant

@@ -54,10 +54,12 @@ def design_hinf(
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
-    Weights define the required norms: those of `stage_weights` of a stage, or those of S, KS and T
-    of `mixed_sensitivity`. If `gamma` is below 1, all their requirements are satisfied. The
-    controller is verified with its closed loop in the original channels: stability, and the norm by
-    two methods. How it works: `algorithms`.
+    Weights define the required norms. For a stage they follow from a bandwidth:
+    ``weights = fx.stage_weights(plant, 60.0)``, then
+    ``K = fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``; if `K.gamma` is below 1, all
+    their requirements are satisfied. `mixed_sensitivity` builds a plant from weights of S, KS and
+    T. The controller is verified with its closed loop in the original channels: stability, and the
+    norm by two methods; ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
 
     Parameters
     ----------
