@@ -95,6 +95,7 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
+from .inverse_zeros import SlowZeros as SlowZeros
 from .machine_plants import FigureInterval as FigureInterval
 from .machine_plants import PlantMachines as PlantMachines
 from .moving import PortPath as PortPath
@@ -115,7 +116,6 @@ from .remade import MachineParts as MachineParts
 from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
-from .inverse_zeros import SlowZeros as SlowZeros
 from .standard import AnyPlant as AnyPlant
 from .standard import StandardPlant as StandardPlant
 from .standard import assemble_plant as assemble_plant

@@ -18,9 +18,9 @@ from ..loop.machine_figures import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency
+from ..plant.inverse_zeros import SlowZeros, slow_zeros
 from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
-from ..plant.inverse_zeros import SlowZeros, slow_zeros
 from ..store import Value
 from ..tolerances import SAME
 from ..words import instance, name_list
