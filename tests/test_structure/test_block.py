@@ -160,5 +160,31 @@ def test_pieces_that_touch_at_an_edge_only_are_refused():
 def test_reprs():
     assert (
         repr(make_block().dofs.interpolation)
-        == "BlockShape(size=[0.4, 0.3, 0.1], elements=[4, 3, 1])"
+        == "BlockShape(size=[0.4, 0.3, 0.1], elements=[4, 3, 1], poisson_ratio=0.33)"
     )
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_bent_block_is_known_between_its_nodes(axis):
+    """Pure bending with its curvature across: exact displacements and rotations at any point."""
+    block, nu, size = make_block(), 0.33, np.array([0.4, 0.3, 0.1])
+
+    def bent(points):
+        along, across, z = points[..., axis], points[..., 1 - axis], points[..., 2]
+        found = np.zeros(points.shape)
+        found[..., axis], found[..., 1 - axis] = along * z, -nu * across * z
+        found[..., 2] = -0.5 * (along**2 + nu * (z**2 - across**2))
+        return found
+
+    own = np.array(block.dofs.xyz), [("x", "y", "z").index(d) for d in block.dofs.directions]
+    u = np.take_along_axis(bent(own[0]), np.array(own[1])[:, None], axis=1)[:, 0]
+    for point in np.random.default_rng(4).random((6, 3)) * size:
+        step = 1e-4
+        slopes = [
+            (bent(point + step * e) - bent(point - step * e)) / (2 * step) for e in np.eye(3)
+        ]
+        G = np.array(slopes)  # G[i, j]: slope of j along i
+        curl = [G[1, 2] - G[2, 1], G[2, 0] - G[0, 2], G[0, 1] - G[1, 0]]
+        wanted = [*bent(point), *(0.5 * np.array(curl))]
+        found = [block.dofs.row(tuple(point), d) @ u for d in ("x", "y", "z", "rx", "ry", "rz")]
+        np.testing.assert_allclose(found, wanted, atol=1e-10)

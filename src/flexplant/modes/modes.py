@@ -128,11 +128,16 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
     return MeshError(found + 1, f, limit, float(ratio), partners)
 
 
+def sampled_moves(dofs: DofSet) -> IntArray:
+    """Return positions of a random sample of the translations, which favours no direction."""
+    moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
+    return np.asarray(np.random.default_rng(0).permutation(moves)[:PLACES])
+
+
 def _at_common_places(coarse: Any, finer: Any) -> tuple[FloatArray, FloatArray]:
     """Return the shapes (p, k) of both at DOFs of the coarse mesh, along x, y and z."""
     dofs = coarse.dofs
-    moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
-    chosen = np.array(moves)[:: max(len(moves) // PLACES, 1)]
+    chosen = sampled_moves(dofs)
     rows = np.array([finer.dofs.row(dofs.xyz[i], dofs.directions[i]) for i in chosen])
     return np.real(coarse.phi[chosen]), rows @ np.real(finer.phi)
 

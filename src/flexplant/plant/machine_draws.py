@@ -14,10 +14,11 @@ from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
 from ..labels import Place
 from ..modes.matching import assigned
-from ..modes.modes import PLACES
+from ..modes.modes import sampled_moves
 from ..seeds import REFUSED
 from ..sparse.symmetric import dense
-from ..tolerances import TINY, TYPED
+from ..structure.rigid import rigid_motions
+from ..tolerances import SAME, TINY, TYPED
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.trend import MIXED
@@ -159,19 +160,39 @@ class MachineFamily:
 
     @cached_property
     def _together(self) -> FloatArray:
-        """Factors (b, b) of the scatter of stiffness between modes below and in the measured band.
+        """Factors (b, b) of the scatter of stiffness between modes that strain other springs.
 
-        A mode below the lowest measured one, as of a body on isolators, strains other springs than
-        the measured modes. Scatter then changes the coupling of a lower mode i and a higher mode j
-        by a fraction of omega_i^2, the stiffness of the lower mode, and not of omega_i omega_j.
+        A mode of a body on isolators strains its isolators, and an elastic mode strains the body.
+        With u the fraction of a mode's strain energy in bodies, independent scatter of bodies and
+        isolators couples two modes by ``sqrt(u_i u_j + (1 - u_i) (1 - u_j))``. A higher mode j also
+        moves the isolators: this couples it to a lower mode i by at least omega_i / omega_j.
         """
         r, omega = self.whole.n_rigid, self.omega
-        lowest = float(np.min(omega[self.measured]))
-        lower = np.minimum.outer(omega, omega)
-        higher = np.maximum.outer(omega, omega)
-        apart = (lower < lowest) & (lowest <= higher)
-        apart[:r], apart[:, :r] = False, False
-        return np.divide(lower, higher, out=np.ones_like(lower), where=apart)
+        body = self._strained()
+        factors = np.sqrt(np.outer(body, body) + np.outer(1.0 - body, 1.0 - body))
+        lower, higher = np.minimum.outer(omega, omega), np.maximum.outer(omega, omega)
+        least = np.divide(lower, higher, out=np.ones_like(lower), where=higher > 0.0)
+        factors = np.maximum(factors, least)
+        factors[:r], factors[:, :r] = 1.0, 1.0
+        return np.asarray(factors)
+
+    def _strained(self) -> FloatArray:
+        """Return the fraction (b,) of each mode's strain energy in bodies, not in isolators.
+
+        It is the strain energy that is left without rigid-body motions, and zero below the measured
+        band, whose modes are those of isolators.
+        """
+        b, stiffness = self.omega.size, self.omega**2
+        dofs = self.whole.model.dofs
+        moves = sampled_moves(dofs)
+        rigid, *_ = la.lstsq(self.over[moves], rigid_motions(dofs)[moves])
+        size = np.linalg.norm(rigid, axis=0)
+        Q = la.orth(rigid / np.where(size > 0.0, size, 1.0), rcond=SAME)
+        rest = np.eye(b) - Q @ Q.T
+        left = np.sum(rest * (stiffness[:, None] * rest), axis=0)
+        above = self.omega >= np.min(self.omega[self.measured])
+        found = np.divide(left, stiffness, out=np.zeros(b), where=above)
+        return np.asarray(np.minimum(found, 1.0))
 
     @cached_property
     def _seen(self) -> FloatArray:
@@ -221,8 +242,8 @@ class MachineFamily:
     def _carried(self, part: Any, is_stiffness: bool) -> FloatArray:
         """Return a matrix of the reduced model in the evaluation model's modes.
 
-        Exactly where they are combinations of the reduced model's modes; above, the mean relative
-        effect on those.
+        Exactly where they are combinations of the reduced model's modes; above, the median relative
+        effect on those: springs move a few modes much, and the others hardly.
         """
         model = self.machines.fit.model
         K, M = dense(model.K), dense(model.M)
@@ -233,8 +254,7 @@ class MachineFamily:
         dofs, shapes = model.dofs, phi
         if hasattr(model, "T"):
             dofs, shapes = model.full_dofs, model.T @ phi
-        moves = [i for i, d in enumerate(dofs.directions) if d in ("x", "y", "z")]
-        moves = moves[:: max(len(moves) // PLACES, 1)]
+        moves = sampled_moves(dofs)
         places = [(tuple(dofs.xyz[i].tolist()), dofs.directions[i]) for i in moves]
         seen = np.array([self.whole.row(at, d) for at, d in places]) @ self.over
         among, *_ = la.lstsq(shapes[moves], seen)
@@ -245,8 +265,8 @@ class MachineFamily:
         found = np.asarray(among.T @ own @ among)
         n_rigid = self.whole.n_rigid
         size = values[n_rigid:] if is_stiffness else 1.0
-        mean = float(np.mean(np.diag(own)[n_rigid:] / size))
-        rest = np.where(known, 0.0, mean * (self.omega**2 if is_stiffness else 1.0))
+        usual = float(np.median(np.diag(own)[n_rigid:] / size))
+        rest = np.where(known, 0.0, usual * (self.omega**2 if is_stiffness else 1.0))
         return np.asarray(found + np.diag(rest))
 
     def machine(self, rng: np.random.Generator) -> DrawnModes:

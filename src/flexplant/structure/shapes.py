@@ -17,6 +17,7 @@ from ..tolerances import SAME
 from .element_matrices import (
     Grid,
     beam_parts,
+    brick_bending,
     brick_shape,
     brick_slopes,
     edge_share,
@@ -231,6 +232,8 @@ class BlockShape(GridShape):
         Number of elements in x, y and z.
     present : (nz, ny, nx) array of bool, optional
         Which elements exist; None: all.
+    poisson_ratio : float
+        Poisson's ratio, by which a bent element curves across.
 
     Examples
     --------
@@ -243,6 +246,7 @@ class BlockShape(GridShape):
     size: tuple[float, float, float]
     elements: tuple[int, int, int]
     present: Any = None
+    poisson_ratio: float = 0.0
 
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return self.elements, self.present, 3
@@ -250,8 +254,9 @@ class BlockShape(GridShape):
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all DOFs in the motion of the material at a point.
 
-        Rotations rx, ry, rz are half the curl of the displacements; they step between elements, and
-        the element on the side of larger coordinates is taken.
+        The bending modes inside an element follow its corners. Rotations rx, ry, rz are half the
+        curl of the displacements; they step a little between elements, and the element on the side
+        of larger coordinates is taken.
         """
         require_known("motion", [direction], _BLOCK_MOTIONS, "a solid")
         point = real_array(xyz, "xyz", (3,))
@@ -266,7 +271,7 @@ class BlockShape(GridShape):
             raise off("outside")
         element, inside, sizes = self._located(point, self.size, lambda: off("in a hole of"))
         kind = _BLOCK_MOTIONS.index(direction)
-        weights = np.zeros((8, 3))
+        weights = np.zeros((11, 3))
         if kind < 3:
             weights[:, kind] = brick_shape(inside)
         else:
@@ -274,7 +279,13 @@ class BlockShape(GridShape):
             after, before = (kind - 2) % 3, (kind - 1) % 3
             weights[:, before] = 0.5 * slopes[:, after]
             weights[:, after] = -0.5 * slopes[:, before]
-        return self._row(element, weights.ravel())
+        return self._row(element, weights[:8].ravel() + weights[8:].ravel() @ self._bending)
+
+    @cached_property
+    def _bending(self) -> FloatArray:
+        """Bending modes (9, 24) inside an element that follow its corners."""
+        sizes = [n / k for n, k in zip(self.size, self.elements, strict=True)]
+        return brick_bending(sizes[0], sizes[1], sizes[2], self.poisson_ratio)
 
 
 _BLOCK_MOTIONS = ("x", "y", "z", "rx", "ry", "rz")

@@ -330,7 +330,7 @@ def solid_block(
     Returns
     -------
     FEModel
-        Sparse, without D, its DofSet interpolating with the trilinear shape functions.
+        Sparse, without D, its DofSet interpolating with the shape functions of its elements.
 
     Raises
     ------
@@ -352,7 +352,7 @@ def solid_block(
     grid = Grid(counts, 3, there)
     a, b, c = (n / k for n, k in zip(lengths, counts, strict=True))
     shape = BlockShape(
-        (lengths[0], lengths[1], lengths[2]), (counts[0], counts[1], counts[2]), present
+        (lengths[0], lengths[1], lengths[2]), (counts[0], counts[1], counts[2]), present, nu
     )
     return FEModel._proven(
         M=grid.matrix([(brick_mass(a, b, c), rho)]),

@@ -14,9 +14,11 @@ from ..arrays import FloatArray
 from ..errors import ModelError
 from ..identification import MeasuredModes
 from ..store import Value
-from ..tolerances import CHANCE, INTERVAL, ROUNDING, TINY
+from ..tolerances import INTERVAL, ROUNDING, TINY
 from .sensitivities import eigenvalue_sensitivities
 
+#: probability that chance alone rejects a slope or a mode: three standard deviations
+LEVEL = 0.003
 #: gap of two modes, in deviations of a frequency, below which scatter mixes their shapes by more
 #: than a tenth: sqrt(2) over the gap
 MIXED = 14.0
@@ -121,7 +123,7 @@ class Trend(Value):
     @property
     def is_significant(self) -> bool:
         """Whether the slope is significant (probability by chance below 0.3 %)."""
-        return self.p_value < CHANCE
+        return self.p_value < LEVEL
 
     @property
     def unshaped_pairs(self) -> tuple[tuple[int, int], ...]:
@@ -169,7 +171,7 @@ class Trend(Value):
         others = np.maximum(left @ left - left * alone, TINY) / (dof - 1)
         chance = 2.0 * m * stdtr(dof - 1, -np.abs(alone) * np.sqrt(free / others))
         worst = int(np.argmin(chance))
-        return (self.modes[worst], float(alone[worst])) if chance[worst] < CHANCE else None
+        return (self.modes[worst], float(alone[worst])) if chance[worst] < LEVEL else None
 
     @property
     def missing(self) -> str:
