@@ -5,6 +5,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
+from flexplant.modes.modes import sampled_moves
 from flexplant.testbeds.ritz import plate_modes, ritz_plate
 from oracles_mindlin import mindlin_frequencies
 
@@ -88,3 +89,12 @@ def test_frequencies_of_two_meshes_point_to_the_converged_plate(seed):
     assert np.all(np.diff(found.freq) >= 0)
     with pytest.raises(ModelError, match="Halve"):
         solved(18).extrapolated(fine)
+
+
+def test_shapes_of_a_solid_are_compared_along_all_directions():
+    """Every sixth translation of this block is along x, so that even steps would miss z."""
+    dofs = fx.solid_block(size=(0.6, 0.4, 0.03), elements=(16, 11, 2), density=2700.0,
+                          youngs_modulus=70e9, poisson_ratio=0.33).dofs  # fmt: skip
+    chosen = [dofs.directions[i] for i in sampled_moves(dofs)]
+    assert len(chosen) == 300
+    assert min(chosen.count(direction) for direction in "xyz") > 70
