@@ -180,9 +180,7 @@ def test_a_bent_block_is_known_between_its_nodes(axis):
     u = np.take_along_axis(bent(own[0]), np.array(own[1])[:, None], axis=1)[:, 0]
     for point in np.random.default_rng(4).random((6, 3)) * size:
         step = 1e-4
-        slopes = [
-            (bent(point + step * e) - bent(point - step * e)) / (2 * step) for e in np.eye(3)
-        ]
+        slopes = [(bent(point + step * e) - bent(point - step * e)) / (2 * step) for e in np.eye(3)]
         G = np.array(slopes)  # G[i, j]: slope of j along i
         curl = [G[1, 2] - G[2, 1], G[2, 0] - G[0, 2], G[0, 1] - G[1, 0]]
         wanted = [*bent(point), *(0.5 * np.array(curl))]
