@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import FloatArray, number
 from ...certificates import Certificate, Verified
-from ...errors import CertificateError, FlexplantError, ModelError, SolverError, attempted, counted
+from ...errors import CertificateError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
@@ -23,7 +23,7 @@ from ...plant.uncertainty.channels import with_channels
 from ...tolerances import SAME
 from ...words import mapping
 from ..controller import Controller
-from ..pipeline import Design, solved, verified
+from ..pipeline import Design, Solution, solved, verified
 from ..preparation import prepared
 from .lower_bound import pointwise_bound
 
@@ -101,76 +101,80 @@ def _mean(plants: Sequence[AnyPlant]) -> AnyPlant:
     return StandardPlant.from_statespace(first.system.replace(**mixed, blocks=None), **sides)
 
 
-def over_positions(moving: PlantRange, design: Design, progress: bool | None = None) -> Controller:
-    """Return the controller whose worst norm over the positions is least of those tried."""
-    # tried are the mean plant, then the mean plant with a channel for each row and column that
-    # moves, `y = (C + delta dC) x` and `x+ = ... + (B + delta dB) u`, whose scale is searched
-    search, motion = _Search(moving, design), _MotionChannels(moving)
-    with Progress(2 + 2 * _STEPS, _DESIGNS, progress=progress, even=False):
-        first = search.tried_with("the mean plant", motion.mean)
-        if motion.scales.size and first is not None:
-            motion.even(first.system)
-            search.over_scales(motion)
-        return search.answer()
+@dataclass(frozen=True)
+class OverPositions(Design):
+    """The controller whose worst norm over the positions is least of those tried.
 
+    These are for the mean plant, then for the mean plant with a channel for each row and column
+    that moves, ``y = (C + delta dC) x`` and ``x+ = ... + (B + delta dB) u``, of several scales.
+    """
 
-class _Search:
-    """Designs for one plant or another, each judged by its loops at all positions."""
+    design: Design
+    progress: bool | None = None
 
-    def __init__(self, moving: PlantRange, design: Design) -> None:
-        self.moving, self.design = moving, design
-        self.tried: dict[str, float] = {}
-        self.best: Controller | None = None
+    def prepare(self, plant: PlantRange) -> PlantRange:
+        """Return the plants: each design prepares a problem of its own."""
+        return plant
 
-    def tried_with(self, name: str, plant: AnyPlant) -> Controller | None:
-        """Design for a plant, judge, and keep what is best."""
-        found, worst, least = None, np.inf, min(self.tried.values(), default=np.inf)
-        with attempted(f"the design for {name}"):  # another scale may serve
-            found = verified(self.design, solved(self.design, plant))
-            worst = _worst_norm(self.moving, found.system, least)
-            if worst < least:
-                self.best = found
-        self.tried[name] = worst
-        tick(_DESIGNS)
-        return found
+    def solve(self, problem: PlantRange) -> tuple[Controller, dict[str, float]]:
+        """Return the best controller, and the worst norm of each that was tried."""
+        motion, tried, found = _MotionChannels(problem), dict[str, float](), list[Controller]()
 
-    def over_scales(self, motion: _MotionChannels) -> None:
-        """Halve or double the scale of the channels while that helps."""
-        for factor in (0.5, 2.0):
-            scale, value = 1.0, np.inf
-            for _ in range(_STEPS):
-                name = f"scale {scale:g} of the motion"
-                if name not in self.tried:
-                    self.tried_with(name, motion.channels(scale))
-                if not self.tried[name] < value:
-                    break
-                scale, value = scale * factor, self.tried[name]
-            if scale != factor:
-                break
+        def worst_of(name: str, plant: AnyPlant) -> float:
+            if name not in tried:
+                least, tried[name] = min(tried.values(), default=np.inf), np.inf
+                with attempted(f"the design for {name}"):  # another scale may serve
+                    one = verified(self.design, solved(self.design, plant))
+                    tried[name] = _worst_norm(problem, one.system)
+                    if tried[name] < least or not found:
+                        found.append(one)
+                tick(_DESIGNS)
+            return tried[name]
 
-    def answer(self) -> Controller:
-        """Return the best, with the norms of all positions."""
-        moving = self.moving
-        if self.best is None:
+        with Progress(2 + 2 * _STEPS, _DESIGNS, progress=self.progress, even=False):
+            worst_of("the mean plant", motion.mean)
+            if motion.scales.size and found:
+                motion.even(found[0].system)
+                for factor in (0.5, 2.0):  # while that helps
+                    scale, value = 1.0, np.inf
+                    for _ in range(_STEPS):
+                        reached = worst_of(f"scale {scale:g} of the motion", motion.channels(scale))
+                        if not reached < value:
+                            break
+                        scale, value = scale * factor, reached
+                    if scale != factor:
+                        break
+        if not np.isfinite(min(tried.values())):
+            places = problem.places
             raise SolverError(
                 "no controller was found that is stable at all "
-                f"{counted(len(moving.plants), 'position')} from {moving.places[0]:g} to "
-                f"{moving.places[-1]:g} (tried: {', '.join(self.tried)}). Ask for less bandwidth, "
-                "a shorter range, or schedule the design (loop.schedule_loops)."
+                f"{counted(len(places), 'position')} from {places[0]:g} to {places[-1]:g} (tried: "
+                f"{', '.join(tried)}). Ask for less bandwidth, a shorter range, or schedule the "
+                "design (loop.schedule_loops)."
             )
-        K = self.best.system
+        return found[-1], tried
+
+    def restore(self, plant: PlantRange, problem: PlantRange, found: Any) -> StateSpace:
+        """Return the best controller."""
+        K: StateSpace = found[0].system
+        return K
+
+    def certify(self, solution: Solution) -> Controller:
+        """Return the controller with the norms of all positions."""
+        moving, _, K, (best, tried) = solution
         norms = [_position_norm(one, K) for one in moving.plants]
         certificate = moving.certified(lambda one: _position_norm(one, K), norms)
         bounds = [pointwise_bound(prepared(one.system, one.u, one.y)) for one in moving.plants]
         worst = certificate["worst position"]
-        return self.best.replace(
+        answer: Controller = best.replace(
             gamma=max(norms),
             lower=max(bounds),
             certificate=certificate,
             reached={},
-            tried=self.tried,
+            tried=tried,
             notes=(f"one controller for {counted(len(norms), 'position')}; worst at {worst:g}",),
         )
+        return answer
 
 
 class _MotionChannels:
@@ -227,22 +231,10 @@ def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
     return np.flatnonzero(size > SAME * np.abs(rows).max(axis=1, initial=0.0))
 
 
-def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
-    """Return the largest norm at the positions, the ends first, until one is above what is known.
-
-    Infinite where a loop is not stable.
-    """
-    order = sorted(range(len(moving.plants)), key=lambda i: -abs(2 * i - len(moving.plants) + 1))
-    plants = [moving.plants[i] for i in order] + [*moving.between.values()]
-    worst = 0.0
-    for one in plants:
-        try:
-            worst = max(worst, _position_norm(one, K))
-        except FlexplantError:  # a loop that is not stable has no norm
-            return np.inf
-        if worst > least:
-            break
-    return worst
+def _worst_norm(moving: PlantRange, K: StateSpace) -> float:
+    """Return the largest norm at and between the positions, infinite where a loop is not stable."""
+    plants = (*moving.plants, *moving.between.values())
+    return max(float(hinf_norm(lft(one.system, K))) for one in plants)
 
 
 def _position_norm(plant: AnyPlant, K: StateSpace) -> float:
