@@ -94,6 +94,16 @@ def test_stationary_it_is_the_lyapunov_solution():
     assert scaled_gap(found, wanted) < 1e-9
 
 
+@pytest.mark.parametrize("h", [1e-5, 1e-3, 1e-2])
+def test_many_modes_under_few_forces_that_turn_often_in_a_sample(h):
+    """X - E X E' with X stationary; the nodes of one interval reach up to 30 rad."""
+    g = pairs(np.linspace(20.0, 3000.0, 60), np.full(60, 0.01), inputs=1)
+    X, E = la.solve_continuous_lyapunov(g.A, -0.5 * g.B @ g.B.T), la.expm(g.A * h)
+    size = np.sqrt(np.outer(X.diagonal(), X.diagonal()))
+    found = covariance(g, [1.0], h)
+    assert float(np.abs((found - X + E @ X @ E.T) / size).max()) < 1e-9
+
+
 @pytest.mark.parametrize("rate", [1e4, 100.0, 1.0])
 @pytest.mark.parametrize("blocks", [True, False])
 def test_a_slow_sampler_of_a_fast_mode(rate, blocks):
