@@ -39,7 +39,7 @@ LINES = [
      "self.cost += 2.0 * float(error @ error)"),
     ("lti/sampling.py", "np.asarray(asd)[loud] / np.sqrt(2.0)", "np.asarray(asd)[loud]"),
     ("lti/discretisation.py", "np.arctan(0.5 * dt * omega)", "np.arctan(0.4 * dt * omega)"),
-    ("lti/sampling.py", "np.sin(turning), -0.5 *", "np.sin(turning), -0.6 *"),
+    ("lti/sampling.py", "decay * np.sin(turning) /", "1.2 * decay * np.sin(turning) /"),
     ("identification/spectra.py", "count / (1.0 + 2.0 * doubled)", "1.0 * count"),
     ("reduction/ranking.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
     ("estimation/filter_models.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
