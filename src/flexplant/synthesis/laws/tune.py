@@ -287,12 +287,10 @@ class JointSearch:
         if held is not None:
             return held
         known = found = self._start()
-        added, spare = [np.empty(0) for _ in self.plants], _SPARE
+        spare = _SPARE
         for _ in range(_ROUNDS):
-            high = [plant.high(found.laws, _NEAR * self.peak) for plant in self.plants]
-            added = [np.union1d(*both) for both in zip(added, high, strict=True)]
-            again = self.checked(self._raised(found.numbers, added, 1.0 / self.peak + spare))
-            if again is None:
+            again = self.checked(self._raised(found.numbers, 1.0 / self.peak + spare))
+            if again is None:  # of lines alone: they count turns, not poles
                 break
             found = again
             if found.worst.size <= self.peak:
@@ -336,15 +334,13 @@ class JointSearch:
             )
         return wild
 
-    def _raised(
-        self, numbers: list[FloatArray], added: Sequence[FloatArray], least: float
-    ) -> list[FloatArray]:
+    def _raised(self, numbers: list[FloatArray], least: float) -> list[FloatArray]:
         """Return what steps from stable laws lead to."""
-        # an exact penalty on what is violated [Fletcher1987]_; det(I + P C) turns as often as
-        # before
-        grids = [np.union1d(one.grid, more) for one, more in zip(self.plants, added, strict=True)]
-        couplings = [one.coupling(grid) for one, grid in zip(self.plants, grids, strict=True)]
+        # an exact penalty on what is violated [Fletcher1987]_; each step is stable, and adds the
+        # resonances of its closed loop to the frequencies
         x, radius = np.concatenate(numbers), _RADIUS
+        grids = self._seen(x, [one.grid for one in self.plants])
+        couplings = [one.coupling(grid) for one, grid in zip(self.plants, grids, strict=True)]
         gains, rooms = self._rooms(x, couplings, least)
         lowest = min(float(room.min()) for room in rooms)
         for _ in range(_STEPS):
@@ -361,12 +357,44 @@ class JointSearch:
                 # second-order correction: the bounds are curved, and steps along them short
                 bent = program.at(found) - program.slopes @ step
                 step = program.step(bent, radius)[0]
-            if gained > 0.1 * expected and all(map(_same_winding, couplings, gains, there)):
-                x, gains, rooms, lowest = x + step, there, found, low
+            if gained > 0.1 * expected and self._stays_stable(x + step, couplings, gains, there):
+                x = x + step
+                grids = self._seen(x, grids)
+                couplings = [
+                    old if grid.size == old.freq.size else one.coupling(grid)
+                    for one, grid, old in zip(self.plants, grids, couplings, strict=True)
+                ]
+                gains, rooms = self._rooms(x, couplings, least)
+                lowest = min(float(room.min()) for room in rooms)
                 radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
             else:
                 radius *= 0.4
         return self._split(x)
+
+    def _laws(self, x: FloatArray) -> list[Law]:
+        return [law.law(own) for law, own in zip(self.of, self._split(x), strict=True)]
+
+    def _seen(self, x: FloatArray, grids: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return frequencies with those of the closed loops of some numbers where |S| is large."""
+        laws = self._laws(x)
+        return [
+            np.union1d(grid, one.high(laws, _NEAR * self.peak))
+            for one, grid in zip(self.plants, grids, strict=True)
+        ]
+
+    def _stays_stable(
+        self,
+        x: FloatArray,
+        couplings: Sequence[Coupling],
+        before: Sequence[ComplexArray],
+        after: Sequence[ComplexArray],
+    ) -> bool:
+        """Return whether all loops are stable: by their poles, of lines by turns as before."""
+        laws = self._laws(x)
+        return all(
+            _same_winding(*each) if isinstance(one.plant, Frf) else one.is_stable(laws)
+            for one, *each in zip(self.plants, couplings, before, after, strict=True)
+        )
 
     def _rooms(
         self, x: FloatArray, couplings: Sequence[Coupling], least: float
