@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +114,7 @@ def tune_loops(
     if _has_no_line(axes):
         return made(axes, {axes.names[0]: _pid_law(axes, float(peak))}, 0, 0, None)
     plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
-    frf, of, alone = _axes_response(plants[-1], axes), [], []
+    frf, found = _axes_response(plants[-1], axes), []
     resolved = not isinstance(axes.plant, Frf)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         for i, (name, (free, powers)) in enumerate(
@@ -125,17 +126,15 @@ def tune_loops(
                 AxisLaw(MeasuredAxis(name, *lines, power, resolved), float(peak), most)
                 for power in powers
             ]
-            law, numbers = _fastest(laws)
-            of.append(law)
-            alone.append(numbers)
+            found.append(_each_line(laws))
             bar.advance()
-    found = JointSearch(of, plants, float(peak), alone).best()
-    design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None)
-    notes = [note for law, x in zip(of, found.numbers, strict=True) for note in law.notes(x)]
-    if found.worst.size > peak:
+    of, best = _together(found, plants, float(peak))
+    design = made(axes, dict(zip(axes.names, best.laws, strict=True)), rigid, 0, None)
+    notes = [note for law, x in zip(of, best.numbers, strict=True) for note in law.notes(x)]
+    if best.worst.size > peak:
         notes.append(
-            f"|S| below {20.0 * np.log10(peak):.3g} dB was not reached: |S| {found.worst.place} is "
-            f"{20.0 * np.log10(found.worst.size):.3g} dB at {found.worst.freq:.4g} Hz, which ended "
+            f"|S| below {20.0 * np.log10(peak):.3g} dB was not reached: |S| {best.worst.place} is "
+            f"{20.0 * np.log10(best.worst.size):.3g} dB at {best.worst.freq:.4g} Hz, which ended "
             "the search. Allow a higher peak, decouple the axes better (before=, after=), or move "
             "actuators or sensors to where they excite or see less of what resonates there"
         )
@@ -215,8 +214,8 @@ def _lines(axes: Axes, rigid: int) -> list[tuple[bool, tuple[int, ...]]]:
     return found
 
 
-def _fastest(laws: Sequence[AxisLaw]) -> tuple[AxisLaw, FloatArray]:
-    """Return the law of the highest bandwidth among those of several lines."""
+def _each_line(laws: Sequence[AxisLaw]) -> list[tuple[AxisLaw, FloatArray]]:
+    """Return the fastest law of each line of an axis that has one, the fastest line first."""
     found, failures = [], []
     for law in laws:
         try:
@@ -225,7 +224,29 @@ def _fastest(laws: Sequence[AxisLaw]) -> tuple[AxisLaw, FloatArray]:
             failures.append(error)
     if not found:
         raise failures[0]
-    return max(found, key=lambda one: float(one[1][0]))
+    return sorted(found, key=lambda one: -float(one[1][0]))
+
+
+def _together(
+    found: Sequence[list[tuple[AxisLaw, FloatArray]]], plants: list[JointPlant], peak: float
+) -> tuple[list[AxisLaw], JointLaws]:
+    """Return the laws of all axes together, on the fastest line of each or on its lowest."""
+    # axes that are decoupled on their springs are coupled on the lines of their masses, above
+    fastest = [lines[0] for lines in found]
+    lowest = [min(lines, key=lambda one: one[0].axis.power) for lines in found]
+    tried: list[tuple[list[AxisLaw], JointLaws]] = []
+    failures = []
+    for chosen in (fastest, lowest):
+        of, alone = [law for law, _ in chosen], [numbers for _, numbers in chosen]
+        if tried and (all(map(is_, of, tried[0][0])) or tried[0][1].worst.size <= peak):
+            break
+        try:
+            tried.append((of, JointSearch(of, plants, peak, alone).best()))
+        except SolverError as error:
+            failures.append(error)
+    if not tried:
+        raise failures[0]
+    return min(tried, key=lambda one: one[1].worst.size)
 
 
 def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
@@ -392,8 +413,8 @@ class JointSearch:
         """Return whether all loops are stable: by their poles, of lines by turns as before."""
         laws = self._laws(x)
         return all(
-            _same_winding(*each) if isinstance(one.plant, Frf) else one.is_stable(laws)
-            for one, *each in zip(self.plants, couplings, before, after, strict=True)
+            _same_winding(there, old, new) if isinstance(one.plant, Frf) else one.is_stable(laws)
+            for one, there, old, new in zip(self.plants, couplings, before, after, strict=True)
         )
 
     def _rooms(
