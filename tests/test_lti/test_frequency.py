@@ -338,3 +338,14 @@ def test_a_grid_of_our_own_leaves_undamped_resonances_out(omega, blocks):
     s = 2j * np.pi * found.freq
     wanted = sum(w / (s**2 + w**2) for w in omega)
     assert np.max(np.abs(found["y1", "u1"] / wanted - 1)) < 1e-6
+
+
+def test_measured_rotations_have_their_units_from_their_labels_and_keep_them():
+    """A response of rotations per moment was printed in m/N."""
+    frf = Frf([1.0, 2.0], np.ones((2, 2, 2)), ["1:rz", "1:x"], ["2:rz", "2:x"], "velocity")
+    units = ("rad/s", "N m", "m/s", "N")
+    assert [frf.unit("2:rz", "1:rz"), frf.unit("2:x", "1:x")] == ["rad/s/(N m)", "m/s/N"]
+    named = frf.replace(outputs=["joint", "tip"], inputs=["motor", "hammer"])
+    found = (*(named.channel_units[name] for name in ("joint", "motor", "tip", "hammer")),)
+    assert found == units
+    assert Frf([1.0], np.ones((1, 1, 1)), ["1:rz"], ["2:rz"]).unit("2:rz", "1:rz") is None

@@ -165,6 +165,8 @@ def _line_range(frf: Any) -> str:
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: units of a motion by the order of its time derivative
 _PER_TIME = ("", "/s", "/s^2")
+#: ends of the DOF labels of rotations
+ROTATIONS = (":rx", ":ry", ":rz")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -280,10 +282,19 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             )
         inputs = signal_names(self.inputs, shape[1], "u", "inputs")
         outputs = signal_names(self.outputs, shape[0], "y", "outputs")
-        units = known_units(self.units, (*inputs, *outputs))
+        units = self._rotations(inputs, outputs)
+        units |= known_units(self.units, (*inputs, *outputs))
         self._set(
             inputs=inputs, outputs=outputs, units=units, coherence=coherence, variance=variance
         )
+
+    def _rotations(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, str]:
+        """Return the units of measured rotations and moments, which DOF labels show."""
+        if self.quantity not in ORDERS:
+            return {}
+        angle = "rad" + _PER_TIME[ORDERS[self.quantity]]
+        units = {name: "N m" for name in inputs if name.endswith(ROTATIONS)}
+        return units | {name: angle for name in outputs if name.endswith(ROTATIONS)}
 
     def _completed_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Return the changes of `replace`, with the units of renamed channels."""

@@ -77,6 +77,8 @@ def solve_modes(
         small model.
     damping : ModalDamping or Rayleigh, optional
         Damping used in place of the model's D. None: the model's D, or no damping without D.
+        ``ModalDamping(solve_modes(model, count=9).zeta, others=0.005)`` keeps the ratios that D
+        gives the first modes, those on isolators for example.
     compliance_at : place or sequence of places
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
         modes is kept, by residual attachment vectors.

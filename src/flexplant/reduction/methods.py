@@ -273,7 +273,9 @@ class DesiredDofs(ReductionMethod):
             truncated = modes.select(range(len(labels), modes.n_modes))
             modes = modes.select(range(len(labels)))
         k = modes.n_modes + modes.n_vectors
-        require_real(modes, "(5) has no diagonal form: add dampers later, or keep D by Serep(dofs)")
+        require_real(
+            modes, "(5) has no diagonal form: add dampers later, or keep D by reduction.Serep(dofs)"
+        )
         if len(labels) != k:
             advice = f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"
             if len(labels) > k:

@@ -195,7 +195,7 @@ def _connectivity(found: Facts) -> list[Line]:
             "note",
             "connectivity",
             f"{count} separate pieces; in addition to the largest: {'; '.join(shown)}{more}",
-            "coincident nodes not merged, or a missing contact? Join them, or model them apart",
+            "right where a body floats; otherwise merge coincident nodes, or add the contact",
         )
     ]
 
@@ -423,8 +423,8 @@ def _rigid_lines(found: Facts) -> Iterator[Line]:
         "note" if partly else "ok",
         "rigid body",
         f"{text} ({expected})",
-        "rigid-body modes at 0 Hz, which are kept: a controller holds a stage that floats or "
-        "slides. Is a support missing? fixed(labels), or a spring there"
+        "rigid-body modes at 0 Hz are kept: a controller holds a stage that floats or slides. If a "
+        "support is missing, use fixed(labels) or add a spring"
         if partly
         else "",
     )
@@ -455,8 +455,8 @@ def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
     absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
     if motions.n_bodies > 1:
         own = counted(motions.n_rigid, "rigid-body motion")
-        whole = f"all move freely together in {free}" if free else "none moves all of them together"
-        return f"{motions.n_bodies} separate bodies with {own}; {whole}{absent}"
+        whole = f"all move freely together in {free}" if free else "no motion moves all of them"
+        return f"{motions.n_bodies} separate bodies have {own} in all; {whole}{absent}"
     if combined > 0 and not held:
         of_joints = f"{counted(combined, 'motion')} of components in their joints"
         return f"free in {free}, and {of_joints}{absent}"
