@@ -10,7 +10,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError
 from ..modes.matching import ALIKE, mac_matrix
 from ..tolerances import CERTAIN, CHANCE, MOST_STEPS, NEGLIGIBLE, TINY
-from .refine import Lines, PoleFit, pivoted, scaled_inverse
+from .refine import OWN, Lines, PoleFit, pivoted, refined, scaled_inverse
 
 #: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
 #: may be one resonance; one bandwidth where the weaker pole is the broader: the remainder of a
@@ -90,7 +90,8 @@ def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
     """Return two poles within a bandwidth with equal shape and participation, the weaker last.
 
     One resonance with a distorted circle (leakage, amplitude) looks like this. With one input two
-    modes look the same, unless the residual is only noise of a known variance.
+    modes look the same, unless the residual is only noise of a known variance, or one pole at each
+    output explains far less than the two.
     """
     height = strength(fit)
     alike = [mac_matrix(vectors, vectors) > ALIKE for vectors in (fit.shapes, fit.participation)]
@@ -104,11 +105,18 @@ def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
             if apart > (widths.sum() if same else reach * np.sqrt(widths.prod())):
                 continue
             single = fit.participation.shape[0] == 1
-            if (single and (same or not fit.lines.known)) or (
+            distorted = (single and (same or not fit.lines.known)) or (
                 (same or single) and coherence(fit, fit.poles[k]) > NOISE
-            ):
+            )
+            if distorted and (same or _one_pole_each(fit, int(k))):
                 return int(j), int(k)
     return None
+
+
+def _one_pole_each(fit: PoleFit, weaker: int) -> bool:
+    """Return whether separate poles of the outputs explain as much without a pole as with it."""
+    rest = refined(fit.lines, *fit.rest(weaker), steps=OWN, strict=False)
+    return own_cost(rest) < NOISE * fit.cost
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,8 @@ class Facts:
     damping: dict[str, Any]
     #: frequency [Hz] by Rayleigh's quotient of each joint motion that the structure resists
     resisted: dict[int, float]
+    #: number of joint motions that the model states
+    n_joint_motions: int
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
         """Return the labels of some rows (from 0)."""
@@ -83,7 +85,7 @@ class Facts:
 
 def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
     """Return all known facts on some matrices."""
-    proven = model is not None
+    proven, joints = model is not None, None if model is None else model.joint_motions
     skew = {
         name: (0.0, 0, 0) if proven else _skew(matrix)
         for name, matrix in (("K", given.K), ("M", given.M), ("D", given.D))
@@ -115,7 +117,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
                 located=given.located,
                 rounding=max(ZERO, _rounding(K, M, given, digits)),
                 M=M,
-                joint_motions=None if model is None else model.joint_motions,
+                joint_motions=joints,
             )
         written = 0.0 if digits is None else 10.0**-digits
         lowest, scaled, failure = _try_lowest_modes(
@@ -152,6 +154,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         swapped=swapped,
         damping={} if D is None else _damping_facts(D, motions, proven),
         resisted={} if model is None else _resisted(model),
+        n_joint_motions=0 if joints is None else joints.shape[1],
     )
 
 

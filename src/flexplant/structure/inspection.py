@@ -457,9 +457,11 @@ def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
         own = counted(motions.n_rigid, "rigid-body motion")
         whole = f"all move freely together in {free}" if free else "no motion moves all of them"
         return f"{motions.n_bodies} separate bodies have {own} in all; {whole}{absent}"
-    if combined > 0 and not held:
+    if combined > 0 and (not held or combined <= found.n_joint_motions):
+        together = f"free in {free}, and {{}}" if free else "free in {}"
         of_joints = f"{counted(combined, 'motion')} of components in their joints"
-        return f"free in {free}, and {of_joints}{absent}"
+        rest = f"; else grounded in {held}" if held else ""
+        return f"{together.format(of_joints)}{rest}{absent}"
     if combined > 0:
         alone = [f"free in {free}"] if free else []
         if found.given.located and found.given.dofs is not None:

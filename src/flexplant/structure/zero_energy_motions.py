@@ -56,7 +56,8 @@ def zero_energy(
     names = DIRECTIONS[: motions.shape[1]]
     present = np.any(motions != 0, axis=0)
     several = bodies(K, M, dofs)
-    possible = motions if joint_motions is None else np.hstack([motions, joint_motions])
+    # joint motions first: what is made orthogonal to them does not mix with their rounding
+    possible = motions if joint_motions is None else np.hstack([joint_motions, motions])
     every, basis = _of_bodies(K, M, possible, several, rounding, dofs.xyz)
     left = motions - basis @ (basis.T @ motions)
     free = present & (np.linalg.norm(left, axis=0) < NEGLIGIBLE * np.linalg.norm(motions, axis=0))
