@@ -469,6 +469,40 @@ def test_folded_modes_do_not_make_weak_modes_means_of_separate_fits(seed):
     assert np.max(np.abs(near - truth[2:7])) < 2 * np.pi * 0.1
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::flexplant.errors.FlexplantWarning")  # of the difference
+def test_differences_at_strong_modes_do_not_make_weak_modes_means_of_separate_fits():
+    """A difference of 3e-9, seen at a signal of 1e7 times the noise: 1.5 Hz of error at 270 Hz."""
+    rng, freq = np.random.default_rng(0), np.arange(10.0, 300.0, 0.25)
+    truth = pole(np.array([23.0, 34.0, 134.0, 270.0]), np.array([0.015, 0.03, 0.04, 0.03]))
+    phi = rng.normal(size=(4, 4)) * np.array([1e3, 1e3, 20.0, 40.0])
+    phi[:2, 2:] *= 1e-3
+    rows = []
+    for o in range(4):
+        own = truth * (1 + 3e-9 * rng.normal() * np.array([1.0, 1.0, 0.0, 0.0]))
+        rows.append(modal_frf(freq, own, phi[[o]], phi[[2, 3]])[0])
+    H = np.array(rows)
+    deviation = 1e-2 * phi[2, 2] ** 2 / (0.08 * (2 * np.pi * 134.0) ** 2)
+    frf = Frf(freq, noisy(H, deviation, rng), variance=np.full(H.shape, deviation**2))
+    found = identify_modes(frf)
+    near = [np.argmin(np.abs(found.poles - p)) for p in truth]
+    off = np.abs(found.poles[near] - truth)
+    assert np.all(off[2:] < 2 * np.pi * 0.05)
+    assert np.all(off < 4 * np.abs(found.std[near]))
+
+
+@pytest.mark.slow
+def test_two_modes_at_one_input_stay_two_without_a_variance():
+    """A pair within a bandwidth, of other shapes: they were one mode, and the outputs disagreed."""
+    rng, freq = np.random.default_rng(4), np.arange(10.0, 350.0, 0.25)
+    truth = pole(np.array([46.0, 117.4, 119.3, 260.0]), np.array([0.015, 0.039, 0.009, 0.015]))
+    phi = np.array([[0.4, 0.05, -1.0, 0.01], [-1.0, -1.0, -1.0, -1.0], [0.6, -0.2, 0.0, 0.25]])
+    H = modal_frf(freq, truth, phi, phi[[1]])
+    found = identify_modes(Frf(freq, noisy(H, 1e-5 * np.abs(H).max(), rng)))
+    assert found.inconsistency is None
+    np.testing.assert_allclose(found.poles, truth, rtol=1e-2)
+
+
 def test_slopes_against_central_differences():
     frf = measured(CLOSE[[0, 2, 6]], PHI[:, :3], n_in=2, freq=np.arange(40.0, 170.0, 1.0))
     weight = np.sqrt(2.0 / frf.variance)

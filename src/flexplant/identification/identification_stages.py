@@ -25,9 +25,11 @@ from .model_error import (
     strength,
     supported,
     twin_poles,
+    unevenness,
 )
 from .pole_test import (
     UPPER,
+    afforded_terms,
     dropped,
     fewer_terms,
     gain_due_of_own_poles,
@@ -243,9 +245,14 @@ class Task:
     def lines(self, ready: PreparedLines) -> Lines:
         """Return lines with all residual terms, so that no pole replaces a residual term."""
         rows = RUNS if self.side == RUNS and ready.side == "outputs" else ready.side
+        upper = self.upper
+        if upper is None:
+            # modes folded by a hold are too weak for poles of their own and too strong for few
+            # terms: outputs would seem to disagree
+            most = afforded_terms(ready.freq.size, self.lower)
+            upper = UPPER[-1] if self.hold is None else max(UPPER[-1], *most, 0)
         return Lines(
-            *(ready.freq, ready.data, ready.weight, self.lower),
-            *(UPPER[-1] if self.upper is None else self.upper, self.hold, ready.known),
+            *(ready.freq, ready.data, ready.weight, self.lower, upper, self.hold, ready.known),
             late=self.delay % 1.0,
             inflation=ready.inflation,
             variance_freedom=self.frf.freedom,
@@ -401,12 +408,15 @@ def _answered(
 
     count = task.steps if settled else QUICK * int(compare)
     fit, reported, rejected = gated(now.fit, count, alone=begin.alone, compare=compare)
-    apart = None
+    apart, uneven = None, 1.0
     if settled:
         fit = refined(lines, fit.poles, fit.participation, steps=task.steps, fine=True)
     if compare:
-        excess = fit.cost - lines.freedom(fit.m)
-        apart = disagreement(fit, gain_due_of_own_poles(fit), excess)
+        excess, least = fit.cost - lines.freedom(fit.m), gain_due_of_own_poles(fit)
+        if fit.misfit < NOISE:
+            uneven = unevenness(fit, least)
+        else:
+            apart = disagreement(fit, least, excess)
         if apart is not None:
             reported, others = steady(fit, reported, apart)
             fit = PoleFit(lines, apart.poles, fit.participation, fit.pivots)
@@ -422,6 +432,7 @@ def _answered(
     found = answer(
         *(task.frf, task.delay, ready, fit, reported, task.labels, begin.diagram),
         *(tuple(sorted(weaker + rejected + ready.mains)), reason, apart),
+        uneven,
     )
     if begin.at_peaks:
         half = np.maximum(-found.poles.real, np.pi * float(np.median(np.diff(lines.freq))))

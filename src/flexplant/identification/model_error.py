@@ -57,6 +57,14 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     return True
 
 
+def unevenness(fit: PoleFit, least: float) -> float:
+    """Return the factor by which poles differ between outputs more than by noise, else 1."""
+    # the gain of separate poles per parameter is 1 by noise alone. Where the shared poles leave
+    # hardly more than noise they are better than means of separate ones, which weak modes lack
+    gain = fit.cost - own_cost(fit)
+    return gain / (2 * fit.m * (len(fit.lines.parts) - 1)) if gain > least else 1.0
+
+
 def coherence(fit: PoleFit, pole: complex) -> float:
     """Return the factor by which a misfit near a pole lowers the cost more than noise does."""
     # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over

@@ -207,13 +207,18 @@ def fewer_terms(fit: PoleFit) -> Proposals:
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
+def afforded_terms(n_freq: int, lower: int) -> list[int]:
+    """Return the larger numbers of residual terms that a number of lines allows."""
+    return [upper for upper in MORE if n_freq >= 8 * (upper + lower)]
+
+
 def more_terms(fit: PoleFit) -> Proposals:
     """Propose more residual terms where the data require them, as many as the lines allow."""
     # folded modes are weak and broad: their remainder with few terms is not visible, but causes a
     # bias
     lines = fit.lines
-    afforded = [u for u in MORE if u > lines.upper and lines.freq.size >= 8 * (u + lines.lower)]
-    trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded)
+    afforded = afforded_terms(lines.freq.size, lines.lower)
+    trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded if upper > lines.upper)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 

@@ -31,11 +31,12 @@ def answer(
     rejected: tuple[Rejected, ...],
     reason: str,
     apart: Disagreement | None,
+    uneven: float,
 ) -> IdentifiedModes:
-    """Return the reported modes of a fit, sorted."""
+    """Return the reported modes of a fit, sorted; `uneven` enlarges the variance of its poles."""
     lines, misfit = fit.lines, fit.misfit
     formal, spread = _covariances(fit, ready)
-    covariance, spread = formal * max(1.0, misfit), spread * max(1.0, misfit)
+    covariance, spread = formal * max(uneven, misfit), spread * max(1.0, misfit)
     if apart is not None:
         covariance = apart.covariance(formal)
     shapes, part, terms = fit.shapes, fit.participation, fit.terms
