@@ -59,10 +59,11 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
 
 def unevenness(fit: PoleFit, least: float) -> float:
     """Return the factor by which poles differ between outputs more than by noise, else 1."""
-    # the gain of separate poles per parameter is 1 by noise alone. Where the shared poles leave
-    # hardly more than noise they are better than means of separate ones, which weak modes lack
+    # where shared poles leave hardly more than noise they are better than means of separate ones,
+    # which weak modes lack. The gain of separate poles is 1 for each parameter by noise alone; all
+    # of it may be due to one part of one pole
     gain = fit.cost - own_cost(fit)
-    return gain / (2 * fit.m * (len(fit.lines.parts) - 1)) if gain > least else 1.0
+    return gain / (len(fit.lines.parts) - 1) if gain > least else 1.0
 
 
 def coherence(fit: PoleFit, pole: complex) -> float:
