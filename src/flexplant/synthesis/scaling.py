@@ -47,10 +47,7 @@ def balanced(
     scale = state_scale(A, B, C)  # never A alone: that shrinks one side of a nearly triangular A
     for _ in range(2):  # the border is weighed anew once the states have sizes alike
         A_, B_, C_ = A * scale / scale[:, None], B / scale[:, None], C * scale
-        try:
-            gain = float(np.linalg.norm(C_ @ np.linalg.solve(s * np.eye(n) - A_, B_)))
-        except np.linalg.LinAlgError:  # a pole at s: any weight will do
-            gain = 1.0
+        gain = float(np.linalg.norm(C_ @ np.linalg.solve(s * np.eye(n) - A_, B_)))
         weight = 1.0 / np.sqrt(gain) if 0.0 < gain < np.inf else 1.0
         drive, sight = np.linalg.norm(B_, axis=1), np.linalg.norm(C_, axis=0)
         scale = scale * bordered_scale(A_, weight * drive, weight * sight)
@@ -68,10 +65,7 @@ def timed(
 def answers(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> FloatArray:
     """Return the sizes (m,) of ``C (s I - A)^-1 B + D`` by column, at least a part of its terms."""
     # what u moves and z does not show has no size there but rounding
-    try:
-        states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
-    except np.linalg.LinAlgError:  # a pole at s
-        states = np.asarray(B, dtype=np.complex128)
+    states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
     terms = np.linalg.norm(np.abs(C) @ np.abs(states) + np.abs(D), axis=0)
     return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), NEGLIGIBLE * terms))
 

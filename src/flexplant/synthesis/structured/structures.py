@@ -139,6 +139,7 @@ class FixedOrder(Value):
         entries = _Entries(self.order, pattern, prepared, nests=self.start is None)
         known = self.start
         if known is None and self.order:
+            # one start of many: without it the search begins at the structure's own
             with attempted("a start from the controller of full order, reduced to this one"):
                 lower = self.order < plant.system.n_states
                 full = design_hinf(plant, Riccati(back_off=_RELAXED) if lower else None).system
