@@ -11,6 +11,7 @@ from flexplant.synthesis import (
     FixedOrder,
     FullBlock,
     Lmi,
+    RepeatedScalar,
     design_h2,
     design_hinf,
     design_mu,
@@ -318,6 +319,33 @@ def test_robust_performance_of_two_inputs():
     assert 0.99 * found.gamma <= max(bounds) <= found.gamma
     constant = [oracle.smallest_norm(with_delta_at_u(p, 0.2, d)) for d in (3.0, 10.0, 30.0)]
     assert found.gamma <= 1.01 * min(constant)
+
+
+@pytest.mark.long
+def test_robust_performance_of_an_uncertain_stiffness():
+    """mu is what a machine reaches, and no constant D is better, as for a real Delta it may be."""
+    p = problem("undamped mode", 71)
+    A, B, C, D = p.parts
+    place = int(np.argmax(np.abs(A[0])))  # of the stiffness, off by at most 20 %
+
+    def opened(d):
+        drive, sight = d * np.eye(len(A))[:, :1], 0.2 / d * A[0, place] * np.eye(len(A))[[place]]
+        across = np.block([[0.0, np.zeros((1, B.shape[1]))], [np.zeros((len(C), 1)), D]])
+        parts = A, np.hstack([drive, B]), np.vstack([sight, C]), across
+        return Problem("mu", parts, p.nu, p.ny)
+
+    P = posed(opened(1.0)).system
+    uncertain = uncertain_system(P, [RepeatedScalar()], u=["u0"], y=["y0"])
+    z = [f"z{i}" for i in range(1, len(C) + 1 - p.ny)]
+    found = design_mu(uncertain, w=["w1"], z=z, progress=False)
+    K = found.system
+    gains = []
+    for delta in np.linspace(-1.0, 1.0, 41) / found.gamma * (1.0 - 1e-9):
+        off = A.copy()
+        off[0, place] *= 1.0 + 0.2 * delta
+        gains.append(oracle.loop_norm(p._replace(parts=(off, B, C, D)), (K.A, K.B, K.C, K.D)))
+    assert 0.98 * found.gamma <= max(gains) <= found.gamma
+    assert found.gamma <= min(oracle.smallest_norm(opened(d)) for d in (1.0, 3.0, 10.0))
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...plant.uncertainty.delta_blocks import FullBlock
+from ...plant.uncertainty.delta_blocks import FullBlock, RepeatedScalar
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod
@@ -93,10 +93,11 @@ def design_mu(
 
     D-K iteration: an H-infinity controller for the plant with its Deltas scaled by D(s), then D
     for the best loop so far, a filter of few states per Delta, and so on. Each D is multiplied by
-    the number that gives the smallest H-infinity norm. In the design real Deltas
-    count as complex, which is cautious; what is judged, and kept, is the controller of the smallest
-    mixed mu, real Deltas real, between all frequencies. The first candidates are those without
-    uncertainty and for D = 1.
+    the number that gives the smallest H-infinity norm; where Deltas are real, the iteration is also
+    made with D as it is, and the better one is kept. In the design real Deltas count as complex,
+    which is cautious; what is judged, and kept, is the controller of the smallest mixed mu, real
+    Deltas real, between all frequencies. The first candidates are those without uncertainty and for
+    a constant D.
 
     Where all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
     plant, with the shift of real mu and a constant D, evened out in closed loop; the bound is that
@@ -168,7 +169,19 @@ class _DkIteration(Design):
         return plant  # each step prepares a problem of its own
 
     def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
-        steps = _filter_steps(problem, self.w, self.z, self.method, self.most, self.order)
+        found = self._iterated(problem, sized=True)
+        if any(isinstance(one, RepeatedScalar) and one.real for one in found[0].after.blocks):
+            # real Deltas count as complex in the norm, which then says little of the size of D
+            with attempted("the D-K iteration from D = 1"):
+                other = self._iterated(problem, sized=False)
+                found = min(found, other, key=lambda one: one[0].mu)
+        return found
+
+    def _iterated(
+        self, problem: UncertainPlant[Any], *, sized: bool
+    ) -> tuple[_DkStep, list[Verified]]:
+        given = self.w, self.z, self.method, self.most, self.order
+        steps = _filter_steps(problem, *given, sized=sized)
         return _best_step(steps, self.most + 1, _SETTLED, self.progress)
 
     def restore(self, plant: UncertainPlant[Any], problem: Any, found: Any) -> StateSpace:
@@ -243,9 +256,16 @@ def _best_step(
 
 
 def _filter_steps(
-    uncertain: UncertainPlant[Any], w: Any, z: Any, method: Any, most: int, order: int
+    uncertain: UncertainPlant[Any],
+    w: Any,
+    z: Any,
+    method: Any,
+    most: int,
+    order: int,
+    *,
+    sized: bool,
 ) -> Iterator[_DkStep]:
-    """Yield the controllers without uncertainty, for D = 1, then for D(s) of the best loop."""
+    """Yield the controllers without uncertainty, for constant D, then for D(s) of the best loop."""
     plant = open_plant(uncertain, w=w, z=z)
     # the weights of neglected modes by few states, D one
     omega = _fit_grid(plant.system)
@@ -255,7 +275,7 @@ def _filter_steps(
         if best is not None and number > 1:
             scales = _scales_of(plant, best.after, order)
         try:
-            if number:
+            if number and sized:
                 scales = _best_sized(plant, scales)
             K = _scaled_controller(plant, scales, method, nominal=not number)
             loop = uncertain_loop(uncertain, [K], w=w, z=z)
