@@ -113,7 +113,7 @@ class OverPositions(Design):
     progress: bool | None = None
 
     def prepare(self, plant: PlantRange) -> PlantRange:
-        """Return the plants: each design prepares a problem of its own."""
+        """Return the plants: each design prepares a separate problem."""
         return plant
 
     def solve(self, problem: PlantRange) -> tuple[Controller, dict[str, float]]:

@@ -171,7 +171,7 @@ class _StageTask(Design):
         self.best: _StageTry | None = None
 
     def prepare(self, plant: AnyPlant) -> AnyPlant:
-        """Return the plant from efforts to errors: each bandwidth poses a problem of its own."""
+        """Return the plant from efforts to errors: each bandwidth poses a separate problem."""
         return plant if self.errors is None else plant.through(self.errors)
 
     def solve(self, problem: AnyPlant) -> _StageTry:

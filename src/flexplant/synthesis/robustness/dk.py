@@ -166,7 +166,7 @@ class _DkIteration(Design):
     progress: bool | None
 
     def prepare(self, plant: UncertainPlant[Any]) -> UncertainPlant[Any]:
-        return plant  # each step prepares a problem of its own
+        return plant  # each step prepares a separate problem
 
     def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
         found = self._iterated(problem, sized=True)
