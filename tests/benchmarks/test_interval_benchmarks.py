@@ -10,12 +10,12 @@ and servo are designed as the README does. No constant of the drawing of machine
 these. The solid's springs were made softer along x and y after one trial with equal ones: there the
 pairs of suspension modes had a sentence in the interval's place.
 
-Measured on seeds that were not used before: 20 plates with masses (19 stated) hold 101 of 114
-intervals (of 19: die:z 17, die:rx 12, die:ry 18, modulus margin 17, bandwidth 19, MA 18), 7 soft
-pairs 40 of 42 (die:rx 6, die:ry 6, all else 7), 6 of 8 solids on springs 26 of 36 (of 6: die:z 1,
-die:rx 3, die:ry 4, the others 6), which is not enough: true errors lie below the intervals. The
-other two solids have a sentence in the interval's place.
-Where nothing is stated the model is said to lack something.
+Measured on seeds from 31000 on, which were not used before, in the order z, rx, ry, margin,
+bandwidth, MA: 11 of 12 plates with masses are stated and hold 10, 9, 11, 11, 11, 11 of 11; 10 of 11
+soft pairs 8, 9, 10, 10, 10, 10 of 10; 12 of 12 solids on springs 11, 12, 8, 12, 12, 12 of 12. That
+is 187 of 198 (94 %). Where nothing is stated the model is said to lack something. Polynomials of
+order 13, used before, made the modes of the machines above the fortieth up to 30 % too high, and
+their errors 5 to 25 % too small.
 """
 
 import warnings
@@ -185,9 +185,8 @@ def third(kind, rom, make):
     return rom.T.T @ ((K[1] - K[0]) @ rom.T) / 0.1
 
 
-def judged(kind, seed, make=fx.plate):
-    """Intervals and true figures of one machine."""
-    machine = machine_of(kind, seed)
+def designed_for(kind, seed, machine, make=fx.plate):
+    """The sampled plant of a drawing that was updated with the poles of a machine."""
     at = drawn(kind, kind["cells"], make)[1]
     modes = solved(kind, kind["cells"], make, count=24, compliance_at=[at])
     kept = [at, *(modes.dofs.nearest(place, "z") for place in corners(kind) if "springs" in kind)]
@@ -202,16 +201,26 @@ def judged(kind, seed, make=fx.plate):
     whole = solved(kind, kind["cells"], make, *fit.values, count=120)
     whole = whole.calibrated(measured_of(machine, whole, kind["poles"], seed)(kind))
     plant = fx.assemble_plant(fit.calibrated(measured), ports(kind), evaluation=whole)
-    plant = plant.discretized(RATE, delay=DELAY)
+    return plant.discretized(RATE, delay=DELAY)
+
+
+def errors_of(observer, machine):
+    """True rms errors of a filter on a machine."""
+    g = observer.system.select(inputs=[f"y{i}" for i in range(1, 5)])
+    return unlike_machines.true_errors(machine, (g.A, g.B, g.C, g.D), FORCE, NOISE, RATE, 4)
+
+
+def judged(kind, seed, make=fx.plate):
+    """Intervals and true figures of one machine."""
+    machine = machine_of(kind, seed)
+    plant = designed_for(kind, seed, machine, make)
     observer = fx.design_kalman(plant)
     servo = fx.design_servo(plant, bandwidth=kind["bandwidth"], observer=observer)
     loop = fx.close_loop(plant, observer, servo)
     stated = [observer.interval(name) for name in FIGURES[:3]]
     stated += [loop.interval(name) for name in FIGURES[3:5]]
     stated.append(loop.interval(ma, unit="m"))
-    g = observer.system.select(inputs=[f"y{i}" for i in range(1, 5)])
-    errors = unlike_machines.true_errors(machine, (g.A, g.B, g.C, g.D), FORCE, NOISE, RATE, 4)
-    true = [*errors, *loop_figures(machine, (observer, servo))]
+    true = [*errors_of(observer, machine), *loop_figures(machine, (observer, servo))]
     return stated, true
 
 
@@ -280,3 +289,21 @@ def test_a_thin_drawing_states_no_narrow_number():
     kind = KINDS["plate with masses"]
     stated, held = table("thin drawing", kind, fx.kirchhoff_plate, 5)
     assert stated < 0.5 or held >= 0.85
+
+
+@pytest.mark.parametrize("name", ["plate with masses", "soft pair", "solid on springs"])
+def test_a_filter_that_weighs_modes_by_their_uncertainty(name, seeds=range(41000, 41003)):
+    """Print by how much it lowers the upper ends of the intervals, and the true errors."""
+    ratios = []
+    for seed in seeds:
+        machine = machine_of(KINDS[name], seed)
+        with warnings.catch_warnings(action="ignore"):
+            plant = designed_for(KINDS[name], seed, machine)
+        both = [fx.design_kalman(plant, machines=own) for own in (None, plant.machines)]
+        ends = [[one.interval(figure).high for figure in FIGURES[:3]] for one in both]
+        true = [errors_of(one, machine) for one in both]
+        ratios.append([np.divide(*pair[::-1]) - 1.0 for pair in (ends, true)])
+    upper, errors = np.mean(ratios, axis=0)
+    print(f"\n{name}, z rx ry: upper ends", *(f"{x:+.1%}" for x in upper), end="")
+    print(", true errors", *(f"{x:+.1%}" for x in errors))
+    assert upper.mean() <= 0.0
