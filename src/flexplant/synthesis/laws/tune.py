@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from operator import is_
 from typing import Any, NamedTuple
 
@@ -261,8 +262,9 @@ def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
     return Frf(freq, data, axes.before.inputs, axes.names)
 
 
-#: slower starts, as a factor, until the loops are stable with |S| below so much
-_SLOWER, _STARTS, _WILD = 0.8, 30, 10.0
+#: slower starts, as a factor, until the loops are stable with |S| below so much; starts from which
+#: the peak is sought
+_SLOWER, _STARTS, _WILD, _TRIED = 0.8, 30, 10.0, 3
 #: steps between two checks, and checks at which frequencies are added
 _STEPS, _ROUNDS = 50, 6
 #: radii [e-folds], penalty on what is violated, step of differences
@@ -307,18 +309,24 @@ class JointSearch:
         held = self._held(self.given)
         if held is not None:
             return held
-        known = found = self._start()
-        spare = _SPARE
-        for _ in range(_ROUNDS):
-            again = self.checked(self._raised(found.numbers, 1.0 / self.peak + spare))
-            if again is None:  # of lines alone: they count turns, not poles
-                break
-            found = again
-            if found.worst.size <= self.peak:
-                return found
-            known = min(known, found, key=lambda one: one.worst.size)
-            spare += 1.0 / self.peak - 1.0 / found.worst.size  # what lies between the points
-        return self._held(known.numbers) or known
+        known: JointLaws | None = None
+        for start in islice(self._starts(), _TRIED):
+            found, spare = start, _SPARE
+            known = found if known is None else known
+            for _ in range(_ROUNDS):
+                again = self.checked(self._raised(found.numbers, 1.0 / self.peak + spare))
+                if again is None:  # of lines alone: they count turns, not poles
+                    break
+                found = again
+                if found.worst.size <= self.peak:
+                    return found
+                known = min(known, found, key=lambda one: one.worst.size)
+                spare += 1.0 / self.peak - 1.0 / found.worst.size  # what lies between the points
+            held = self._held(known.numbers)
+            if held is not None:
+                return held
+        assert known is not None  # noqa: S101 - there is a start, or none is stable
+        return known
 
     def _held(self, numbers: Sequence[FloatArray]) -> JointLaws | None:
         """Return the laws, or ones a little slower, that hold the peak; None where it is far."""
@@ -338,14 +346,20 @@ class JointSearch:
             for x, low in zip(numbers, least, strict=True)
         ]
 
-    def _start(self) -> JointLaws:
-        """Return the fastest of ever slower laws that are stable, |S| not wild if possible."""
-        wild = None
+    def _starts(self) -> Iterator[JointLaws]:
+        """Return ever slower laws that are stable, |S| not wild if possible: each half as fast."""
+        wild, last = None, np.inf
         for step in range(_STARTS):
-            found = self.checked(self._slowed(self.given, _SLOWER**step))
+            factor = _SLOWER**step
+            if factor > 0.5 * last:
+                continue
+            found = self.checked(self._slowed(self.given, factor))
             if found is not None and found.worst.size < _WILD:
-                return found
+                last = factor
+                yield found
             wild = wild or found
+        if last < np.inf:
+            return
         if wild is None:
             lowest = ", ".join(f"{law.lowest:.3g}" for law in self.of)
             raise SolverError(
@@ -353,7 +367,7 @@ class JointSearch:
                 f"every bandwidth down to {lowest} Hz. Decouple the axes better (before=, "
                 "after=), or close them one after the other with design_loops."
             )
-        return wild
+        yield wild
 
     def _raised(self, numbers: list[FloatArray], least: float) -> list[FloatArray]:
         """Return what steps from stable laws lead to."""
