@@ -87,35 +87,36 @@ and the names of the same functions in other tools.
 **Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
 package (peer) in one run of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
 above 1 means that flexplant is faster; the results are compared first. Times vary by about 20 %
-from run to run.
+from run to run; other work on both cores made the quick calls of this run up to 50 % slower.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 3.7 s | scipy eigsh | 30 s | 8.2 |
-| 24 modes of a plate, 30 603 DOFs | 1.3 s | scipy eigsh on CHOLMOD (not installed here) | - | - |
-| all 243 modes of a plate, dense | 15 ms | scipy eigh | 5.6 ms | 0.37 |
-| 200 lines of a plate's responses, 30 000 DOFs | 1.8 s | scipy splu (4 of them) | 460 s | 250 |
-| 8 x 8 frequency responses, 10 000 lines | 7.4 ms | python-control, slycot | 0.16 s | 22 |
-| H-infinity norm, 48 states, 0.1 % damping | 2.8 ms | slycot ab13dd | 2.5 ms | 0.87 |
-| the same, A dense | 2.5 ms | slycot ab13dd | 2.3 ms | 0.91 |
-| H2 norm, 200 states | 3.4 ms | python-control, slycot | 8 ms | 2.3 |
-| zero-order hold, 48 states | 0.24 ms | scipy cont2discrete | 0.16 ms | 0.64 |
-| a discrete Riccati equation, 48 states | 3.6 ms | scipy solve_discrete_are | 7.5 ms | 2.1 |
-| 100 000 samples through a Kalman filter | 41 ms | filterpy (5000 of them) | 5 s | 120 |
-| 100 000 samples of a loop, 212 states | 73 ms | python-control | 1.3 s | 18 |
-| the same, commands saturated | 1.8 s | python-control (2000 of them) | 3.2 s | 1.8 |
-| H-infinity, 3 states: norm 0.137 | 34 ms | python-control, slycot: 0.137 | 18 ms | 0.52 |
-| H-infinity, 61 states of a stage: norm 0.902 | 0.59 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 20 ms | slycot ab13md, the upper one | 13 ms | 0.68 |
-| poles of a close pair in noise: error 5e-07 | 0.33 s | scikit-rf: 7e-07 | 0.28 s | 0.84 |
-| a sparse OUTPUT4 file of Nastran | 12 ms | pyYeti | 35 ms | 2.8 |
+| 24 modes of a solid, 27 783 DOFs | 4.2 s | scipy eigsh | 35 s | 8.3 |
+| 24 modes of a plate, 30 603 DOFs | 1.5 s | scipy eigsh on CHOLMOD | 1.6 s | 1 |
+| all 243 modes of a plate, dense | 14 ms | scipy eigh | 5.6 ms | 0.39 |
+| 200 lines of a plate's responses, 30 000 DOFs | 2.4 s | scipy splu (4 of them) | 590 s | 250 |
+| 8 x 8 frequency responses, 10 000 lines | 9.9 ms | python-control, slycot | 0.22 s | 23 |
+| H-infinity norm, 48 states, 0.1 % damping | 4.4 ms | slycot ab13dd | 2.5 ms | 0.57 |
+| the same, A dense | 3.7 ms | slycot ab13dd | 2.5 ms | 0.68 |
+| H2 norm, 200 states | 4.8 ms | python-control, slycot | 9 ms | 1.9 |
+| zero-order hold, 48 states | 0.19 ms | scipy cont2discrete | 0.18 ms | 0.95 |
+| a discrete Riccati equation, 48 states | 5.5 ms | scipy solve_discrete_are | 9.1 ms | 1.7 |
+| 100 000 samples through a Kalman filter | 60 ms | filterpy (5000 of them) | 9.2 s | 150 |
+| 100 000 samples of a loop, 212 states | 100 ms | python-control | 1.6 s | 16 |
+| the same, commands saturated | 2.8 s | python-control (2000 of them) | 6 s | 2.1 |
+| H-infinity, 3 states: norm 0.137 | 28 ms | python-control, slycot: 0.137 | 23 ms | 0.82 |
+| H-infinity, 61 states of a stage: norm 0.901 | 0.66 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 31 ms | slycot ab13md, the upper one | 15 ms | 0.49 |
+| poles of a close pair in noise: error 5e-07 | 0.55 s | scikit-rf: 7e-07 | 0.34 s | 0.61 |
+| a sparse OUTPUT4 file of Nastran | 16 ms | pyYeti | 36 ms | 2.3 |
 
 Peers are faster where checks are not wanted. For all modes of the plate, a third of the time goes
 into residuals, and a third into the separation of rigid-body motions and the full accuracy of soft
 modes. The zero-order hold returns a checked system with names. H-infinity of 3 states is bounded
 to 1 % and its norm computed twice. mu has a lower bound too, from a perturbation that reaches it.
-On plates of 10 000 to 300 000 DOFs eigsh with a factor of CHOLMOD or PARDISO is 1.4 to 1.8 times
-faster than `solve_modes`, on solids 0.85 to 2 times (``tests/benchmarks/modes_peers.py``). ``python
+With a factor of CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs, as
+fast on plates of 30 000 and 99 000, and takes twice as long on a solid of 28 000 DOFs
+(``tests/benchmarks/modes_peers.py``, whose peer is the wheel `sksparse-minimal`). ``python
 -m pytest -n 0 -m benchmark -s tests/benchmarks`` times many more.
 
 **Limits**

@@ -81,8 +81,13 @@ def superlu(A):
 
 
 def cholmod(A):
-    """CHOLMOD, where scikit-sparse is installed."""
-    return fx.sparse.Cholmod().factored(A).solve
+    """CHOLMOD, by the wheel of sksparse-minimal, which needs no compiler."""
+    from sksparse_minimal import SparseCholesky
+
+    A = sp.csc_matrix(A)
+    A.sort_indices()
+    A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
+    return SparseCholesky(A).solve_A
 
 
 FACTORS = {"ours_on_cholmod": fx.sparse.Cholmod()}
