@@ -10,7 +10,7 @@ from flexplant import DofSet, load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
 from flexplant.loop import SpillOver, close_loop
-from flexplant.loop.other_machines import growing_modes
+from flexplant.loop.other_machines import growing_modes, modes_in_words
 from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,
@@ -115,6 +115,12 @@ def test_the_named_modes_are_the_cause():
     assert stability(dense(whole, errors, found.system, only)[0], whole.dt) > 0
     for number, freq in zip(named, found.left_out.freq, strict=True):
         assert freq == pytest.approx(many().freq[number - 1], rel=0.02)
+
+
+def test_a_pole_that_modes_share_is_given_once():
+    said = modes_in_words((1, 2, 5, 7), (63.456, 63.456, 63.456, 80.0))
+    assert said == "modes 1, 2, 5 (at 63.46 Hz), mode 7 (at 80 Hz)"
+    assert modes_in_words((), ()) == "no mode named"
 
 
 @pytest.mark.slow

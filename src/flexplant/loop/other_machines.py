@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -138,11 +140,15 @@ def _db(margin: float) -> str:
 
 
 def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
-    """Return a text of modes, the first few of many."""
-    listed = [f"mode {n} (at {f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
-    more = len(listed) - SHOWN
-    first = ", ".join(listed[:SHOWN]) or "no mode named"
-    return first + (f" and {more} more" if more > 0 else "")
+    """Return a text of modes, the first few of many; a pole of several modes is given once."""
+    pairs = list(zip(modes, freq, strict=True))
+    listed = []
+    for pole, sharing in groupby(pairs[:SHOWN], key=itemgetter(1)):
+        numbers = [str(number) for number, _ in sharing]
+        several = "s" if len(numbers) > 1 else ""
+        listed.append(f"mode{several} {', '.join(numbers)} (at {pole:.4g} Hz)")
+    more = len(pairs) - SHOWN
+    return (", ".join(listed) or "no mode named") + (f" and {more} more" if more > 0 else "")
 
 
 def high(margin: float, without: float) -> bool:
