@@ -276,7 +276,8 @@ _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
-#: distance of a mode from a bandwidth, in logarithms, within which it resonates there
+#: a bandwidth is next to a resonance when a mode lies within this of it, and the gain of the axis
+#: differs by more than this from that on the real axis; in logarithms
 _RESONANT = 0.2
 #: wide leads are tried where a mode lies above the bandwidth within this factor
 _NEAR = 4.0
@@ -319,36 +320,41 @@ class ServoTask:
                     f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
                     f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
                 )
-        best = self._law(driven, np.abs(gains_at(self.plant, driven)))
-        modes = elastic(self.plant)[:, None]
-        if not np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT) or self._serves(best):
-            return best
+        exact, smooth = np.abs(gains_at(self.plant, driven)), (2.0 * np.pi * driven.freq) ** -2.0
+        best, modes = self._law(self._plain(driven, exact)), elastic(self.plant)[:, None]
         # next to a resonance the response says little of the axis: that on the real axis does
-        other = self._law(driven, (2.0 * np.pi * driven.freq) ** -2.0)
-        return other if self._serves(other) else best
+        near = np.any(np.abs(np.log(modes / driven.freq)) < _RESONANT, axis=0)
+        if not np.any(near & (np.abs(np.log(exact / smooth)) > _RESONANT)) or self._serves(best):
+            return best
+        other = self._plain(driven, smooth)
+        if self.radius(other) < 1.0 and self._serves(other := self._law(other)):
+            return other
+        return best
 
-    def _law(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
-        """Return the laws of axes whose plant has these gains at the bandwidths."""
-
-        def of(lines: tuple[str, ...], lead: float = LEADS[0]) -> ServoLaw:
-            each = zip(lines, driven.freq, gains, strict=True)
-            axes = (self.axis(n, float(f), float(g), lead) for n, f, g in each)
-            return ServoLaw(driven, tuple(axes))
-
-        tried = [of(lines) for lines in combinations(lines_of(self.plant, driven))]
+    def _plain(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
+        """Return the laws, without notches, on the best lines of axes with these gains."""
+        tried = [
+            ServoLaw(driven, tuple(map(self.axis, lines, driven.freq.tolist(), gains.tolist())))
+            for lines in combinations(lines_of(self.plant, driven))
+        ]
         able = [one for one in tried if self.phase_margins(one).min() > 0.0]
-        if not able:
-            return tried[0]
-        lines = tuple(axis.line for axis in self._best(able).axes)
-        best = self._settling(self.notched(of(lines)))
-        modes, lowest = elastic(self.plant), float(driven.freq.min())
-        if "mass" not in lines or not np.any((modes > lowest) & (modes < _NEAR * lowest)):
+        return self._best(able) if able else tried[0]
+
+    def _law(self, plain: ServoLaw) -> ServoLaw:
+        """Return the law with notches, lead and integral action."""
+        if self.phase_margins(plain).min() <= 0.0:
+            return plain
+        best = self._settling(self.notched(plain))
+        modes, lowest = elastic(self.plant), float(plain.driven.freq.min())
+        near = bool(np.any((modes > lowest) & (modes < _NEAR * lowest)))
+        if not near or all(axis.line != "mass" for axis in plain.axes):
             return best
         for lead in LEADS[1:]:
             # the widest leads only where the others do not serve: they cost most noise
             if lead != LEADS[1] and self._holds(best, TARGET):
                 break
-            wide = self.notched(of(lines, lead))
+            axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
+            wide = self.notched(plain._replace(axes=tuple(axes)))
             if self._best([best, wide]) is wide:
                 wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
@@ -403,7 +409,7 @@ class ServoTask:
         stable = (law for law in rising if self.radius(law) < 1.0)
         return next(stable, None) or min(rising, key=self.radius)
 
-    def axis(self, line: str, bandwidth: float, gain: float, lead: float) -> Axis:
+    def axis(self, line: str, bandwidth: float, gain: float, lead: float = LEADS[0]) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""
         wide = line == "mass" and lead != LEADS[0]
         usual = min((lead if wide else _ROLLOFF[line]) * bandwidth, 0.4 * self.rate)
