@@ -65,11 +65,14 @@ def design_servo(
     free body, or above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``,
     on a damper line ``k (1 + w_i / s) F(s)``, on a spring line ``k F(s) / s``, and ``k F(s)`` if
     the response is zero at rest. F is a second-order roll-off and the notches. The gain k makes the
-    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. If two lines
-    are close, the one with the smaller peak of |S| at u is used. In the same way the lead of a mass
-    line is chosen wide (16 instead of 4) if a mode lies above the bandwidth within a factor of 4. A
-    wide lead suppresses the error up to a higher frequency, but less at low frequencies: pass
-    `integrator` if errors must settle sooner than the margin allows. The certificate is for the
+    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. Next to a
+    resonance, where the law of that gain does not hold 6 dB, the gain on the real axis is used if
+    its law does. If two lines are close, the one with the smaller peak of |S| at u is used. In the
+    same way the lead of a mass line is chosen wide (16 instead of 4, or 64 where 16 does not hold
+    6 dB) if a mode lies above the bandwidth within a factor of 4. A wide lead suppresses the error
+    up to a higher frequency, but less at low frequencies, and passes more noise to the actuators. A
+    notch takes the poles of its mode out of the loop; its width is chosen by |S|. Roll-off and
+    notches keep their frequencies under Tustin's rule. The certificate is for the
     loop that will run: with observer, flexible modes and delay, and with the truncated modes if
     they are known.
     `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
@@ -87,11 +90,12 @@ def design_servo(
         Channels of z (axes of POIs) or y (sensors) to control, as for
         `flexplant.plant.driven_axes`.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass, below half the rate; by default 8 bandwidths (16 with a
-        wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
+        Corner of the second-order low-pass, below half the rate; by default 8 bandwidths (16 or 64
+        with a wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
     integrator : float [Hz], optional
-        Corner of the integral action; by default a tenth of the bandwidth, with a wide lead down to
-        a fiftieth, the fastest that raises |S| at u by at most 10 %.
+        Corner of the integral action; by default a tenth of the bandwidth. With a wide lead it is
+        the fastest up to that which raises |S| at u by at most 10 %; on springs it is up to half
+        the bandwidth, where |S| at a twentieth of the bandwidth would exceed 0.3 otherwise.
     notches : sequence of float [Hz], optional
         Frequencies of resonances to notch, each below half the rate. By default they are placed at
         the plant's modes, one by one, while |S| at u is above 6 dB (or the loop is unstable) and a
@@ -213,8 +217,9 @@ def servo_bandwidth(
 
     Plant and observer are swept once over a grid that includes their resonances. The loop is broken
     at the plant's input, as in `modulus_margin`; the observer still reads u. A bandwidth that keeps
-    the peak on this grid is accepted if its eigenvalues are stable and `modulus_margin` keeps the
-    peak, also with truncated modes if they are known. Bandwidths are tried in steps of 9 %, from
+    the peak on this grid is accepted if its eigenvalues are stable, every axis with a reference has
+    |S| of at most 0.3 at a twentieth of it, and `modulus_margin` keeps the peak, also with
+    truncated modes if they are known. Bandwidths are tried in steps of 9 %, from
     the top down, then between the first success and the step above it.
 
     Parameters
