@@ -74,8 +74,7 @@ def design_servo(
     notch takes the poles of its mode out of the loop; its width is chosen by |S|. Roll-off and
     notches keep their frequencies under Tustin's rule. The certificate is for the
     loop that will run: with observer, flexible modes and delay, and with the truncated modes if
-    they are known.
-    `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
+    they are known. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
