@@ -19,14 +19,15 @@ from flexplant.lti import (
     balancing,
     control_care,
     controllability_gramian,
+    equations,
     lyapunov,
     norms,
     response_solvers,
+    riccati,
     solve_lyapunov,
     solve_stein,
 )
 from flexplant.lti import norms as h2_norms
-from flexplant.lti import riccati as doubling
 from flexplant.parallel import CHUNK, PROBE, mapped
 from flexplant.synthesis.hinf import hinf_design as attempts
 from flexplant.synthesis.laws import servo_design as servo
@@ -233,9 +234,9 @@ def loaded(g):
         ),
         (norms, "_proved", flexplant.hinf_norm),
         (h2_norms, "controllability_gramian", flexplant.h2_norm),
-        (doubling, "stable_subspace", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
-        (lyapunov, "symmetric", lambda g: solve_lyapunov(g.A, np.eye(2))),
-        (lyapunov, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
+        (riccati, "_solution", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
+        (equations, "symmetric", lambda g: solve_lyapunov(g.A, np.eye(2))),
+        (equations, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
         (lyapunov, "is_block_diagonal", controllability_gramian),
         (balancing, "split_stable", lambda g: balanced(g, order=1)),
         (kalman, "auto_filter_design", lambda g: flexplant.design_kalman(machines.stage())),
