@@ -129,8 +129,12 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
 
 
 def sampled_moves(dofs: DofSet) -> IntArray:
-    """Return positions of a random sample of the translations, which favours no direction."""
+    """Return positions of a random sample of the translations, which favours no direction.
+
+    Of a structure that only turns, such as a train of gears, the rotations.
+    """
     moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
+    moves = moves or list(range(len(dofs.directions)))
     return np.asarray(np.random.default_rng(0).permutation(moves)[:PLACES])
 
 

@@ -430,6 +430,10 @@ class Structure(Protocol):
     """Protocol of a model with k coordinates for plants: FEModel, Modes and ReducedModel."""
 
     @property
+    def dofs(self) -> DofSet:
+        """The DOFs among the coordinates, which come first."""
+
+    @property
     def full_dofs(self) -> DofSet:
         """The n DOFs of the structure, with their coordinates."""
 
