@@ -13,8 +13,8 @@ pairs of suspension modes had a sentence in the interval's place.
 Measured on seeds from 31000 to 31012, which were not used before, in the order z, rx, ry, margin,
 bandwidth, MA: 12 of 13 plates with masses are stated and hold 11, 10, 12, 12, 12, 12 of 12; 12 of
 13 soft pairs 9, 11, 12, 11, 12, 12 of 12; 13 of 13 solids on springs 12, 13, 9, 13, 13, 13 of 13.
-That is 209 of 222 (94 %). Where nothing is stated the model is said to lack something. Polynomials of
-order 13, used before, made the modes of the machines above the fortieth up to 30 % too high, and
+That is 209 of 222 (94 %). Where nothing is stated the model is said to lack something. Polynomials
+of order 13, used before, made the modes of the machines above the fortieth up to 30 % too high, and
 their errors 5 to 25 % too small.
 """
 
