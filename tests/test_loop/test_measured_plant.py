@@ -3,10 +3,12 @@
 Model and machine are one mesh: the exact response of the machine is the oracle of what is measured.
 """
 
+from collections import Counter
 from functools import cache
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_static
@@ -19,6 +21,7 @@ from flexplant.loop import (
     modulus_margin,
     sensitivity,
 )
+from flexplant.loop.measured_loop import broken_count, measured_between
 from flexplant.lti import Frf, StateSpace, frequency_response
 from flexplant.plant import Sensor, assemble_plant
 from flexplant.synthesis import design_servo
@@ -193,3 +196,54 @@ def test_a_measurement_held_by_python_control_is_a_measured_plant():
         sensitivity((frf, frd))
     with pytest.raises(ModelError, match="FrequencyResponseData, got int"):
         Frf.from_control(3)
+
+
+def lqg(seed):
+    """A free mass with a mode, in one or two axes, and a filter that models a narrow disturbance.
+
+    The disturbance lies below the lines from 20 Hz or between them; its poles decay or grow.
+    """
+    rng = np.random.default_rng(seed)
+    m = int(rng.integers(1, 3))
+    w, zeta = np.append(np.zeros(m), 2 * np.pi * rng.uniform(150, 900)), 0.02
+    phi = np.vstack([np.eye(m), 0.3 * rng.standard_normal((1, m))])
+    A = la.block_diag(*[[[0, 1], [-(a**2), -2 * zeta * a]] for a in w])
+    B, C = np.zeros((len(A), m)), np.zeros((m, len(A)))
+    B[1::2], C[:, ::2] = phi, phi.T
+    wd = 2 * np.pi * (rng.uniform(1, 15) if seed % 3 else rng.uniform(25, 80))
+    grows = rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2.5)
+    Ad = np.kron(np.eye(m), [[0, 1], [-(wd**2), 2 * grows * wd]])
+    Cd = np.kron(np.eye(m), [[wd, 0.0]])
+    Ae = np.block([[A, B @ Cd], [np.zeros((2 * m, len(A))), Ad]])
+    Be, Ce = np.vstack([B, np.zeros((2 * m, m))]), np.hstack([C, np.zeros((m, 2 * m))])
+    fed = np.kron(np.eye(m), np.diag([0.0, wd**2])) * 10 ** rng.uniform(-2, 2)
+    R = np.eye(m) * (2 * np.pi * rng.uniform(15, 50)) ** -4
+    L = la.solve_continuous_are(Ae.T, Ce.T, la.block_diag(B @ B.T, fed), R) @ Ce.T @ la.inv(R)
+    F = np.hstack([la.inv(R) @ B.T @ la.solve_continuous_are(A, B, C.T @ C, R), Cd])
+    gain = rng.choice([1.0, 1.0, 0.3, 3.0])
+    return A, B, C, Ae - Be @ F - L @ Ce, L, -gain * F
+
+
+@pytest.mark.slow
+def test_narrow_poles_of_the_controller_below_and_between_the_lines_are_counted_or_not_known():
+    f, known = np.arange(20.0, 1500.0), Counter()
+    for seed in range(40):
+        try:
+            A, B, C, Ak, Bk, Ck = lqg(seed)
+        except (la.LinAlgError, ValueError):
+            continue
+        K = StateSpace(
+            Ak,
+            Bk,
+            Ck,
+            np.zeros((len(Ck), len(C))),
+            inputs=[f"y{i}" for i in range(len(C))],
+            outputs=[f"u{i}" for i in range(len(Ck))],
+        )
+        resolvent = np.linalg.inv(2j * np.pi * f[:, None, None] * np.eye(len(A)) - A)
+        P = Frf(f, np.moveaxis(C @ resolvent @ B, 0, -1), inputs=K.outputs, outputs=K.inputs)
+        poles = la.eigvals(np.block([[A, B @ Ck], [Bk @ C, Ak]]))
+        found = broken_count(measured_between(P, K, {}), None, 0).unstable
+        known[bool(np.any(la.eigvals(Ak).real > 0.0)), found is not None] += 1
+        assert found in (None, np.count_nonzero(poles.real > 0.0)), seed
+    assert known[True, True] > 8 and known[False, True] > 8

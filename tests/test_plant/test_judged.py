@@ -126,6 +126,12 @@ def test_a_response_from_20_hz_up_that_holds_a_delay_judges_a_slow_filter_with_i
         found = fx.close_loop(plant, observer, servo)
         margin = found.completed.modulus_margin
         assert found.on_measurement.margin == pytest.approx(margin, rel=0.02)
+    # measured from sample to sample, where a delay is usual: it says that it adds the plant's
+    texts = [
+        repr(fx.close_loop(JUDGED.measured(given, hold=False, delay=d), observer, servo))
+        for d in (0.0, 1.5)
+    ]
+    assert ["with 1.5 samples of delay added" in text for text in texts] == [True, False]
     with pytest.raises(fx.errors.ModelError, match="delay counts samples"):
         JUDGED.continuous.measured(given, delay=0.7)
 

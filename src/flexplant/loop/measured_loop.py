@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..lti.frequency import Frf, frequency_response
-from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
+from ..lti.frequency_sweep import around_resonance
+from ..lti.measured_lines import FEWEST, SHOWN, STEP, HiddenModes, free_motions, low_slope, on_lines
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..tolerances import SAME, TINY
+from ..tolerances import MOST_STEPS, SAME, TINY
 from ..words import flag, instance
-from .broken import BrokenLoop
+from .broken import BrokenLoop, inverted
 
 #: degrees of freedom above which a variance is not averaged
 _FREEDOM = 20.0
@@ -237,6 +238,9 @@ _SLOPE = 0.75
 #: measured plant is extrapolated; number of lines per decade there
 _BELOW, _DENSE = 1e-3, 50
 
+#: error of a plant below its lines: a suspension at a third of the lowest line adds this fraction
+_ROUGH = 0.1
+
 
 class NyquistCount(NamedTuple):
     """Unstable poles of a closed loop by the argument principle; None: the reason says why."""
@@ -256,31 +260,51 @@ def nyquist_count(
     rigid: int,
     at_zero: int,
     unstable: int,
-    slowest: float,
+    poles: ComplexArray,
 ) -> NyquistCount:
     """Return the unstable poles of ``u = K P u``, counted on the lines and between them.
 
     From 0+ to the highest frequency the argument of ``F = det(I - K P)`` changes by
     ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
-    loop. Below the lines and the controller's `slowest` pole [Hz] F continues as ``c / (i w)^n0``,
-    c real; above the lines it ends positive.
+    loop. Below the lines and the `poles` s / (2 pi) [Hz] of the controller F continues as
+    ``c / (i w)^n0``, c real; above the lines it ends positive. Around narrow poles of the
+    controller, which is known everywhere, F is followed between the lines and below them. A count
+    that hangs on an error of the continued plant is not known.
     """
-    freq, L = _continued(lines, plant, controller, rigid, slowest)
-    F = np.linalg.det(np.eye(L.shape[-1]) - L)
+    slowest = float(np.abs(poles).min(initial=np.inf))
+    reach = _BELOW * min(1.0, slowest / float(lines[0]))
+    low = lines[0] * np.geomspace(reach, 1.0, round(-_DENSE * np.log10(reach)))[:-1]
+    freq = np.concatenate([low, lines])
+
+    def gain(at: FloatArray) -> ComplexArray:
+        P = _continued(lines, plant, rigid, at)
+        return np.asarray(np.einsum("uyf,yvf->fuv", controller(at), P))
+
+    F = np.linalg.det(np.eye(plant.shape[1]) - gain(freq))
     if not np.all(np.abs(F) > 0.0):
         return NyquistCount(None, "a line lies on the critical point")
-    below_lines = freq.size - lines.size
-    below = np.angle(F[1 : below_lines + 1] / F[:below_lines])
-    steps = np.concatenate([below, hidden.step])
+    path = _past_poles(freq, poles)
+    places, turns = _followed(gain, freq, path, below=low.size)
+    direct = np.angle(F[1:] / F[:-1])
+    steps, unknown, undecided = (
+        np.concatenate([np.zeros(low.size, dtype=part.dtype), part])
+        for part in (hidden.step, hidden.unknown, hidden.undecided)
+    )
+    other = np.abs(turns - direct[places]) > np.pi
+    # where a mode of the plant and a pole of the controller turn F, neither path holds both
+    both = other & (places >= low.size) & (np.abs(steps - direct)[places] > np.pi)
+    unknown[places] |= both | np.isnan(turns)
+    steps[places] = np.where(other | (places < low.size), turns, steps[places])
     for open_, what in (
-        (hidden.unknown, "the phase turns too far for its path to be known"),
-        (hidden.undecided, "may be a mode that is unstable in the loop if it is slightly narrower"),
+        (unknown, "the phase turns too far for its path to be known"),
+        (undecided, "may be a mode that is unstable in the loop if it is slightly narrower"),
     ):
         if open_.any():
-            low, high = lines[int(np.argmax(open_)) :][:2]
+            begin, end = freq[int(np.argmax(open_)) :][:2]
+            place = "between the lines at" if begin >= lines[0] else "below the lines, between"
             return NyquistCount(
                 None,
-                f"between the lines at {low:.4g} and {high:.4g} Hz {what}: measure with a finer "
+                f"{place} {begin:.4g} and {end:.4g} Hz {what}: measure with a finer "
                 "resolution there, or give the loop less gain at that resonance",
             )
     grows = -float(np.polyfit(np.log(freq[:3]), np.log(np.abs(F[:3])), 1)[0])
@@ -293,21 +317,31 @@ def nyquist_count(
         )
     last = float(np.angle(F[-1]))
     start = float(np.angle(F[0])) + 0.5 * np.pi * at_zero  # the argument of c: a multiple of pi
-    low = start - np.pi * np.round(start / np.pi)
-    for miss, place, where in ((low, freq[0], "lower"), (last, freq[-1], "higher")):
+    first = start - np.pi * np.round(start / np.pi)
+    for miss, place, where in ((first, freq[0], "lower"), (last, freq[-1], "higher")):
         if abs(miss) > _END:
             return NyquistCount(
                 None,
                 f"at {place:.4g} Hz the loop gain has not reached its limit (the phase is "
                 f"{np.degrees(abs(miss)):.0f} deg off): measure at {where} frequencies",
             )
-    change = low + float(np.sum(steps)) - last
+    change = first + float(np.sum(steps)) - last
     count = unstable + 0.5 * at_zero - change / np.pi
     if abs(count - round(count)) > 0.05 or round(count) < 0:
         return NyquistCount(
             None,
             f"the phase turns so that {count:.3g} poles would be unstable: state the rigid-body "
             "and the unstable poles that the plant has",
+        )
+    early = path[path < lines[0]]
+    own = np.linalg.eigvals(gain(early))
+    peak = np.abs(own / (1.0 - own)).max(axis=1)  # 1 / peak: factor on P that F = 0 needs
+    if peak.max() * _ROUGH > 1.0:
+        return NyquistCount(
+            None,
+            f"below the lines, at {early[np.argmax(peak)]:.4g} Hz, the loop is so close to the "
+            f"critical point that the plant must be known there to {100.0 / peak.max():.2g} %: "
+            "measure at lower frequencies",
         )
     widest = int(np.argmax(hidden.width))
     near = float(0.5 * np.sum(lines[widest : widest + 2]))
@@ -334,7 +368,7 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
     plant = parts.plant(grid)
     rigid = free_motions(grid, plant) if rigid is None else rigid
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
-    slowest = float(np.abs(distance[~zero]).min(initial=np.inf)) / (2 * np.pi * (parts.dt or 1.0))
+    swing = distance[~zero] / (2j * np.pi * (parts.dt or 1.0))
     slope = low_slope(grid, plant)
     if abs(slope - (2 if rigid else 0)) > 1.0:
         return NyquistCount(
@@ -345,18 +379,56 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         )
     return nyquist_count(
         grid, plant, parts.controller, parts.hidden,
-        rigid=rigid, at_zero=at_zero, unstable=unstable + own, slowest=slowest,
+        rigid=rigid, at_zero=at_zero, unstable=unstable + own, poles=swing,
     )  # fmt: skip
 
 
+def _past_poles(freq: FloatArray, poles: ComplexArray) -> FloatArray:
+    """Return frequencies and those around poles that they do not resolve."""
+    place = np.searchsorted(freq, poles.real) - 1
+    inside = (place >= 0) & (place < freq.size - 1)
+    poles, wide = poles[inside], np.diff(freq)[place[inside]]
+    narrow = poles[2.0 * np.abs(poles.imag) < SHOWN * wide]
+    near = narrow.real + np.abs(narrow.imag) * around_resonance()[:, None]
+    return np.union1d(freq, near[(near > freq[0]) & (near < freq[-1])])
+
+
+def _followed(
+    gain: Callable[[FloatArray], ComplexArray], freq: FloatArray, path: FloatArray, below: int
+) -> tuple[IntArray, FloatArray]:
+    """Return the intervals that the path divides or that lie below the lines, and steps of F there.
+
+    A step is NaN where halving does not make it small.
+    """
+    # det(M) with M = I - L turns as the eigenvalues of M(high) M(low)^-1 do, each of which shows
+    # a turn that cancels in their product
+    place = np.searchsorted(freq, path[:-1], side="right") - 1
+    divided = np.bincount(place, minlength=freq.size - 1) > 1
+    divided[:below] = True
+    low, high = path[:-1][divided[place]], path[1:][divided[place]]
+    steps = np.zeros(freq.size - 1)
+    for _ in range(MOST_STEPS):
+        if not low.size:
+            break
+        L = gain(high)
+        turn = np.angle(np.linalg.eigvals((np.eye(L.shape[-1]) - L) @ inverted(gain(low))))
+        small = np.abs(turn).max(axis=1) <= STEP
+        place = np.searchsorted(freq, low, side="right") - 1
+        np.add.at(steps, place[small], turn[small].sum(axis=1))
+        middle = 0.5 * (low + high)[~small]
+        low, high = (np.sort(np.append(end[~small], middle)) for end in (low, high))
+    steps[np.searchsorted(freq, low, side="right") - 1] = np.nan
+    places = np.flatnonzero(divided)
+    return places, steps[places]
+
+
 def _continued(
-    freq: FloatArray, plant: ComplexArray, controller: Responder, rigid: int, slowest: float
-) -> tuple[FloatArray, ComplexArray]:
-    """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines."""
+    lines: FloatArray, plant: ComplexArray, rigid: int, freq: FloatArray
+) -> ComplexArray:
+    """Return a measured plant (ny, nu, n) on its lines, between them and below them."""
     # below the lines: the largest directions, those of the rigid-body modes, fall with f^2, the
     # others are constant; the imaginary part (delay) falls with another factor f
-    reach = _BELOW * min(1.0, slowest / float(freq[0]))
-    low = np.geomspace(reach, 1.0, round(-_DENSE * np.log10(reach)))[:-1]
+    low = freq[freq < lines[0]] / lines[0]
     first = plant[:, :, 0]
     left, sizes, right = np.linalg.svd(first.real)
     to, fro = left[:, :rigid], right[:rigid]
@@ -368,6 +440,4 @@ def _continued(
         return np.asarray((whole.real + 1j * low * whole.imag) / fall)
 
     below = over(free, low**2) + over(held, np.ones(low.size))
-    every = np.concatenate([low * freq[0], freq])
-    P = np.concatenate([below, plant], axis=2)
-    return every, np.einsum("uyf,yvf->fuv", controller(every), P)
+    return np.concatenate([below, on_lines(lines, plant, freq[low.size :])], axis=2)

@@ -28,6 +28,9 @@ class OnMeasurement(Value):
         Where |S| at u is largest.
     reason : str
         Why the stability is not known; else empty.
+    added : float [samples]
+        Delay of the plant that was added to a response measured from sample to sample, which may
+        contain it.
 
     Examples
     --------
@@ -39,6 +42,7 @@ class OnMeasurement(Value):
     margin: float
     freq: float
     reason: str = ""
+    added: float = 0.0
 
     @property
     def is_unstable(self) -> bool:
@@ -49,13 +53,16 @@ class OnMeasurement(Value):
     def summary(self) -> str:
         """The finding in words."""
         if self.reason:
-            return f"on the measured response: stability not known, {self.reason}"
-        if self.is_unstable:
-            return "on the measured response: unstable"
-        return (
-            f"on the measured response: stable, modulus margin {self.margin:.3g} at "
-            f"{self.freq:.4g} Hz"
+            found = f"stability not known, {self.reason}"
+        elif self.is_unstable:
+            found = "unstable"
+        else:
+            found = f"stable, modulus margin {self.margin:.3g} at {self.freq:.4g} Hz"
+        added = (
+            f" (with {self.added:g} samples of delay added, as the response was said to contain "
+            "none: else plant.measured(..., delay=))"
         )
+        return f"on the measured response: {found}{added if self.added else ''}"
 
     def __repr__(self) -> str:
         return f"<OnMeasurement: {self.summary}>"
@@ -77,6 +84,7 @@ def judged(loop: Any, known: MeasuredResponse) -> OnMeasurement | None:
     parts = measured_between(frf, law, {})
     count = broken_count(parts, None, 0)
     peak, freq = parts.worst("u", bool(parts.mixed("u")))
+    added = plant.delay if plant.dt and not (known.hold or known.delay) else 0.0
     if count.unstable is None:
-        return OnMeasurement(float("nan"), freq, count.reason)
-    return OnMeasurement(0.0 if count.unstable else 1.0 / peak, freq)
+        return OnMeasurement(float("nan"), freq, count.reason, added)
+    return OnMeasurement(0.0 if count.unstable else 1.0 / peak, freq, added=added)

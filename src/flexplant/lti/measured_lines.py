@@ -159,9 +159,9 @@ _ASIDE = 0.25
 #: counts as found; and fraction of its shift to which the fits must agree
 _SAFETY, _FOUND, _ALIKE = 2.0, 0.3, 0.5
 #: half-power width relative to the distance of lines above which lines resolve a mode
-_SHOWN = 4.0
+SHOWN = 4.0
 #: phase step of det(I - L) between two lines above which its path is not known
-_STEP = 0.6 * np.pi
+STEP = 0.6 * np.pi
 #: number of lines of the three fits of an interval
 FEWEST = LINES + 2
 
@@ -261,9 +261,9 @@ def _hidden_modes(
     found = there & alike & (width.min(axis=0) > -error)
     turn = _phase_change(p + d, wide) - _phase_change(p, wide)
     turns = np.round((turn - step) / (2.0 * np.pi))
-    followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < _STEP
+    followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < STEP
     followed &= turns.max(axis=0) == turns.min(axis=0)
-    far = np.abs(step) > _STEP  # also next to a mode of a neighbouring interval
+    far = np.abs(step) > STEP  # also next to a mode of a neighbouring interval
     turns = np.where(found | (far & alike & followed), turns[0], 0.0)
     unknown = np.where(found, ~followed, far & ~(alike & followed))
     critical = np.max(np.where(acts, np.where(found, needed, size), 0.0), axis=0, initial=0.0)
@@ -282,7 +282,7 @@ def _hidden_modes(
         step + 2.0 * np.pi * turns,
         unknown,
         undecided,
-        np.minimum(2.0 * narrow, _SHOWN * wide),
+        np.minimum(2.0 * narrow, SHOWN * wide),
         np.unique(through),
     )
 
