@@ -197,7 +197,7 @@ def _lacks(plant: PartitionedSystem, group: list[_Pole], case: _Case, rate: floa
         return []
     if rigid.size:
         shapes = (bases[0] @ missing)[rigid].real
-        return [f"{case.verb} the rigid-body {' and '.join(_axes_in_words(plant, shapes))}"]
+        return [f"{case.verb} the rigid-body {' and '.join(axes_in_words(plant, shapes))}"]
     grows = any(pole.value.real > 0 and not pole.value.imag for pole in group)
     fate = "grows" if grows else "does not decay"
     names = list(dict.fromkeys(_pole_name(plant, pole.value) for pole in group))
@@ -254,7 +254,7 @@ def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(U[:, np.count_nonzero(s > SAME * s[0]) :])
 
 
-def _axes_in_words(plant: PartitionedSystem, combinations: FloatArray) -> list[str]:
+def axes_in_words(plant: PartitionedSystem, combinations: FloatArray) -> list[str]:
     """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.assembled.realisation
     model = realisation.model

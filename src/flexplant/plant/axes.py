@@ -14,6 +14,8 @@ from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import TYPED
 from ..words import name_list
+from .assumptions import axes_in_words
+from .building import rigid_shapes
 from .partitioned import Partition
 from .ports import Poi
 from .realisation import natural
@@ -87,8 +89,10 @@ def driven_axes(
     axes : sequence of str, optional
         Channels of z or y. When not given all axes of the POIs where the actuators move them
         independently, else those of the POIs that have a reference, else those with a reference.
+        A free motion that the actuators move and that none of these shows would drift: for each
+        the displacement sensor that shows it best is an axis, too, one without a reference.
     poi : str, optional
-        The POI whose axes are meant, when `axes` is not given.
+        The POI whose axes are meant, when `axes` is not given; these alone.
 
     Returns
     -------
@@ -97,7 +101,9 @@ def driven_axes(
     Raises
     ------
     AssumptionError
-        When the actuators do not move the axes apart at rest, whatever the frequencies asked.
+        When the actuators do not move the axes apart at rest, whatever the frequencies asked; when
+        neither axes nor POI are given and sensors or actuators do not suffice to hold a free motion
+        that the axes do not show.
     LabelError
         When a channel is not one of the plant's, or the plant has no POI.
 
@@ -114,22 +120,27 @@ def driven_axes(
     plant = Partition.of(plant)
     named = freq.keys() if isinstance(freq, Mapping) else None
     sets = _candidates(plant, axes, poi)
-    first: tuple[str, ...] = ()
+    drifts = ""
     for channels in sets:
-        sigma = _sigmas(plant, channels, freq, named)
         # at rest: above its modes a machine may not pass on what it moves apart below them, and
         # that is a matter of the bandwidth, not of the places
-        if apart(felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, plant.u)):
+        if apart(_at_rest(plant, channels)):
+            if axes is None and poi is None:
+                channels, drifting = _holding(plant, channels)
+                if drifting.size:
+                    drifts = drifts or _drift(plant, channels, drifting)
+                    continue
+            sigma = _sigmas(plant, channels, freq, named)
             gains = {s: felt(plant, s, channels, plant.u) for s in np.unique(sigma)}
             inverse = {s: np.linalg.pinv(G) for s, G in gains.items()}
             late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
             columns = [inverse[s][:, i] / s**2 for i, s in enumerate(sigma)]
             T = np.stack(columns, axis=1) * late
             return DrivenAxes(channels, tuple(plant.u), sigma / (2.0 * np.pi), T)
-        first = first or channels
     raise AssumptionError(
-        f"the actuators ({some_names(list(plant.u)) or 'none'}) do not move these axes apart: "
-        f"{some_names(list(first))}. Add or move actuators, or choose fewer axes, axes=[...]."
+        drifts
+        or f"the actuators ({some_names(list(plant.u)) or 'none'}) do not move these axes apart: "
+        f"{some_names(list(sets[0]))}. Add or move actuators, or choose fewer axes, axes=[...]."
     )
 
 
@@ -157,6 +168,53 @@ def _candidates(
     followed = tuple(one.channel(axis) for one, axis in ports.followed if one in pois)
     sets = [one for one in (every, led, followed) if one]
     return list(dict.fromkeys(sets))
+
+
+def _holding(plant: Partition, channels: tuple[str, ...]) -> tuple[tuple[str, ...], FloatArray]:
+    """Return channels with sensors of free motions that these leave unseen, and what drifts still.
+
+    The second are combinations (k, r) of rigid-body modes that the actuators move.
+    """
+    sensors = [s.name for s in plant.assembled.ports.y if s.order == 0]
+    names, held = [*channels, *sensors], list(channels)
+    seen, push = rigid_shapes(plant, names, plant.u)
+    motions = _spanned(push)[0]
+    moved = seen @ motions.T
+    moved[np.abs(moved).max(axis=1, initial=0.0) <= TYPED * np.abs(seen).max(initial=0.0)] = 0.0
+    shown = dict(zip(names, moved, strict=True))
+
+    def unseen(among: Sequence[str]) -> FloatArray:
+        return _spanned(np.array([shown[name] for name in among]))[1]
+
+    while more := [name for name in sensors if len(unseen([*held, name])) < len(unseen(held))]:
+        distances = np.array([_distance(_at_rest(plant, [*held, name])) for name in more])
+        if distances.max() <= _APART:
+            break
+        # the first of equal ones, so that rounding decides nothing
+        held.append(more[int(np.argmax(distances >= (1.0 - TYPED) * distances.max()))])
+    return tuple(held), unseen(held) @ motions
+
+
+def _drift(plant: Partition, held: Sequence[str], drifting: FloatArray) -> str:
+    """Return which motions (k, r) no axis shows, and what to add, in words."""
+    motions = " and ".join(
+        f"rigid-body mode {int(np.argmax(np.abs(one))) + 1} "
+        f"({axes_in_words(plant, one[:, None])[0]})"
+        for one in drifting
+    )
+    full = len(held) >= len(plant.u)
+    add = "an actuator" if full else "a displacement sensor or a POI that shows it"
+    return (
+        f"the actuators move {motions}, which none of the axes ({some_names(list(held))}) shows, "
+        f"so that it would drift. Add {add}, or name the axes that count, axes=[...]."
+    )
+
+
+def _spanned(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return bases of what rows (p, r) span, whatever their units, and of what they do not."""
+    sizes, basis = np.linalg.svd(rows / divisor(np.linalg.norm(rows, axis=1, keepdims=True)))[1:]
+    rank = int(np.sum(sizes > TYPED * sizes.max(initial=0.0)))
+    return np.asarray(basis[:rank]), np.asarray(basis[rank:])
 
 
 def _channels(pois: Sequence[Poi]) -> tuple[str, ...]:
@@ -208,12 +266,22 @@ def felt(
     return np.asarray(np.where(np.abs(G) > TYPED * most, G, 0.0))
 
 
+def _at_rest(plant: Partition, channels: Sequence[str]) -> FloatArray:
+    """Return the gain (r, m) of channels to the actuators next to rest."""
+    return felt(plant, 2.0 * np.pi * resting_frequency(plant), channels, plant.u)
+
+
 def apart(G: FloatArray) -> bool:
     """Return whether the rows of a gain (r, m) are independent, whatever the channels' units."""
-    if not G.size or G.shape[0] > G.shape[1]:
-        return False
+    return _distance(G) > _APART
+
+
+def _distance(G: FloatArray) -> float:
+    """Return how independent the rows of a gain (r, m) are, from 0 to 1."""
+    if not G.size or G.shape[0] > G.shape[1] or not np.all(np.any(G, axis=1)):
+        return 0.0
     sizes = np.linalg.svd(_balanced(G)[0], compute_uv=False)
-    return bool(np.all(np.any(G, axis=1)) and sizes[-1] > _APART * sizes[0])
+    return float(sizes[-1] / sizes[0])
 
 
 def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:

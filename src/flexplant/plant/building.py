@@ -414,8 +414,16 @@ def warn_of_another_body(own: Partition, other: Partition) -> None:
 
 def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
     """Return the accelerations at outputs per force at inputs, of the modes at 0 Hz alone."""
-    # `rows R m^-1 R' pushes'` with R the free motions and m their mass; filters of the ports count
-    # with their static gains
+    seen, push = rigid_shapes(plant, outputs, inputs)
+    return np.asarray(seen @ push.T)
+
+
+def rigid_shapes(
+    plant: Partition, outputs: Sequence[str], inputs: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return what outputs (p, r) show and inputs (m, r) push of the modes at 0 Hz, of unit mass."""
+    # their product is `rows R m^-1 R' pushes'` with R the free motions and m their mass; filters of
+    # the ports count with their static gains
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     r = realisation.n_rigid
     motions = realisation.outputs[:, 2 * np.arange(r)] * realisation.pairs[:r, 0, 1]
@@ -426,7 +434,7 @@ def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) 
         np.array([side[name] for name in names]).reshape(-1, len(motions)) @ motions
         for side, names in ((places, outputs), (forces, inputs))
     )
-    return np.asarray(seen @ push.T)
+    return np.asarray(seen), np.asarray(push)
 
 
 class WhiteNoise(NamedTuple):

@@ -125,8 +125,8 @@ def design_servo(
     Warns
     -----
     FlexplantWarning
-        When the loop on the POI itself is unstable, or the truncated modes make it unstable or
-        bring |S| at u above 8 dB.
+        When the loop on the POI itself is unstable, the truncated modes make it unstable or bring
+        |S| at u above 8 dB, or a sensor is held at zero while references move the POIs.
 
     Examples
     --------
@@ -166,6 +166,7 @@ def design_servo(
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
+    task.reading.warn_of_held(axes)
     centres = ", ".join(f"{notch.freq:.4g}" for notch in law.notches)
     notes = [f"notches at {centres} Hz"] if centres else []
     if observer is None:
@@ -274,8 +275,7 @@ _ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
 _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 #: faster corners relative to the bandwidth. Up to that of the usual lead the fastest is taken that
 #: raises |S| and lowers the frequency up to which |S| of the references is below 1 by at most this
-#: factor: a tenth, for errors that settle up to five times sooner. Those above it are for axes on
-#: springs that the loop would follow too little otherwise
+#: factor. Those above it are for axes on springs that would follow too little otherwise
 _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
 #: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
 #: bandwidth, which a free mass has with the usual lead

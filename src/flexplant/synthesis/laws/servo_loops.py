@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import ComplexArray, FloatArray
-from ...errors import LabelError
+from ...errors import LabelError, warn
 from ...loop.blocks import as_block
 from ...loop.broken import inverted, largest_sensitivity
 from ...lti.blocks_of_states import Matrices
@@ -345,6 +345,16 @@ class Reading:
     def estimates(self) -> list[str]:
         """What an observer has to give."""
         return [one for channel, one in self.reads.items() if one != channel]
+
+    def warn_of_held(self, axes: Sequence[str] | None) -> None:
+        """Warn of sensors that stand for a motion that no POI shows, where axes are not given."""
+        held = [channel for channel, one in self.reads.items() if one == channel]
+        if axes is None and held and self.references:
+            warn(
+                "no axis of a POI shows a free motion that the actuators move, so that the servo "
+                f"holds {', '.join(held)} at zero, also while references move the POIs. Add a Poi "
+                "that shows this motion to move otherwise, or name the axes, axes=[...]."
+            )
 
 
 @lru_cache(maxsize=_KEPT)
