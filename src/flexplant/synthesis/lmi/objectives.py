@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import FloatArray, between, positive
+from ...errors import SolverError
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
@@ -479,13 +480,17 @@ class ObjectivePrograms:
 
     def smallest(self, rate: float) -> float:
         """Return the smallest bound of what is minimised, sought again in its own unit."""
-        unit = self._guess()
-        for _ in range(_UNITS):
-            found = self._optimum(unit, rate)
-            if 0.1 < found / unit < 10.0:
-                break
+        unit, failure = self._guess(), None
+        for step in range(_UNITS):
+            try:
+                found = self._optimum(unit, rate)
+            except SolverError as error:  # a unit far from the optimum spoils the numbers
+                failure, unit = error, 10.0 * unit
+                continue
+            if 0.1 < found / unit < 10.0 or step == _UNITS - 1:
+                return found
             unit = found
-        return found
+        raise failure or SolverError("the unit of what is minimised did not settle. Report it.")
 
     def _optimum(self, unit: float, rate: float) -> float:
         """Return the smallest bound from one program, in some unit."""
