@@ -14,7 +14,7 @@ PINS = {
     "slow lag": 0.5382,
     "integrator": 0.6028,
     "double integrator, mode": 0.6548,
-    "zero at 10 rad/s": 1.2267,
+    "zero at 10 rad/s": 1.2228,
 }
 
 pytestmark = pytest.mark.slow
