@@ -71,8 +71,8 @@ def design_servo(
     same way the lead of a mass line is chosen wide (16 instead of 4, or 64 where 16 does not hold
     6 dB) if a mode lies above the bandwidth within a factor of 4. A wide lead suppresses the error
     up to a higher frequency, but less at low frequencies, and passes more noise to the actuators. A
-    notch takes the poles of its mode out of the loop; its width is chosen by |S|. Roll-off and
-    notches keep their frequencies under Tustin's rule. The certificate is for the
+    notch has the damping of its mode, which it meets or, of a fast mode, stands below: there the
+    loop tolerates a mode that is elsewhere. Its width is chosen by |S|. The certificate is for the
     loop that will run: with observer, flexible modes and delay, and with the truncated modes if
     they are known. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
