@@ -29,7 +29,7 @@ from ..pipeline import Design, Solution, designed, posed, solved, verified
 from ..preparation import Prepared, badly_scaled
 from .hinf_riccati import Riccati
 from .lower_bound import raised_bound
-from .moved_design import OverPositions, PlantRange
+from .moved_design import PositionDesign, PlantRange
 from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
@@ -148,7 +148,7 @@ def design_hinf(
         if bandwidth is not None and plants:
             weights = stage_weights(list(plants.values())[len(plants) // 2], bandwidth)
             plants = {x: one.weighted(weights) for x, one in plants.items()}
-        return designed(OverPositions(design, progress), PlantRange.of(plants), None)
+        return designed(PositionDesign(design, progress), PlantRange.of(plants), None)
     plant = posed(plant, u, y, what)
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))

@@ -102,7 +102,7 @@ def _mean(plants: Sequence[AnyPlant]) -> AnyPlant:
 
 
 @dataclass(frozen=True)
-class OverPositions(Design):
+class PositionDesign(Design):
     """The controller whose worst norm over the positions is least of those tried.
 
     These are for the mean plant, then for the mean plant with a channel for each row and column
