@@ -257,6 +257,8 @@ class ServoLoop:
         """
         narrow, *wider = _WIDTHS
         best = self._lowest(law, at, size, [self._inverse(mode, narrow) for mode in modes])
+        shallow = replace(best[0], depth=max(best[0].depth, Notch(1.0).depth))  # takes less phase
+        best = min(best, self._lowest(law, at, size, [shallow]), key=lambda one: one[1])
         for width in wider:
             if best[1] <= _BELOW_TARGET * TARGET:
                 break
