@@ -154,7 +154,7 @@ def test_one_flipped_sign_fails_the_check():
             if side == "u"
             else K.replace(B=K.B * signs, D=K.D * signs)
         )
-        with pytest.warns(FlexplantWarning, match=r"unstable .*spectral radius 1\.\d+: mode \d"):
+        with pytest.warns(FlexplantWarning, match=r"unstable .*spectral radius 1\.\d+: modes? \d"):
             checked = checked_loop(problem.replace(evaluation=many()), [wrong]).left_out
         assert not checked.is_stable and checked.modulus_margin == 0.0
 
