@@ -29,7 +29,7 @@ from ..pipeline import Design, Solution, designed, posed, solved, verified
 from ..preparation import Prepared, badly_scaled
 from .hinf_riccati import Riccati
 from .lower_bound import raised_bound
-from .moved_design import PositionDesign, PlantRange
+from .moved_design import PlantRange, PositionDesign
 from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
