@@ -114,13 +114,20 @@ class PreparedLines:
         """Return the same with weights from the residual of a fit, averaged over lines."""
         import scipy.ndimage as ndi
 
-        power = ndi.uniform_filter1d(np.abs(error) ** 2, STRETCH, axis=2, mode="nearest")
-        return self._weighted(power, fitted_share)
+        power = np.maximum(np.abs(error) ** 2, self._rounding())
+        # the noise of an acceleration, as a displacement, falls by decades over a stretch near
+        # zero: its ratio to the power of frequency that fits it best is averaged
+        x = np.log(self.freq) - np.mean(np.log(self.freq))
+        trend = np.exp((np.log(power) @ x)[..., None] / (x @ x) * x)
+        mean = ndi.uniform_filter1d(power / trend, STRETCH, axis=2, mode="mirror")
+        return self._weighted(trend * mean, fitted_share)
+
+    def _rounding(self) -> FloatArray:
+        # 1e-13 of an amplitude: data without noise only have rounding errors
+        return np.asarray(1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True))
 
     def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:
-        # 1e-13 of an amplitude: data without noise only have rounding errors
-        floor = 1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True)
-        variance = np.maximum(power / (1.0 - fitted_share), floor)
+        variance = np.maximum(power / (1.0 - fitted_share), self._rounding())
         return replace(self, weight=np.sqrt(2.0 / variance))
 
 

@@ -100,7 +100,7 @@ def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
 
     One resonance with a distorted circle (leakage, amplitude) looks like this. With one input two
     modes look the same, unless the residual is only noise of a known variance, or one pole at each
-    output explains far less than the two.
+    output explains far less than the two, and separate poles of the outputs hardly more.
     """
     height = strength(fit)
     alike = [mac_matrix(vectors, vectors) > ALIKE for vectors in (fit.shapes, fit.participation)]
@@ -117,15 +117,18 @@ def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
             distorted = (single and (same or not fit.lines.known)) or (
                 (same or single) and coherence(fit, fit.poles[k]) > NOISE
             )
-            if distorted and (same or _one_pole_each(fit, int(k))):
+            if distorted and (same or not _is_shared_pair(fit, int(k))):
                 return int(j), int(k)
     return None
 
 
-def _one_pole_each(fit: PoleFit, weaker: int) -> bool:
-    """Return whether separate poles of the outputs explain as much without a pole as with it."""
+def _is_shared_pair(fit: PoleFit, weaker: int) -> bool:
+    """Return whether two shared poles explain most of what one pole at each output leaves."""
+    # a second pole that stands for differences between outputs leaves more than noise of them
+    if coherence(fit, fit.poles[weaker]) > NOISE or fit.cost > NOISE * own_cost(fit):
+        return False
     rest = refined(fit.lines, *fit.rest(weaker), steps=OWN, strict=False)
-    return own_cost(rest) < NOISE * fit.cost
+    return fit.cost < (1 - MOSTLY) * own_cost(rest)
 
 
 @dataclass(frozen=True, eq=False)
