@@ -491,6 +491,16 @@ def test_differences_at_strong_modes_do_not_make_weak_modes_means_of_separate_fi
     assert np.all(off < 5 * np.abs(found.std[near]))
 
 
+def test_weights_from_residuals_follow_the_noise_of_an_acceleration_to_the_lowest_line():
+    """White noise of an acceleration: its power as a displacement falls by 16 from 5 to 10 Hz."""
+    rng, freq = np.random.default_rng(0), np.arange(5.0, 450.0, 0.5)
+    deviation = (2 * np.pi * freq) ** -2.0 * np.ones((20, 20, 1))
+    error = noisy(np.zeros(deviation.shape, dtype=complex), deviation, rng)
+    ready = prepared_lines(Frf(freq, deviation + error), None).from_residuals(error, 0.0)
+    power = np.mean(2.0 / ready.weight**2 / deviation**2, axis=(0, 1))
+    np.testing.assert_allclose(power, 1.0, rtol=0.25)
+
+
 @pytest.mark.slow
 def test_two_modes_at_one_input_stay_two_without_a_variance():
     """A pair within a bandwidth, of other shapes: they were one mode, and the outputs disagreed."""
