@@ -16,10 +16,10 @@ Every quantity also accepts a measured `fx.Frf` as plant; `in_axes` transforms i
 >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
 >>> loop = fx.close_loop(plant, observer, servo)
 >>> loop.is_stable, round(loop.modulus_margin, 2)
-(True, 0.57)
+(True, 0.58)
 >>> report = fx.loop.report_loops(loop)
 >>> round(report["u1"].phase_margin), round(loop.rms("die:error") * 1e9)
-(41, 248)
+(41, 247)
 
 Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, for a loop
 gain L (a system or a measured `fx.Frf`), for ``(plant, controller)`` or a closed loop;

@@ -80,7 +80,7 @@ class ClosedLoop(Value):
     >>> loop.is_stable, loop.driven
     (True, ('u1',))
     >>> f"{1e9 * loop.rms('die:x'):.0f} nm"
-    '248 nm'
+    '247 nm'
     """
 
     plant: AnyPlant
