@@ -11,7 +11,7 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
-from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
+from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
@@ -19,7 +19,7 @@ from ...tolerances import NEGLIGIBLE, SAME, SPLIT
 from ..preparation import Prepared
 
 #: points of the sweep, and times that it is refined
-_POINTS, _REFINEMENTS = 100, 2
+_POINTS, _REFINEMENTS = 200, 2
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
 
@@ -44,7 +44,7 @@ def pointwise_bound(problem: Prepared) -> float:
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     system = problem.system
     poles = system.poles()
-    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS, around=SOUGHT)])
+    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS)])
     undamped = poles[np.abs(poles.real) <= SPLIT * np.max(np.abs(poles), initial=1.0)]
     apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))
     grid = grid[np.all(apart > SPLIT * (1.0 + np.abs(undamped.imag)), axis=1)]
