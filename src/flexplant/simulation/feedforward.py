@@ -23,7 +23,7 @@ from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
 from ..store import Value
 from ..tolerances import SAME
-from ..words import instance, name_list
+from ..words import flag, instance, name_list
 from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
 from .nonlinear_elements import Acts, split_elements
@@ -152,6 +152,7 @@ def design_feedforward(
     move: SetPointProfile | None = None,
     along: npt.ArrayLike | None = None,
     elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
+    slow_zeros: bool = True,
 ) -> Feedforward:
     """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
 
@@ -194,6 +195,9 @@ def design_feedforward(
     elements : mapping {name: element, or a list of some}, optional
         Elements of actuators and sensors, as for `simulate`: a warning names a `Saturation` that
         the move exceeds, with the required value. The gains do not depend on it.
+    slow_zeros : bool
+        Whether stable slow zeros are inverted by filters. On a machine whose isolators differ by
+        more than their damping from the model, gains alone may leave less.
 
     Returns
     -------
@@ -245,7 +249,8 @@ def design_feedforward(
         raise ModelError("elements are compared with a move: pass design_feedforward(loop, "
                          "move=move, elements=...).")  # fmt: skip
     closed = loop is not None and bool(loop.blocks or move is not None)
-    zeros = axes.slow_zeros(plant, closed) if along is None else None
+    inverted = flag(slow_zeros, "slow_zeros") and along is None
+    zeros = axes.slow_zeros(plant, closed) if inverted else None
     gains = at_rest(axes.inverse(_forced(plant, ()), along, zeros), plant.dt, axes.axes)
     if loop is not None and closed:
         last = highest if move is None else min(highest, move.order)
