@@ -169,7 +169,7 @@ def test_damping_is_that_of_the_machine_through_the_window(lines, off):
 
 @pytest.mark.slow
 def test_segments_too_short_for_the_damping_are_warned_of():
-    """0.05 % in segments of 2 s gives modes of several times the damping."""
+    """0.05 % in segments of 2 s is named; 5 % is not."""
     rate, freqs = 1000.0, np.array([40.0, 85.0, 130.0, 190.0, 240.0])
     rng = np.random.default_rng(1)
     phi, u = rng.normal(size=(3, 5)), rng.normal(size=120_000)
@@ -184,7 +184,6 @@ def test_segments_too_short_for_the_damping_are_warned_of():
         assert all(one.category is FlexplantWarning for one in said)
         assert bool(texts) == narrow
         if narrow:
-            assert found.zeta.max() > 3 * zeta
             assert "segment= of at least" in texts[0]
         else:
             assert np.abs(found.freq / freqs - 1).max() < 2e-3

@@ -7,9 +7,9 @@ import pytest
 
 import oracles_synthesis as oracle
 from flexplant.errors import AssumptionError, CertificateError, ModelError, SolverError
-from flexplant.lti import StateSpace
-from flexplant.lti.interconnection import lft
-from flexplant.synthesis.controller import Controller, SolvedController, certified_norm
+from flexplant.lti import StateSpace, lft
+from flexplant.synthesis import Controller
+from flexplant.synthesis.controller import SolvedController, certified_norm
 from flexplant.synthesis.pipeline import Design, designed, posed, solved
 
 
