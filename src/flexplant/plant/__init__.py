@@ -6,9 +6,9 @@ for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u =
 - `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
 - `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes some.
-- `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is uncertain, as Deltas
-  for analysis and as machines drawn at random; your own kind of uncertainty derives from
-  `Uncertainty`. Dynamics that the model lacks: `Neglected` modes,
+- `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: the plant with its
+  uncertainty, as Deltas for analysis and as machines drawn at random; your own kind of uncertainty
+  derives from `Uncertainty`. Dynamics that the model lacks: `Neglected` modes,
   `UnmodelledDynamics(weight, at="u1")`.
 - Your own kind of sensor derives from `SensorPort`, a force from `ForcePort`.
 - `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body, with its
@@ -63,8 +63,9 @@ columns are the peak of |S|, the modulus margin at u, and |S| at 5 Hz::
           120  noise 0.5         1.03      77       6.1        0.42        0.0005
 
 A larger effort makes the loop slower and its margin larger. Disturbance and noise have
-little influence here. With peak 6 a mode of wrong frequency becomes unstable. Without uncertainty
-the ratios are 3 and 3: the larger disturbance or effort, the more |T| at u determines gamma. Noise
+little influence here. With peak 6 the loop is unstable, because one mode of the machine has another
+frequency than in the model. The defaults of disturbance and effort are 20 and 10 with
+``uncertainty``, 3 and 3 without. The larger they are, the more |T| at u determines gamma. Noise
 below 0.02 gives the controller more gain at the modes that the model lacks.
 
 Without ``uncertainty``, a design for 80 Hz on the same model is unstable on that machine. At 1 %

@@ -357,15 +357,16 @@ class Assumption(Value):
     Parameters
     ----------
     key : str
-        `excited` (w reaches), `detectable` (y sees), `performance` (z sees), `stabilisable`
-        (u reaches) every mode that does not decay; `D12`, `D21` (full rank); `P12`,
-        `P21` (u -> z and w -> y have no invariant zeros on the stability limit).
+        Name of the assumption. For every mode that does not decay: w reaches it (`excited`), y sees
+        it (`detectable`), z sees it (`performance`), u reaches it (`stabilisable`). `D12` and `D21`
+        have full rank. `P12` (u -> z) and `P21` (w -> y) have no invariant zeros on the stability
+        limit.
     holds : bool
-        Whether it does.
+        Whether the assumption holds.
     finding : str
-        In physical words.
+        Result in physical terms.
     remedy : str
-        What to change; empty when it holds.
+        Change by which it would hold; empty when it holds.
 
     Examples
     --------
@@ -418,7 +419,7 @@ class AssumptionReport(Value):
 
     @cached_property
     def modes(self) -> tuple[ModeVisibility, ...]:
-        """How well each elastic mode is reached and seen, and by which channel: information."""
+        """Visibility of each elastic mode at its best channels; for information only."""
         return mode_visibility(self.plant)
 
     @property
@@ -455,8 +456,8 @@ class AssumptionReport(Value):
     def require(self, keys: tuple[str, ...], purpose: str) -> None:
         """Raise AssumptionError unless the assumptions of these keys hold.
 
-        A key that does not apply to this plant holds. The message says for what `purpose` they are
-        needed and what to change, and holds the report.
+        An assumption that does not apply to this plant counts as satisfied. The message says for
+        which `purpose` the assumptions are needed and what to change. The error carries the report.
         """
         needed = _TESTS if {"P12", "P21"} & set(keys) else _TESTS[:2]
         known = tuple(item for tests in needed for item in self._found(tests))

@@ -44,9 +44,9 @@ class DrivenAxes(Value):
         Frequencies of sigma = 2 pi freq at which each axis is decoupled.
     T : (m, r) array
         Commands of the axes to actuators: ``G(sigma) T = I / sigma^2`` with ``G(sigma)`` the
-        response of the channels to the actuators at z = exp(sigma dt), but for the factor
-        ``exp(-sigma dt (delay + 1/2))`` of hold and delay. A command is the acceleration of its
-        axis where it moves as a mass: T is that mass then.
+        response of the channels to the actuators at z = exp(sigma dt), apart from the factor
+        ``exp(-sigma dt (delay + 1/2))`` of hold and delay. Where an axis moves as a mass, its
+        command is its acceleration, and T contains the mass.
 
     Examples
     --------
@@ -89,10 +89,11 @@ def driven_axes(
     axes : sequence of str, optional
         Channels of z or y. When not given all axes of the POIs where the actuators move them
         independently, else those of the POIs that have a reference, else those with a reference.
-        A free motion that the actuators move and that none of these shows would drift: for each
-        the displacement sensor that shows it best is an axis, too, one without a reference.
+        A free motion that the actuators move and that none of these axes shows would drift. For
+        each such motion, the displacement sensor that shows it best is added as an axis without a
+        reference.
     poi : str, optional
-        The POI whose axes are meant, when `axes` is not given; these alone.
+        POI to whose axes the choice is limited when `axes` is not given.
 
     Returns
     -------

@@ -28,8 +28,8 @@ class GravityAxes(Value):
     """Static transformations between the channels of a plant and its rigid body.
 
     With G the rigid-body part of the plant u -> y, ``to_motions G to_actuators = mass^-1 / s^2``
-    and ``to_motions G accelerations = I / s^2``. On ground springs the same transformations hold,
-    from their inertia line on.
+    and ``to_motions G accelerations = I / s^2``. On ground springs the same transformations are
+    valid above the suspension frequencies, where the inertia dominates.
 
     Parameters
     ----------
@@ -63,12 +63,12 @@ class GravityAxes(Value):
 
     @property
     def T_u(self) -> FloatArray:
-        """Forces at the centre of gravity to actuators (nu, r)."""
+        """Matrix (nu, r) from forces at the centre of gravity to actuators."""
         return self.to_actuators.D
 
     @property
     def T_y(self) -> FloatArray:
-        """Sensors to motions of the centre of gravity (r, ny)."""
+        """Matrix (r, ny) from sensors to motions of the centre of gravity."""
         return self.to_motions.D
 
 
@@ -76,8 +76,8 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     """Return the static transformations to and from the centre of gravity.
 
     From the geometry of a free or suspended body: no mode shape is involved but the rigid-body
-    ones, so that a structure on weak springs is decoupled as if it were free. What the actuators
-    move of any machine are the axes of `flexplant.decouple`.
+    ones, so that a structure on weak springs is decoupled as if it were free. For the axes that the
+    actuators of any machine move, use `flexplant.decouple`.
 
     Parameters
     ----------
@@ -94,8 +94,9 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     Raises
     ------
     AssumptionError
-        When the actuators or sensors do not reach or see an axis apart from the others; when no
-        axes are given and they have part in one that the model's shapes do not make.
+        When the actuators do not reach, or the sensors do not see, an axis independently of the
+        others; when no axes are given and actuators or sensors act along an axis that the model's
+        shapes do not contain.
     LabelError, ModelError
         When an axis is not one of the structure's; when the plant was not assembled from a
         structure, or it is held.

@@ -20,9 +20,9 @@ from .rest_expansion import followed_at_rest
 class Decoupling(Value):
     """Static transformations between the channels of a plant and its axes.
 
-    With G the plant u -> y, ``to_motions G to_actuators`` is about ``I / sigma^2`` at sigma = 2 pi
-    freq, but for hold and delay: a double integrator for each axis on a mass line. At rest
-    ``to_motions y`` is where the axes are.
+    With G the plant u -> y, ``to_motions G to_actuators`` is approximately ``I / sigma^2`` at the
+    real frequency sigma = 2 pi freq, apart from hold and delay. Each axis on a mass line is then a
+    double integrator. At rest ``to_motions y`` gives the positions of the axes.
 
     Parameters
     ----------
@@ -60,17 +60,17 @@ class Decoupling(Value):
 
     @property
     def accelerations(self) -> StateSpace:
-        """The commands `die:z:command` to actuators: accelerations, where an axis is a mass."""
+        """System from commands (accelerations where the axis is a mass) to actuators."""
         return self.to_actuators
 
     @property
     def T_u(self) -> FloatArray:
-        """Commands of the axes to actuators (nu, r)."""
+        """Matrix (nu, r) from commands of the axes to actuators."""
         return self.to_actuators.D
 
     @property
     def T_y(self) -> FloatArray:
-        """Sensors to motions of the axes (r, ny)."""
+        """Matrix (r, ny) from sensors to motions of the axes."""
         return self.to_motions.D
 
 
@@ -82,8 +82,9 @@ def decouple(
 ) -> Decoupling:
     """Return the static transformations to the axes that the actuators move, and from them.
 
-    On the real axis, where no mode resonates (`flexplant.plant.driven_axes`). Mass and centre of
-    gravity of a free body are those of `flexplant.plant.gravity_axes`.
+    The axes are decoupled at a real frequency sigma, where no mode resonates (see
+    `flexplant.plant.driven_axes`). `flexplant.plant.gravity_axes` gives the mass and the centre of
+    gravity of a free body.
 
     Parameters
     ----------
@@ -92,8 +93,8 @@ def decouple(
     axes : sequence of str, optional
         Channels of z or y, as for `flexplant.plant.driven_axes`.
     bandwidth : float or mapping {axis: float} [Hz], optional
-        Where the axes are decoupled, about the crossover of their loops; a hundredth of the rate
-        when not given.
+        Frequency at which the axes are decoupled, about the crossover of their loops; a hundredth
+        of the rate when not given.
 
     Returns
     -------

@@ -32,9 +32,9 @@ class EvaluationModel(Value):
     ----------
     source : Modes, FEModel, ReducedModel or StandardPlant
         A structure gets the plant's ports. The modes that a reduced model left out count as well.
-        A plant has the same channels as the plant that is judged on it.
+        A plant must have the same channels as the plant that is judged on it.
     ports : Ports, optional
-        Those that the plant got after it was assembled; a plant as source gets them too.
+        Ports that replaced those of the plant after its assembly; a plant as source gets them too.
 
     Examples
     --------

@@ -51,14 +51,15 @@ class Disturbance(_PlacedForce):
     asd_deviation : float
         Relative deviation of the density, by which machines that are drawn differ.
     shape : StateSpace, optional
-        A stable filter that the channel goes through on its way to the structure: the asd is then
-        that of the white noise at its input, and its states join the plant's.
+        Stable filter between the channel and the structure. The asd is then that of the white noise
+        at the input of the filter, and the states of the filter are added to those of the plant.
     held : bool
-        Whether the noise is held over each sample, as that of a force from a digital output is:
-        of variance asd^2 rate / 2 per sample once the plant is sampled. It may then reach an
-        acceleration sensor at once: process and sensor noise are correlated.
+        Whether the noise is held over each sample, like that of a force from a digital output. It
+        has the variance asd^2 rate / 2 per sample once the plant is sampled. It may act directly on
+        an acceleration sensor: process and sensor noise are then correlated.
     moves : mapping {position: (3,) array} or PlaceTable, optional
-        How its point follows the positions of `Ports`; `at` is where all of them are zero.
+        Motion of its point with the positions of `Ports`; `at` is its place when all positions are
+        zero.
 
     Examples
     --------
@@ -81,12 +82,13 @@ class Disturbance(_PlacedForce):
 class BaseAcceleration(ForcePort):
     """An acceleration of the floor (or frame) under the whole structure, in w.
 
-    The structure feels ``-M r a``, r its rigid-body motion in the direction, and moves relative to
-    the base: so do POIs, and sensors of displacement and velocity. What is `absolute` (as
-    accelerometers are) has the motion of the base added: its acceleration r a, or the integrals of
-    it. These are bounded where the `shape` has zeros at 0 Hz, as many as there are integrals, or
-    the sensor's `dynamics` have (those of a geophone). A free structure stays where it is; springs
-    to ground (`suspend`) and supports make it bend.
+    The load on the structure is ``-M r a``, with r its rigid-body motion in the direction. The
+    structure, POIs and sensors of displacement and velocity move relative to the base. For POIs and
+    sensors that are `absolute` (as accelerometers are), the motion of the base is added: its
+    acceleration r a, or the integrals of r a. The integrals are bounded if the `shape`, or the
+    `dynamics` of the sensor (those of a geophone), has as many zeros at 0 Hz as there are
+    integrals. A free structure stays at rest in space; springs to ground (`suspend`) and supports
+    make it bend.
 
     Parameters
     ----------
@@ -104,9 +106,10 @@ class BaseAcceleration(ForcePort):
 
     Notes
     -----
-    Modes and reduced models have an inertia against motions that their shapes can make: free
-    or suspended structures. For a held one pass the FEModel; one that was held by `fixed` has the
-    mass that couples it to its held DOFs, matrices made elsewhere have lost it.
+    Modes and reduced models contain the inertia only of motions that their shapes can make, which
+    suffices for free or suspended structures. For a held structure pass the FEModel. A model that
+    was held by `fixed` keeps the mass that couples it to its held DOFs; matrices that were held
+    elsewhere have lost this mass.
 
     Examples
     --------
@@ -130,7 +133,7 @@ class BaseAcceleration(ForcePort):
 
     @property
     def unit(self) -> str | None:
-        """m/s^2 or rad/s^2."""
+        """Unit of the channel: m/s^2 or rad/s^2."""
         return motion_unit({}, self.direction, 2)
 
     @property
@@ -145,11 +148,11 @@ class BaseAcceleration(ForcePort):
 
 @dataclass(frozen=True, eq=False)
 class OutputDisturbance(ForcePort):
-    """Something added to what one sensor measures, before the sensor's own dynamics; in w.
+    """A disturbance added to the motion that one sensor measures, before its dynamics; in w.
 
-    White noise here needs a sensor with `dynamics` that roll off (an anti-alias filter, say), or a
-    shape that does: a sample of it would have infinite variance. White noise per sample is
-    `Sensor.asd`.
+    White noise needs a sensor with `dynamics` that roll off (an anti-alias filter, for example), or
+    a shape that rolls off; otherwise its samples would have infinite variance. For white noise of
+    the samples use `Sensor.asd`.
 
     Parameters
     ----------
@@ -162,8 +165,8 @@ class OutputDisturbance(ForcePort):
     shape : StateSpace, optional
         A stable filter between the channel and the sensor: drift, mains hum.
     unit : str, optional
-        Unit of the channel where the shape changes it, rad/s of the rate whose integral a gyro
-        shows, say; by default the sensor's.
+        Unit of the channel if the shape changes the unit, for example rad/s for rate noise whose
+        integral a gyro shows; by default the unit of the sensor.
 
     Examples
     --------
@@ -196,16 +199,19 @@ class Actuator(_PlacedForce):
     Parameters
     ----------
     name, at, direction, moves
-        As for `Disturbance`: sums are pairs and other combinations.
+        Name, place, direction and motion as for `Disturbance`. A sum as place is a pair of forces,
+        or another combination.
     dynamics : StateSpace, optional
-        Amplifier and motor, command to force: stable; its states join the plant's.
+        Stable system of amplifier and motor, from command to force. Its states are added to those
+        of the plant.
     latency : float [s]
         Delay of the command by cable or bus, in seconds, in addition to the `delay` in samples of
         `discretized`. It acts exactly, also between samples, once the plant is sampled; a
-        continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
+        continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
-        `name:disturbance` of w. It passes the same `dynamics` as the command, not its latency.
+        `name:disturbance` of w. It passes through the `dynamics` like the command, but not through
+        the latency.
     asd_deviation : float
         Relative deviation of the density, by which machines that are drawn differ.
 
@@ -268,8 +274,8 @@ class _Spectrum(Value):
 class FirstOrder(_Spectrum):
     """First-order noise: flat up to a corner, then falling with 20 dB per decade.
 
-    ``shape = omega / (s + omega)``; white noise of density asd has the variance
-    ``asd^2 omega / 4`` behind it.
+    ``shape = omega / (s + omega)``. At its output, white noise of density asd has the variance
+    ``asd^2 omega / 4``.
 
     Parameters
     ----------
@@ -305,9 +311,9 @@ class FirstOrder(_Spectrum):
 class NarrowBand(_Spectrum):
     """Narrow-band noise: hum, an imbalance, a pump.
 
-    ``shape = 2 zeta omega s / (s^2 + 2 zeta omega s + omega^2)``, 1 at its frequency; white noise
-    of density asd has the variance ``asd^2 zeta omega / 2`` behind it. The force loses its phase
-    within 1 / (2 pi zeta) periods.
+    ``shape = 2 zeta omega s / (s^2 + 2 zeta omega s + omega^2)`` has the gain 1 at its frequency.
+    At its output, white noise of density asd has the variance ``asd^2 zeta omega / 2``. The force
+    loses its phase within 1 / (2 pi zeta) periods.
 
     Parameters
     ----------
@@ -353,15 +359,15 @@ class NarrowBand(_Spectrum):
 class RandomWalk(_Spectrum):
     """A force that drifts: a bias. Its rms after a time t is ``drift t^(1/2)``.
 
-    First-order noise with a corner far below everything else, so that it is stationary and no
-    variance of anything is infinite: above the corner nothing distinguishes it from a random walk.
+    First-order noise with a corner far below all other frequencies, so that it is stationary and
+    all variances are finite. Above the corner it cannot be distinguished from a random walk.
 
     Parameters
     ----------
     drift : float [N/sqrt(s)]
-        Deviation of its change in one second.
+        Standard deviation of its change in one second.
     corner : float [Hz]
-        Below the inverse of the longest record.
+        Corner frequency, below the inverse of the longest record.
 
     Examples
     --------
@@ -386,8 +392,9 @@ class RandomWalk(_Spectrum):
 class RigidForce(ForcePort):
     """A force (or moment) spread over the mass so that a free machine moves and does not bend.
 
-    The load ``M r / (r' M r)``, r the rigid-body motion of its axis, rotations about the centre of
-    mass: it does the work of a unit force along r, and none on elastic modes of a free structure.
+    The load is ``M r / (r' M r)``, with r the rigid-body motion of its axis; rotations are about
+    the centre of mass. It does the work of a unit force along r, and no work on elastic modes of a
+    free structure.
 
     Parameters
     ----------
@@ -410,7 +417,7 @@ class RigidForce(ForcePort):
 
     @property
     def unit(self) -> str | None:
-        """N or N m."""
+        """Unit of the channel: N or N m."""
         return force_unit({}, self.direction)
 
     def push(self, realisation: ModalRealisation) -> FloatArray:

@@ -67,7 +67,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def done(self) -> str:
-        """What was done to the machine, in its repr."""
+        """Weights and blocks that were applied to the machine, as text for the repr."""
         return f", {self.alteration}"
 
     @property
@@ -77,7 +77,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def reading(self) -> StateSpace | None:
-        """The block from the measurements of the machine to y; None where y are these."""
+        """The block from the measurements of the machine to y; None when y are the measurements."""
         return self._reading
 
     @cached_property
@@ -92,7 +92,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def alteration(self) -> str:
-        """What was done to the machine, in words."""
+        """Weights and blocks that were applied to the machine, in words."""
         done = ["weighted"] if self.scaled else []
         done += ["read through a block"] if self.reading is not None else []
         return " and ".join(done)
@@ -120,7 +120,7 @@ class GeneralizedPlant(PartitionedSystem):
     def noise_factor(self) -> FloatArray:
         """G (n, r), G G' the covariance that white disturbances add to x in one sample.
 
-        That of the machine where it is read through a static block alone; else ModelError.
+        It equals that of the machine if only a static block was applied; otherwise ModelError.
         """
         if self.scaled:
             raise ModelError(
@@ -133,7 +133,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def uncertainty(self) -> Any:
-        """What is not known of the machine."""
+        """The uncertainty of the machine."""
         return self.unweighted.uncertainty
 
     @property
@@ -221,7 +221,7 @@ class GeneralizedPlant(PartitionedSystem):
     def uncertain(
         self, *given: Any, frequency: Any = None, damping: Any = None
     ) -> GeneralizedPlant:
-        """Return the weights and blocks around the machine with what is not known of it.
+        """Return the weights and blocks around the machine with its uncertainty.
 
         Parameters are those of `StandardPlant.uncertain`.
         """
@@ -229,7 +229,7 @@ class GeneralizedPlant(PartitionedSystem):
         return self.around(known.nominal)
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
-        """Return what the position does, as `StandardPlant.map`."""
+        """Return figures of the machine over its positions, as `StandardPlant.map`."""
         return position_map(self, judge, points)
 
     def to_control(self) -> Any:

@@ -30,9 +30,9 @@ class SlowZeros(Value):
     Parameters
     ----------
     poles : (k,) complex array [rad/s]
-        Upper half plane; each counts with its conjugate.
+        Poles in the upper half plane; each counts with its conjugate.
     residues : (r, k) complex array
-        c_i of the force of each axis.
+        Residues c_i of the force of each axis.
     dt : float [s]
         Sampling time; the filters then use ``(z - 1) / dt`` in place of s.
 
@@ -67,7 +67,7 @@ class SlowZeros(Value):
         return np.asarray(np.exp(self.poles * self.dt) / (self.poles**order * self._rates))
 
     def responses(self, s: ComplexArray, order: int) -> ComplexArray:
-        """Return what real and imaginary parts of residues add (n, 2 k) at any s [rad/s]."""
+        """Return contributions (n, 2 k) of real and imaginary parts of residues at s [rad/s]."""
         at = np.asarray(s)[:, None]
         rate = np.expm1(at * self.dt) / self.dt if self.dt else at
         gains, rates = self._gains(order), self._rates
@@ -76,7 +76,7 @@ class SlowZeros(Value):
         return np.asarray(at**order * np.hstack([one + other, 1j * (one - other)]))
 
     def at(self, s: complex) -> ComplexArray:
-        """Return what they add (r,) to an expansion of order 4 at any s [rad/s]."""
+        """Return their contribution (r,) to an expansion of order 4 at any s [rad/s]."""
         parts = np.hstack([self.residues.real, self.residues.imag])
         return np.asarray(parts @ self.responses(np.array([s]), len(DERIVATIVES))[0])
 

@@ -26,12 +26,12 @@ from .uncertainty.parameter_amounts import ParameterDelta
 
 
 class FigureInterval(NamedTuple):
-    """Where a figure lies on a share of the machines that the measurement allows.
+    """Interval of a figure over a fraction of the machines that the measurement allows.
 
     Parameters
     ----------
     low, high : float or None
-        Its ends; None where `sentence` says what is missing.
+        Ends of the interval; None where `sentence` says what is missing.
     sentence : str
         The interval in words, or what is missing for one.
 
@@ -102,12 +102,12 @@ class PlantMachines:
 
     @property
     def missing(self) -> str:
-        """What is missing for an interval; empty where nothing is."""
+        """Data that are missing for an interval, in words; empty when none are missing."""
         return "" if self.fit is None else self.fit.missing
 
     @cached_property
     def plants(self) -> list[Any]:
-        """The machines of which intervals are made, drawn once."""
+        """The machines from which intervals are computed, drawn once."""
         if self.fit is None:
             return self.drawn()
         return self.drawn(self.fit.count, rng=self.fit.seed)
@@ -188,7 +188,7 @@ class PlantMachines:
 
     @property
     def densities(self) -> str:
-        """What an interval of noise says where no density has a deviation; else empty."""
+        """Remark for an interval of noise when no density has a deviation; otherwise empty."""
         return "" if self._unsure else ", densities as given"
 
     def _of_fit(self, rng: np.random.Generator) -> DrawnModes:

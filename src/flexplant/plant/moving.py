@@ -28,7 +28,7 @@ from .visibility import WEAK, mode_visibility
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PortPath(Value):
-    """What depends on the place of one port, at many points: rows of C and D, or a column of B.
+    """Rows of C and D, or a column of B, of one port at many points.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class PortPath(Value):
     D : (p, channels, inputs) or (p, outputs, 1) array
         Rows of a POI, or columns of a force.
     B : (p, n, 1) array
-        Columns of a force; without any for a POI.
+        Columns of a force; empty for a POI.
 
     Examples
     --------
@@ -204,17 +204,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PositionMap(Value):
-    """Figures of a machine over its positions; made by `StandardPlant.map`.
+    """Figures of a machine as functions of its position; made by `StandardPlant.map`.
 
     Parameters
     ----------
     grid : mapping {name: (k,) array} [m or rad]
         The values of each position.
     decoupling : (..., 2) array
-        Largest gain by which the transformations of the plant as it stands (`decouple`) miss the
-        identity at each place of the grid: those of the sensors, then of the actuators; 0 where
-        they hold. An axis counts by how far the sensors move with it. NaN where the actuators move
-        no axes apart.
+        Errors of the decoupling at each place of the grid, first of the sensors, then of the
+        actuators. The transformations of the plant at its present position (`decouple`) are applied
+        at that place; the error is the largest gain of the difference from the identity, 0 if there
+        is none. Each axis is weighted by the motion of the sensors that it causes. NaN where the
+        actuators cannot move the axes independently.
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str
@@ -287,7 +288,7 @@ class PositionMap(Value):
 
     @property
     def ever(self) -> npt.NDArray[np.bool_]:
-        """Which modes (m,) are in the loop somewhere, with a share of one percent."""
+        """Whether each mode (m,) has a share of at least one percent in the loop at some place."""
         most = self.visible.reshape(-1, len(self.modes)).max(axis=0, initial=0.0)
         return np.asarray(most >= WEAK)
 

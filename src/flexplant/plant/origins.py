@@ -16,16 +16,16 @@ from .realisation import ModalRealisation
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Assembled(Value):
-    """What is known of a plant that was assembled from a structure.
+    """Origin of a plant that was assembled from a structure: ports, modes, noise and delay.
 
     Parameters
     ----------
     ports : Ports
-        Where the channels are.
+        Places of the channels.
     realisation : ModalRealisation
         The structure's modes.
     physical : StateSpace
-        Forces to motions, before noise, references and efforts are wired to it.
+        System from forces to motions, before noise, references and efforts are connected to it.
     noise_factor : (n, r) array, optional
         G with G G' the covariance of x that disturbances add in one sample.
     delay : float [samples]
@@ -83,7 +83,7 @@ class PlantChannel(Value):
 
 @dataclass(frozen=True, eq=False)
 class Foreign(Value):
-    """What is known of a plant of foreign matrices: the names of its channels and no modes.
+    """Origin of a plant of foreign matrices: the names of its channels, without modes.
 
     It answers the same questions as `Assembled`, so that functions need not distinguish them; what
     needs a structure asks `plant.assembled`.

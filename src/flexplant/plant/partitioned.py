@@ -93,12 +93,12 @@ class PartitionedSystem(Value):
 
     @property
     def reading(self) -> StateSpace | None:
-        """The block from the measurements of the machine to y; None where y are these."""
+        """The block from the measurements of the machine to y; None when y are the measurements."""
         return None
 
     @property
     def done(self) -> str:
-        """What was done to the machine, in its repr."""
+        """Weights and blocks that were applied to the machine, as text for the repr."""
         return ""
 
     @property
@@ -338,7 +338,7 @@ class MeasuredResponse(Value):
     Parameters
     ----------
     frf : Frf
-        From actuators to sensors.
+        Response from actuators to sensors.
     hold : bool
         False where it was measured from sample to sample.
     delay : float [samples]

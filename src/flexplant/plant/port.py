@@ -28,17 +28,17 @@ DERIVATIVES = TERMS[1:]
 
 
 class MeasuredRow(NamedTuple):
-    """What a channel measures: ``row x + direct f + carried g``.
+    """Coefficients of a measured channel: ``row x + direct f + carried g``.
 
     Parameters
     ----------
     row : (2 b,) array
-        Over the states of the modes.
+        Coefficients of the states x of the modes.
     direct : (n,) array
-        Over loads at the model's DOFs: what follows a force at once.
+        Coefficients of loads f at the model's DOFs, to which the channel responds directly.
     carried : (6,) array
-        Over the rigid-body motions of the ground about the origin (x, y, z, rx, ry, rz), in the
-        derivative that is measured: 0 of what is measured against the ground.
+        Coefficients of the rigid-body motions g of the ground about the origin (x, y, z, rx, ry,
+        rz), in the derivative that is measured; 0 for a motion relative to the ground.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def observed(
 
 
 class ForcePort(Value):
-    """A port in w or u. A new kind has a `name`, and says by `push` where it acts.
+    """A port in w or u. A new kind has a `name` and defines by `push` where it acts.
 
     Examples
     --------
@@ -103,12 +103,12 @@ class ForcePort(Value):
 
     @property
     def added_to(self) -> str | None:
-        """The sensor that it is added to, for what does not act on the structure."""
+        """The sensor to which a port that does not act on the structure is added."""
         return None
 
     @property
     def ground(self) -> FloatArray:
-        """The rigid-body motion (6,) of the ground about the origin whose acceleration it is."""
+        """Rigid-body motion (6,) of the ground about the origin, of a port that accelerates it."""
         return np.zeros(6)
 
     @abstractmethod
@@ -116,7 +116,7 @@ class ForcePort(Value):
         """Return the load (n,) over the model's DOFs per unit behind the filter."""
 
     def static_push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) per unit of the channel at rest: the filter is its static gain."""
+        """Return the load (n,) per unit of the channel at rest, with the filter's static gain."""
         return static_gain(self.filter) * self.push(realisation)
 
 
@@ -131,7 +131,7 @@ class SensorPort(Value):
     ----------
     name : str
     at : str, (3,) array [m] or mapping
-        Where it is drawn, and what `StandardPlant.at` moves.
+        Place at which it is drawn, and which `StandardPlant.at` moves.
     asd : float
         One-sided amplitude spectral density of its white noise.
     dynamics : StateSpace, optional
@@ -193,18 +193,18 @@ class SensorPort(Value):
 
     @abstractmethod
     def row(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the row (n,) over the model's DOFs of the displacement that it is about."""
+        """Return the row (n,) over the model's DOFs of the displacement behind `quantity`."""
 
     def carried(self, realisation: ModalRealisation) -> FloatArray:
-        """Return its motion (6,) with each rigid-body motion about the origin."""
+        """Return its displacement (6,) in each rigid-body motion about the origin."""
         return np.asarray(self.row(realisation) @ realisation.model.rigid_motions())
 
     def static_row(self, realisation: ModalRealisation) -> FloatArray:
-        """Return what the channel shows of displacements (n,) at rest: 0 of other quantities."""
+        """Return the row (n,) of the channel over displacements at rest; 0 for other quantities."""
         return (static_gain(self.filter) if self.order == 0 else 0.0) * self.row(realisation)
 
     def see(self, realisation: ModalRealisation) -> MeasuredRow:
-        """Return what it measures of the states, and of forces at once."""
+        """Return its coefficients of the states, and of forces that act on it directly."""
         along = self.carried(realisation) if self.inertial else None
         return observed(realisation, self.row(realisation), self.order, along)
 

@@ -43,7 +43,8 @@ class Sensor(SensorPort):
     asd_deviation : float
         Relative deviation of the density, by which machines that are drawn differ.
     dynamics : StateSpace, optional
-        Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
+        Stable system of sensor and anti-alias filter, from motion to signal. Its states are added
+        to those of the plant.
     latency : float [s]
         Delay of the signal, in seconds. In a sampled plant it is exact, also between samples; a
         continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
@@ -84,7 +85,7 @@ class Sensor(SensorPort):
         return realisation.row(self.at, self.direction)
 
     def carried(self, realisation: ModalRealisation) -> FloatArray:
-        """Return its motion (6,) with each rigid-body motion about the origin."""
+        """Return its displacement (6,) in each rigid-body motion about the origin."""
         return place_motion(realisation.model.full_dofs, self.at, self.direction)
 
 
@@ -165,7 +166,7 @@ class Poi(Value):
             ) from error
 
     def see(self, realisation: ModalRealisation, axis: str) -> MeasuredRow:
-        """Return what an axis shows of the states, and of forces at once."""
+        """Return the coefficients of an axis: of states, and of forces that act directly."""
         along = None
         if self.absolute:
             along = place_motion(realisation.model.full_dofs, self._at(axis), axis)
@@ -366,10 +367,11 @@ class Ports(Value):
         """The SI units of all channels that have one, and of derived channels.
 
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
-        sensors, where a coloured one states no `unit`; references, errors and estimates
-        like their POI, efforts like their actuator. A sum of displacements and rotations has the
-        unit of the part whose weights have length 1, as a displacement has with levers [m] of
-        rotations; no unit if both parts do, or none. Filters of ports do not change units.
+        sensors, unless a coloured noise states a `unit`; references, errors and estimates like
+        their POI, efforts like their actuator. A weighted sum of displacements and rotations has
+        the unit of the group whose weights have length 1: that of displacements if the weights of
+        rotations are levers [m]. It has no unit if both groups or neither have such weights.
+        Filters of ports do not change units.
         """
         found = {port.name: port.unit for port in self.physical}
         for port in self.w:

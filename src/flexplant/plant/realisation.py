@@ -352,9 +352,9 @@ class Feedthrough(ResidualForm):
 
     Displacements then respond to forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of
     the modes that were left out. Velocities and accelerations of these modes are neglected: they
-    are zero below the frequencies of these modes. White forces then reach displacements directly (a
-    sample would have infinite variance: shape them for Kalman filters and simulation), and a
-    simulation needs the delay of at least a sample that every machine has.
+    are zero below the frequencies of these modes. White forces then reach displacements directly,
+    and samples would have infinite variance: give the forces a `shape` for Kalman filters and
+    simulation. A simulation needs a delay of at least one sample, which every machine has.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ Port: TypeAlias = ForcePort | SensorPort | Poi
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachineParts(Value):
-    """What a machine is assembled from, which Deltas change: modes, ports, and delay.
+    """Parts from which a machine is assembled, and which Deltas change: modes, ports and delay.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class MachineParts(Value):
         return cls(plant, own.realisation, own.realisation.pairs, own.ports)
 
     def with_port(self, port: Port) -> MachineParts:
-        """Return the machine with a port in place of the one of its name: at another place, say."""
+        """Return the machine with another port in place of the one with the same name."""
         side = [port if one.name == port.name else one for one in getattr(self.ports, port.home)]
         return self.replace(ports=self.ports.replace(**{port.home: side}))
 

@@ -71,7 +71,7 @@ class Position(Value):
         self._set(start=self.within(start))
 
     def within(self, value: Any) -> float:
-        """Return a value inside the range, to six digits; ModelError when it is farther outside."""
+        """Return a value, limited to the range; ModelError when it is clearly outside."""
         found = number(value, f"position {self.name!r}")
         low, high = self.range
         spare = TYPED * (high - low)
@@ -151,7 +151,7 @@ class PlaceTable(Value):
 
 @dataclass(frozen=True, eq=False)
 class PlaceMotion(Value):
-    """How a place follows positions: ``start + sum_i along_i value_i``, or a table.
+    """Motion of a place with the positions: ``start + sum_i along_i value_i``, or a table.
 
     Made from what is given as `moves` of a port: the mapping {position: direction}, or a table.
 
@@ -160,8 +160,8 @@ class PlaceMotion(Value):
     start : (3,) array [m] or mapping {point: weight}
         The place where all positions are zero.
     along : mapping {name: (3,) array} or PlaceTable
-        How far the place moves per unit of each position: (1, 0, 0) with the stage's x, (-1, 0, 0)
-        against it, as the point of the structure below a head on the frame does.
+        Displacement of the place per unit of each position. (1, 0, 0) moves with the stage's x.
+        (-1, 0, 0) moves against it, like the point of the stage below a head on the frame.
 
     Examples
     --------
@@ -205,7 +205,7 @@ class PlaceMotion(Value):
         return [(weight, np.asarray(point) + shift) for point, weight in terms.items()]
 
     def starting(self, place: Place, values: Mapping[str, float]) -> PlaceMotion:
-        """Return the same motion of a port that stands elsewhere at some values."""
+        """Return the same motion of a port, with a given place at given values of the positions."""
         if isinstance(self.along, PlaceTable):
             raise LabelError(
                 "a port whose places are a table stands where the table says. Replace its table, "

@@ -44,9 +44,10 @@ class StructureFrf(Frf):
         As of `Frf`.
     window, overlap, freedom, units : as of `Frf`
     route : str
-        How the responses were found.
+        Method by which the responses were computed.
     check_freq : (c,) array [Hz]
-        Where ``(K - omega^2 M + i omega D) q = f`` was solved with all of the matrices.
+        Frequencies at which ``(K - omega^2 M + i omega D) q = f`` was solved with the full
+        matrices.
     error : (c,) array
         Error of the worst channel there, relative to the largest magnitude of this channel over all
         frequencies.
@@ -115,7 +116,7 @@ def frequency_response(
     frequency: its modes up to 1.5 times the last one, and the static responses to all loads and at
     all outputs, answer at any number of frequencies. They are checked by solutions with
     ``K + i omega D - omega^2 M`` at a few: at resonances, antiresonances, the ends of the band, and
-    at random. Where these differ by more than `tolerance` they join the basis.
+    at random. Solutions that differ by more than `tolerance` are added to the basis.
 
     ``frequency_response(system, freq)``: ``C (s I - A)^-1 B + D``; see
     `flexplant.lti.frequency_response`.
@@ -125,12 +126,13 @@ def frequency_response(
     model : FEModel, Modes or ReducedModel; or StateSpace
         Modes that `solve_modes` found for an FEModel are used again while they are in use.
     ports : Ports
-        The channels of a structure. Of a system: freq.
+        The channels of a structure. For a system, `freq` takes this place.
     freq : (n_freq,) array [Hz]
         Frequencies, increasing. None: `default_freq` of a system.
     damping : Damping, optional
-        Damping of an FEModel, in place of its D. A Rayleigh is its matrix; modal damping is that
-        of the modes and static shapes used; motions beyond them decay as the last mode does.
+        Damping of an FEModel, in place of its D. `Rayleigh` damping is used as a matrix. Modal
+        damping applies to the modes and static shapes used; all other motions have the damping of
+        the last mode.
     checks : int
         Number of direct solutions of an FEModel that check the modes; 0 for none.
     tolerance : float

@@ -109,8 +109,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
 
     ``K + sum_s k_s r_s' r_s``, D likewise, r_s the row of a spring's motion. Rigid-body motions
     that stretch a spring become suspension modes, true oscillations at low frequency; those that
-    do not stay exactly at 0. Springs of negative stiffness make unstable real pairs of poles of
-    them, as long as they do not bend the structure.
+    do not stay exactly at 0. Springs of negative stiffness turn these motions into pairs of real
+    poles, one of them unstable; such springs must not bend the structure.
 
     Parameters
     ----------

@@ -52,8 +52,8 @@ _VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
 class ModeVisibility(Value):
     """How well w excites, u reaches, y and z see an elastic mode.
 
-    Where damping couples the modes (`plant.form` is dense) it is an undamped mode, with its own
-    part of the damping.
+    Where damping couples the modes (`plant.form` is dense) it is an undamped mode, with the
+    diagonal term of the damping.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class ModeVisibility(Value):
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """What is below one percent, in words."""
+        """Shares below one percent, in words."""
         return tuple(
             f"{side} {_VERBS[side]} mode {self.mode} ({self.freq:.4g} Hz, damping "
             f"{100 * self.zeta:.2g} %) "

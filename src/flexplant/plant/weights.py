@@ -38,10 +38,11 @@ _IDLE = 0.03
 def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int = 0) -> StateSpace:
     """Return the static block from sensors and references to errors at the sensors.
 
-    ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i is while the machine rests with
-    its POIs at their references, the other axes (`driven_axes`) at zero: ``G_yu T (G_zu T)^-1 r``
-    at rest. On a free body this is its rigid-body motion. A controller that reads these errors has
-    one degree of freedom: it responds to a reference as to a disturbance.
+    ``y_i:error = y_i,ref - y_i``. Here y_i,ref is the signal of sensor i while the machine rests,
+    its POIs are at their references and the other axes (`driven_axes`) are at zero:
+    ``G_yu T (G_zu T)^-1 r`` at rest. On a free body this is its rigid-body motion. A controller
+    that reads these errors has one degree of freedom: it responds to a reference as to a
+    disturbance.
 
     A move bends the machine, so that its sensors are not where they are at rest, and the controller
     opposes the move. With an order the derivatives of the references correct y_i,ref: close the
@@ -52,7 +53,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     plant : StandardPlant
         Assembled from a structure, with a reference and displacement sensors.
     poi : str, optional
-        The POI whose references the errors follow; by default all that have some.
+        The POI whose references the errors follow; by default all POIs that have references.
     order : int
         Highest derivative of the references that the errors read, 0 to 4.
 
@@ -115,9 +116,9 @@ class StageWeights(Value):
     z, w : mapping {channel: StateSpace, float or None}
         None leaves the channel out.
     text : str
-        What they mean.
+        Meaning of the weights, in words.
     uncertain : UncertainPlant, optional
-        What was stated of the plant's modes, for ``design_hinf(..., uncertain=)``.
+        Stated uncertainty of the plant's modes, for ``design_hinf(..., uncertain=)``.
     """
 
     z: Mapping[str, Any]
@@ -144,8 +145,8 @@ def stage_weights(
 
     ``plant.weighted(z=weights.z, w=weights.w)`` is what `flexplant.design_hinf` then takes; a
     controller with one degree of freedom reads `reference_errors`. `design_stage` does all three,
-    and finds the largest bandwidth. Below a gamma of 1 |T| at u is below `peak`. What the numbers
-    do is measured on one machine in a table of ``help(flexplant.plant)``. How it works:
+    and finds the largest bandwidth. Below a gamma of 1 |T| at u is below `peak`. A table of
+    ``help(flexplant.plant)`` shows the effect of the arguments on one machine. How it works:
     `algorithms`.
 
     Parameters
@@ -153,22 +154,23 @@ def stage_weights(
     plant : StandardPlant
         Assembled from a structure; continuous or sampled.
     bandwidth : float [Hz]
-        Below which |S| shall stay under 1.
+        Frequency below which |S| shall be less than 1.
     poi : str, optional
         The POI that counts; all axes that the actuators move independently when not given
-        (`driven_axes`). Others are left out of z: they move with these. The first axis carries the
-        scale.
+        (`driven_axes`). Other axes are left out of z, because they move with these. The first axis
+        sets the scale.
     peak : float
         Bound on |T| at u where gamma is 1; value of 1/W_S at high frequencies (at f_c it is 1).
     disturbance, effort : float, optional
-        Sizes of W_d f0^-1 and W_u f0 (before the division): the larger their product, the more
-        |T| at u decides, and the less |S|. 3 and 3 when not given; 20 and 10 where frequencies are
-        uncertain: modes may then be damped as much as they are pushed.
+        Sizes of the weights W_d and W_u, relative to the actuator sizes f0 of `algorithms`. The
+        larger their product, the more gamma depends on |T| at u, and the less on |S|. By default 3
+        and 3; 20 and 10 where frequencies are uncertain, so that modes may be damped as much as
+        they are driven.
     noise : float
-        Noise of a sensor relative to what it shows of a unit of reference.
+        Noise of a sensor, relative to its signal for a reference of one unit.
     uncertainty : UncertainPlant, float, (m,) array or {mode: float}, optional
-        By what share the modes' frequencies may be off, as for ``plant.uncertain(frequency=)``;
-        what the plant says itself when not given.
+        Relative error of the modes' frequencies, as for ``plant.uncertain(frequency=)``; by default
+        the uncertainty of the plant.
 
     Returns
     -------
@@ -348,8 +350,8 @@ def mixed_sensitivity(
 ) -> StandardPlant:
     """Return the plant whose H-infinity norm is that of ``[W_S S; W_KS K S; W_T T]``.
 
-    ``e = r - G u, u = K e``: S = (I + G K)^-1 from r to e, T = G K S. What `augw` and `mixsyn` of
-    other tools build; `design_hinf` of the result designs K. A rigid-body mode or integrator in
+    ``e = r - G u, u = K e``: S = (I + G K)^-1 from r to e, T = G K S. MATLAB's `augw` builds the
+    same plant; `design_hinf` designs K for it, as `mixsyn` does. A rigid-body mode or integrator in
     G is an invariant zero on the limit of [G; weights] from r: add a disturbance at u instead, as
     `stage_weights` does.
 
@@ -358,10 +360,10 @@ def mixed_sensitivity(
     system : StateSpace
         G, (p, m): from u to the measured outputs; continuous or sampled.
     S, T : float or StateSpace, optional
-        Weights of every output: one by one for all alike, or (p, p).
+        Weights of the outputs: one system with one input and one output for all of them, or (p, p).
     KS : float or StateSpace, optional
-        Weight of every input: one by one for all alike, or (m, m). Continuous weights are sampled
-        at the rate of a sampled system (Tustin).
+        Weight of the inputs: one system with one input and one output for all of them, or (m, m).
+        Continuous weights are sampled at the rate of a sampled system (Tustin).
 
     Returns
     -------

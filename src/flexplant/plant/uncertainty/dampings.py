@@ -14,13 +14,13 @@ from .mode_delta import DampingDelta, stated_by_mode
 
 @dataclass(frozen=True, eq=False)
 class Dampings(Uncertainty):
-    """Damping of modes, off by a share of it: `mode6:damping` on 2 zeta omega.
+    """Uncertain damping of modes, a relative error of 2 zeta omega: `mode6:damping`.
 
     Parameters
     ----------
     share : float, (m,) array or {mode: float}
-        By what share damping may be off at delta = 1: one for all, one for each of `modes`, or by
-        mode.
+        Relative error of the damping at delta = 1: one number for all modes, one for each of
+        `modes`, or a mapping by mode.
     modes : sequence of int, optional
         Numbers from 1, rigid-body modes included; by default all elastic ones.
 

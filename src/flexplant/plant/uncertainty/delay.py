@@ -39,7 +39,7 @@ class DelayDelta(Delta):
 
 @dataclass(frozen=True, eq=False)
 class Delay(Uncertainty):
-    """The delay of a sampled plant, off by some samples, more or less.
+    """Uncertain delay of a sampled plant: longer or shorter by up to a number of samples.
 
     Parameters
     ----------

@@ -17,10 +17,11 @@ from .channels import EvenUnits, Opened, with_parts
 class Delta(Value):
     """One real uncertainty, ``w = delta z`` with ``|delta| <= 1``.
 
-    A new kind says by `changed` what a machine is at an amount, for example by `with_port`. Its
-    channels are then read off the plants at both ends, so that [A B; C D] must be affine in the
-    amount, or a fraction of it: the row of a sensor that moves is taken as linear between the ends,
-    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind with other channels has its own `opened`.
+    A new kind defines `changed`, which returns the machine that is off by an amount, for example
+    with `MachineParts.with_port`. Its channels are computed from the plants at both ends of the
+    range. Therefore [A B; C D] must be affine or linear fractional in the amount. The row of a
+    sensor that moves is taken as linear between the ends:
+    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind with other channels overrides `opened`.
 
     Parameters
     ----------
@@ -28,9 +29,11 @@ class Delta(Value):
         Prefix of the channel names: `mode6:freq` has the input `mode6:freq:w` and the output
         `mode6:freq:z`.
     scale : float
-        Change at delta = 1: relative; for a parameter in its unit, for the delay in samples.
+        Change at delta = 1: a relative change; for a parameter a change in its unit, for the delay
+        in samples.
     mode : int
-        Number of the mode, from 1, rigid-body modes included; 0 of what is not of a mode.
+        Number of the mode, from 1, rigid-body modes included; 0 for a Delta that belongs to no
+        mode.
 
     Examples
     --------
@@ -59,15 +62,15 @@ class Delta(Value):
         raise NotImplementedError(f"{type(self).__name__} must say by `changed` what it changes.")
 
     def amount(self, drawn: float) -> float:
-        """Return the amount of a number drawn, which is 1 at `scale`."""
+        """Return the amount that belongs to a drawn number; the number 1 gives `scale`."""
         return self.scale * drawn
 
     def of_matrices(self, plant: Partition) -> Delta:
-        """Return this Delta as one on M, D and K of the plant's model, where it is of modes."""
+        """Return the Delta, one of modes as a Delta of M, D and K of the plant's model."""
         return self
 
     def require_in_range(self, deviations: float) -> None:
-        """Raise ModelError where the Delta reaches what no machine is."""
+        """Raise ModelError when the range of the Delta contains machines that cannot exist."""
 
     @property
     def text(self) -> str:

@@ -29,29 +29,30 @@ _TYPED_POLES = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Fit(Uncertainty):
-    """What a fit, or a measurement of modes, leaves open of the frequencies and dampings.
+    """Uncertainty of frequencies and dampings that a fit or a measurement of modes leaves.
 
     Given to ``plant.uncertain`` as it is, an `UpdateResult`, `ModalUncertainty` or `MeasuredModes`
     is understood as ``Fit(source)``. The covariance of the parameters goes to the modes by the
     eigenvalue sensitivities, ``J C J'``; each mode's stiffness and damping becomes a Delta
     `mode6:freq`, `mode6:damping`. Where damping couples the modes (a large damper to ground, an
     overdamped pair), the parameters of the fit themselves are the Deltas, and act on all modes and
-    shapes. Machines are drawn by the parameters; those of a calibrated plant by their modes.
+    shapes. Drawn machines differ in the parameters; those of a calibrated plant differ in their
+    modes.
 
     Parameters
     ----------
     source : UpdateResult, ModalUncertainty or MeasuredModes
-        A fit whose `model` the plant was assembled from, as it is or calibrated (one with a
-        discrepancy, or of a calibrated plant, counts as its `uncertainty`: two deviations are what
-        a mode may be off by); the uncertainty of a calibrated model, ``fit.uncertainty(measured)``;
-        or measured poles with mode numbers and a covariance.
+        A fit whose `model` the plant was assembled from, as it is or calibrated. (A fit with a
+        discrepancy, or of a calibrated plant, is replaced by its `uncertainty`, in which a mode may
+        be off by two standard deviations.) Or the uncertainty of a calibrated model,
+        ``fit.uncertainty(measured)``; or measured poles with mode numbers and a covariance.
     modes : sequence of int, optional
         Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
         given.
     parameters : sequence of Parameter, optional
         Parameters given to `update`, in the same order; by default those that the fit stores.
     deviations : float
-        Standard deviations at which a delta is 1.
+        Number of standard deviations at which a delta is 1.
 
     Raises
     ------

@@ -14,14 +14,14 @@ from .mode_delta import FrequencyDelta, stated_by_mode
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Frequencies(Uncertainty):
-    """Frequencies of modes, off by a share of them: `mode6:freq` on the stiffness omega^2.
+    """Uncertain frequencies of modes, a relative error of each: `mode6:freq` on omega^2.
 
     Parameters
     ----------
     share : float, (m,) array or {mode: float}
-        By what share frequencies may be off at delta = 1: one for all, one for each of `modes`, or
-        by mode. 0.005 is what an updated model of a structure seldom does better than where it was
-        not measured.
+        Relative error of the frequencies at delta = 1: one number for all modes, one for each of
+        `modes`, or a mapping by mode. For modes that were not measured, updated models seldom have
+        errors below 0.005.
     modes : sequence of int, optional
         Numbers from 1, rigid-body modes included; by default all elastic ones.
 

@@ -77,12 +77,12 @@ def _with_gain(plant: Partition, system: StateSpace, delta: GainDelta) -> StateS
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gains(Uncertainty):
-    """Gains of actuators and sensors, off by a share of them: `u1:gain`.
+    """Uncertain gains of actuators and sensors, a relative error of each: `u1:gain`.
 
     Parameters
     ----------
     share : float or {name: float}
-        By what share gains may be off at delta = 1: one for all, or by name.
+        Relative error of the gains at delta = 1: one number for all, or a mapping by name.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from .delta_blocks import Block
 
 
 class Known(NamedTuple):
-    """What a kind of uncertainty says of a plant.
+    """Deltas of one kind of uncertainty for a plant, and how they are drawn.
 
     Parameters
     ----------
@@ -25,8 +25,8 @@ class Known(NamedTuple):
     covariance : (m, m) array
         Covariance of the deltas as random numbers.
     drawn : sequence of Delta, optional
-        What is drawn for a machine instead: the parameters of a fit, which move all modes and
-        shapes.
+        Deltas that are drawn for a machine instead: the parameters of a fit, which change all modes
+        and shapes.
     drawn_covariance : (q, q) array, optional
 
     Examples
@@ -48,11 +48,11 @@ class Known(NamedTuple):
 
 
 class Uncertainty(Value):
-    """Something that is not known of a machine, for ``plant.uncertain(...)``.
+    """A kind of uncertainty of a machine, for ``plant.uncertain(...)``.
 
-    A new kind says by `deltas` which Deltas a plant has; one whose Deltas are correlated, or that
-    draws something else for a machine, by `known`; one of dynamics by `delta_blocks` and
-    `with_blocks`.
+    A new kind defines `deltas`, the Deltas of a plant. It defines `known` instead if its Deltas are
+    correlated or if it draws something else for a machine. A kind of dynamics defines
+    `delta_blocks` and `with_blocks`.
 
     Examples
     --------
@@ -80,7 +80,7 @@ class Uncertainty(Value):
         return Known.independent(self.deltas(plant))
 
     def bound(self, plant: Partition) -> Any:
-        """Return the `NeglectedModes` of a plant, None of a kind that bounds nothing."""
+        """Return the `NeglectedModes` of a plant; None for a kind without such a bound."""
         return None
 
     def delta_blocks(self, plant: Partition) -> Sequence[Block]:

@@ -16,8 +16,8 @@ from .neglected_dynamics import NeglectedModes, neglected_modes
 class Neglected(Uncertainty):
     """The modes that a plant lacks: one dynamic Delta with weights that bound their effect.
 
-    Machines that are drawn have these modes, with Deltas of modes on those of the same numbers;
-    where parameters of the model are drawn, which are of the plant's own model, they have not.
+    Drawn machines have these modes, and Deltas of modes act on the modes of the same numbers. Where
+    parameters are drawn, which belong to the plant's model, drawn machines do not have these modes.
 
     Parameters
     ----------

@@ -42,17 +42,18 @@ class NeglectedModes(Value):
     Parameters
     ----------
     weights : StateSpace
-        W, diagonal: an own weight for each output, stable with a stable inverse; continuous.
+        W, diagonal: a separate weight for each output, stable with a stable inverse; continuous.
     scales : (n_in,) array [input unit]
-        Sizes of the inputs at which they move the outputs alike.
+        Sizes of the inputs that move the outputs equally.
     inputs, outputs : sequences of str
-        What drives neglected modes, and what they move.
+        Channels that drive the neglected modes, and channels that these modes move.
     mirrored : mapping {str: str}
-        Outputs that are others with the opposite sign (errors of a reference): not bounded twice.
+        Outputs that equal others with the opposite sign (errors of a reference); they are not
+        bounded a second time.
     tightest : float
         Largest singular value of Delta over the frequencies that verified the bound: at most 1.
     looseness : float
-        Median of its inverse, over the logarithm of frequency.
+        Median of the inverse of that singular value, over the logarithm of frequency.
     sampled : NeglectedModes, optional
         The same bound for the sampled plant, delay and folding included: its weights are those of
         the bilinear frequency ``tan(pi f dt) / (pi dt)``, in which a sampled plant is continuous.
@@ -104,7 +105,7 @@ def neglected_modes(
     evaluation : StandardPlant, FEModel, Modes or ReducedModel
         With the same channels; a structure gets the plant's ports.
     resonances : int
-        How many neglected modes the weights follow; all others lie below a smooth line. Each
+        Number of neglected modes that the weights follow; all others lie below a smooth line. Each
         costs two states for each output.
 
     Returns

@@ -154,14 +154,14 @@ def require_matrices(plant: Partition) -> None:
 class Parameters(Uncertainty):
     """Parameters of the model, each known within an amount: they move all modes and shapes.
 
-    A mode that is uncertain too is then that of the nominal plant, whose K changes by a share of
-    ``omega^2 (M phi)(M phi)'``, and D alike.
+    If a mode is uncertain too, it is the mode of the nominal plant: K changes by a fraction of
+    ``omega^2 (M phi)(M phi)'``, and D likewise.
 
     Parameters
     ----------
     amounts : mapping {Parameter: float}
-        By how much each may be off at delta = 1, in its own unit: ``{AddedMass("41:z"): 0.025}``
-        for 0.5 kg within 5 %.
+        Error of each parameter at delta = 1, in the unit of the parameter:
+        ``{AddedMass("41:z"): 0.025}`` for 0.5 kg within 5 %.
 
     Raises
     ------

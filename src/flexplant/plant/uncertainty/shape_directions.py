@@ -118,7 +118,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Shapes(Uncertainty):
-    """Shapes of modes: `mode6:shape1` on what drives the mode and what is seen of it.
+    """Uncertain shapes of modes: `mode6:shape1` changes how a mode is driven and how it is seen.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Shapes(Uncertainty):
     modes : sequence of m int
         Numbers of the modes, from 1, rigid-body modes included.
     deviations : float
-        Standard deviations at which a delta is 1.
+        Number of standard deviations at which a delta is 1.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class Shapes(Uncertainty):
         )
 
     def known(self, plant: Partition) -> Known:
-        """Return a Delta for each direction, as long as the shape."""
+        """Return a Delta for each direction, scaled to the length of the shape."""
         realisation = modal_realisation(plant)
         require_elastic(realisation, self.modes)
         n = realisation.outputs.shape[0]

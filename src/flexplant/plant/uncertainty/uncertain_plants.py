@@ -38,7 +38,7 @@ _PROBE = 0.5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainPlant(Value, Generic[P]):
-    """A plant and what is not known of it: real Deltas, and a weight on the modes that it lacks.
+    """A plant and its uncertainty: real Deltas, and weights on the modes that it lacks.
 
     ::
 
@@ -54,7 +54,7 @@ class UncertainPlant(Value, Generic[P]):
     plant : StandardPlant
         The nominal plant, continuous or sampled.
     kinds : sequence of Uncertainty
-        What is not known of it.
+        Kinds of its uncertainty.
 
     Examples
     --------
@@ -119,7 +119,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @property
     def deviations(self) -> float:
-        """Standard deviations at which a delta is 1; the fewest of all."""
+        """Number of standard deviations at which a delta is 1; the smallest of all kinds."""
         return float(1.0 / np.sqrt(np.diag(self.covariance).max())) if self.deltas else DEVIATIONS
 
     @cached_property
@@ -163,37 +163,37 @@ class UncertainPlant(Value, Generic[P]):
         return self.replace(plant=plant.discretized(rate, delay=delay))
 
     def at(self, poi: Any = None, **positions: float) -> Self:
-        """Return the plant where ports are elsewhere with the same uncertainty."""
+        """Return the plant with ports at other places and the same uncertainty."""
         plant: Any = self.plant
         return self.replace(plant=plant.at(poi, **positions))
 
     def select(self, *, w: Any = None, u: Any = None, z: Any = None, y: Any = None) -> Self:
-        """Return the plant with some of its channels with the same uncertainty."""
+        """Return the plant with some of its channels and the same uncertainty."""
         plant: Any = self.plant
         return self.replace(plant=plant.select(w=w, u=u, z=z, y=y))
 
     def through(self, block: Any) -> Any:
-        """Return the nominal plant, its uncertainty known, read through a block."""
+        """Return the nominal plant with its uncertainty, read through a block."""
         nominal: Any = self.nominal
         return nominal.through(block)
 
     def weighted(self, weights: Any = None, *, z: Any = None, w: Any = None) -> Any:
-        """Return the nominal plant, its uncertainty known, with weights."""
+        """Return the nominal plant with its uncertainty and with weights."""
         nominal: Any = self.nominal
         return nominal.weighted(weights, z=z, w=w)
 
     @property
     def nominal(self) -> P:
-        """The nominal plant with `uncertainty` this value, which weights and blocks keep.
+        """The nominal plant, whose `uncertainty` is this value; weights and blocks keep it.
 
-        What designs and loops take when they are given an uncertain plant; an H-infinity design
-        has ``uncertain.nominal.through(errors).weighted(z=..., w=...)``.
+        Designs and loops use it when they are given an uncertain plant. For an H-infinity design
+        write ``uncertain.nominal.through(errors).weighted(z=..., w=...)``.
         """
         return self.plant.replace(uncertainty=self)
 
     @property
     def frequencies(self) -> dict[int, float]:
-        """By what share the frequency of each mode may be off, {mode: share} at delta = 1."""
+        """Relative error of the frequency of each mode at delta = 1, as {mode: share}."""
         # stiffness is off by twice the relative error of the frequency
         return {d.mode: 0.5 * d.scale for d in self.deltas if isinstance(d, FrequencyDelta)}
 
@@ -205,7 +205,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def of_matrices(self) -> bool:
-        """Whether Deltas are changes of M, D and K: of parameters, and of modes with these."""
+        """Whether Deltas change M, D and K: those of parameters, and of modes next to them."""
         found = any(isinstance(delta, ParameterDelta) for delta in self.deltas)
         if found:
             require_matrices(self.plant)
@@ -282,7 +282,7 @@ class UncertainPlant(Value, Generic[P]):
         return self._closed(machine, self.drawn_blocks(rng))
 
     def drawn_blocks(self, rng: np.random.Generator, size: float | None = None) -> dict[str, Any]:
-        """Draw a stable system of a gain, at most 1 when not given, for each block, by name."""
+        """Return a drawn stable system for each block, by name; of gain `size`, or at most 1."""
         poles = self.plant.continuous.system.poles()
         return {
             one.name: drawn_delta(one, rng, poles, rng.uniform() if size is None else size)
@@ -298,7 +298,8 @@ class UncertainPlant(Value, Generic[P]):
     def values(self, rng: np.random.Generator) -> list[tuple[Delta, float]]:
         """Return drawn values of the Deltas, each kind from its covariance.
 
-        The parameters of a fit in place of the Deltas of its modes: they move all modes and shapes.
+        The parameters of a fit take the place of the Deltas of its modes: they change all modes and
+        shapes.
         """
         found: list[tuple[Delta, float]] = []
         for known in self._known:
@@ -317,12 +318,12 @@ class UncertainPlant(Value, Generic[P]):
         return found[0] if found else plant.evaluation_plant
 
     def on(self, plant: P) -> UncertainPlant[P]:
-        """Return what is not known, of another plant of the same machine.
+        """Return the same uncertainty of another plant of the same machine.
 
         Parameters
         ----------
         plant : StandardPlant
-            Sampled, moved or with other ports, say.
+            The other plant: sampled, moved or with other ports, for example.
         """
         return self.replace(plant=plant.replace(uncertainty=None))
 

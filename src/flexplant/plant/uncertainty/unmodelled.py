@@ -59,8 +59,8 @@ class UnmodelledDynamics(Uncertainty):
         Actuators, sensors, or both.
     form : {"inverse", "coprime"}, optional
         Multiplicative at one side and additive between both when not given. "inverse" needs
-        channels of one side; "coprime" takes all u and y, whose units must be even (see
-        `design_ncf`), and no `at`.
+        channels of one side. "coprime" takes all u and y and no `at`; the units must give signals
+        of similar size (see `ncf_margin`).
     name : str, optional
         Name of the Delta; by default from the channels: `u1:dynamics`.
 
