@@ -16,7 +16,7 @@ both, and prints the following, among other things::
     column = -0.12 +- 0.074
     feet = 0.038 +- 0.038
     modulus margin 0.635 of the model, 0.629 on the measured responses
-    the tool's error in a move of 20 mm: 108 um, with feedforward 3.5 um
+    the tool's error in a move of 20 mm: 108 um, with feedforward 0.4 um
 """
 
 # %% Names and numbers
@@ -144,8 +144,7 @@ def measured_plant(frf: fx.Frf) -> fx.Frf:
 def moves(loop: fx.ClosedLoop) -> dict[str, fx.Response]:
     """Return a move of 20 mm without and with feedforward."""
     move = fx.setpoint(20e-3, velocity=0.05, acceleration=0.5, jerk=10.0, snap=400.0, rate=RATE)
-    # the feet are not known to their damping, so that filters of their zeros would leave more
-    forward = fx.design_feedforward(loop, reference="tool_y:ref", slow_zeros=False)
+    forward = fx.design_feedforward(loop, reference="tool_y:ref")
     fed = fx.close_loop(loop.plant, *loop.blocks, forward)
     given = {"reference": {"tool_y:ref": move}, "duration": 1.2, "noise": False}
     return {
