@@ -23,7 +23,7 @@ from flexplant.synthesis import (
 from flexplant.synthesis.hinf.lower_bound import relaxed_bound
 from flexplant.synthesis.preparation import prepared
 from oracles_synthesis import closed_loop, split
-from textbook_plants import KINDS, Problem, mixed, problem, strictly_proper
+from textbook_plants import KINDS, Problem, mixed, problem, sampled, strictly_proper
 
 oracle = pytest.importorskip("oracles_hinf", exc_type=ImportError)  # needs slycot
 
@@ -150,6 +150,29 @@ def test_efforts_and_noises_that_are_tiny(seed):
     D[2 : 2 + m, -m:], D[-q:, 2 : 2 + q] = effort * np.eye(m), noise * np.eye(q)
     p = Problem("tiny", (A, B, C, D), m, q)
     found = design_hinf(posed(p))
+    assert found.lower <= found.gamma <= FULL * oracle.smallest_norm(p)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 5, 13, 22])
+def test_noises_that_are_tiny_at_half_the_rate(seed):
+    """Sampled masses whose sensors have noise have full rank: gamma is within 1 %, not 5."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 4))
+    m = int(rng.integers(1, n + 1))
+    K = np.diag(rng.uniform(0, 2, n))
+    for i in range(n - 1):
+        K[i : i + 2, i : i + 2] += rng.uniform(0.5, 2) * np.array([[1, -1], [-1, 1]])
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-K, -0.02 * K]])
+    force, seen = np.eye(2 * n)[:, n:], np.eye(n, 2 * n)
+    B = np.hstack([force, np.zeros((2 * n, m)), force[:, :m]])
+    C = np.vstack([seen, np.zeros((m, 2 * n)), seen[:m]])
+    D, (effort, noise) = np.zeros((n + 2 * m, n + 2 * m)), 10.0 ** rng.uniform((-2, -5), (0, -3))
+    D[n : n + m, -m:], D[-m:, n : n + m] = effort * np.eye(m), noise * np.eye(m)
+    dt = 10.0 ** rng.uniform(-2, -1)
+    p = Problem("masses", sampled((A, B, C, D), dt, "zoh"), m, m, dt)
+    found = design_hinf(posed(p))
+    assert "next to no noise" in found.notes[0]
     assert found.lower <= found.gamma <= FULL * oracle.smallest_norm(p)
 
 

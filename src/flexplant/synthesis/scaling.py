@@ -23,7 +23,7 @@ FELT = 1e-3
 _FAR = 1e7
 #: the same of a sampled plant [half the rate in rad/s, as mapped]: a third of the rate, since all
 #: answers are distorted above it
-THIRD = float(np.tan(np.pi / 3.0))
+_THIRD = float(np.tan(np.pi / 3.0))
 #: points a decade of the search for the loop's speed, its start relative to the slowest pole (not a
 #: whole decade below it: no point may lie on an undamped pole), and the factor a decade that is a
 #: fall
@@ -85,7 +85,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     if not sizes.size:
         return 1.0
     start = _START * float(sizes.min())
-    far = max(2.0 * THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
+    far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
     omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
     G = responses(g, omega / (2.0 * np.pi))
     # above the fastest pole and the last corner of all answers only gains grow

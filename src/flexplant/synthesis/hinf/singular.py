@@ -19,7 +19,7 @@ from ...lti.statespace import StateSpace
 from ...tolerances import NEGLIGIBLE, ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared
-from ..scaling import FELT, THIRD, answers
+from ..scaling import FELT
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
@@ -76,13 +76,14 @@ def lacking(p: Prepared) -> Lacking:
     ):
         values = np.zeros(D.shape[1])
         values[: min(D.shape)] = la.svdvals(D) if D.size else 0.0
-        rank, felt = int(np.count_nonzero(values > _RANK)), ROUNDING
+        rank = int(np.count_nonzero(values > _RANK))
+        is_full &= bool(np.all(values > ROUNDING))
         if p.dt and not p.direct:
-            # for D the image of a sampled plant has the answers at half the rate: they are not felt
-            # below a third
-            third = 2j * THIRD / (p.dt * p.speed)
-            felt = float(np.max(answers(A, B, C, np.zeros_like(D), third), initial=felt))
-        is_full &= bool(np.all(values > felt))
+            # the image of a sampled plant has the answers at half the rate for D, and D where z is
+            # infinite: without effort or noise there is only rounding
+            states = np.linalg.solve(2.0 / (p.dt * p.speed) * np.eye(len(A)) - A, B)
+            size = 1.0 + float(np.linalg.norm(np.abs(C) @ np.abs(states)))
+            is_full &= bool(np.all(la.svdvals(C @ states + D) > ROUNDING * size))
         if rank < D.shape[1]:
             little = cause.format("next to " if np.all(values > ROUNDING) else "")
             ranks.append(
