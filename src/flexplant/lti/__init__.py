@@ -5,9 +5,9 @@ frequency responses, norms and sampling exact and fast. Controllers, plants and 
 such systems.
 
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
-- `frequency_response`: an `Frf`, of systems, of structures between their ports, measured or not.
+- `frequency_response`: the `Frf` of a system, or of a structure between its ports.
 - `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
-- `Delayed`: a continuous delay, and laws that differentiate, exact on the frequency axis.
+- `Delayed`: a system with a delay or a derivative in continuous time, exact on the frequency axis.
 - `step`, `impulse`, `lsim`, `step_info`: time responses in numbers; `fx.plot.step` draws them.
 - `h2_norm`, `hinf_norm`, `peak_gain`: norms, with a proof for the last two.
 - `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,

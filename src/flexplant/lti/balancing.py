@@ -96,7 +96,7 @@ def balanced(
         discarded states are set to equilibrium (singular perturbation) instead of zero; the bound
         is the same.
     input_weight, output_weight : StateSpace, optional
-        Stable filters before the inputs and after the outputs, matched in order.
+        Stable filters before the inputs and after the outputs, connected in order.
 
     Raises
     ------

@@ -20,8 +20,8 @@ from .statespace import StateSpace, System, as_statespace
 def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> StateSpace:
     """Return the continuous system whose samples a sampled system gives (``d2c``).
 
-    With a zero-order hold ``[A_d, B_d; 0, 1] = e^([A, B; 0, 0] dt)``, whose logarithm is taken;
-    what it gives is sampled again as a check.
+    With a zero-order hold ``[A_d, B_d; 0, 1] = e^([A, B; 0, 0] dt)``. The logarithm of this matrix
+    gives A and B. The result is sampled again as a check.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> St
     Returns
     -------
     StateSpace
-        With dt = 0 and the same names.
+        Continuous system with the same names.
 
     Raises
     ------
@@ -98,12 +98,12 @@ def resampled(
     rate : float [Hz]
         New sampling rate.
     method : {"hold", "tustin"}
-        As in `continuous`, for both ways.
+        Method as in `continuous`, for both conversions.
 
     Returns
     -------
     StateSpace
-        With dt = 1 / rate.
+        System with dt = 1 / rate.
 
     Raises
     ------
@@ -133,8 +133,8 @@ def descriptor(
 ) -> StateSpace:
     """Return the state space of a descriptor system; equations without a derivative are solved.
 
-    ``E dx/dt = A x + B u, y = C x + D u`` (or ``E x[k+1]``). With the singular values of E, its
-    zero rows are equations ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, which give x_2.
+    ``E dx/dt = A x + B u, y = C x + D u`` (or ``E x[k+1]``). A singular value decomposition of E
+    separates the equations ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, which give x_2.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def descriptor(
     Returns
     -------
     StateSpace
-        With as many states as E has rank.
+        System with a number of states equal to the rank of E.
 
     Raises
     ------

@@ -22,8 +22,8 @@ from .statespace import StateSpace, System, as_statespace
 class Delayed(Value):
     """``(G(s) + s F) e^(-s delay)``: a continuous system, a derivative and a delay.
 
-    The derivative is that of a PD law or of another one with one zero more than poles, which no
-    state space is; in a product with a plant that does not pass steps it is an ordinary system.
+    The derivative is that of a PD law, or of another law with one more zero than poles. Such a law
+    has no state-space form. Its product with a strictly proper plant is an ordinary system.
     `flexplant.loop.DelayedLoop` judges loops, `pade` gives a system with states where one is
     needed.
 
@@ -32,9 +32,9 @@ class Delayed(Value):
     system : StateSpace, or a system of python-control or SciPy
         G, continuous.
     delay : float [s]
-        Of all channels.
+        Delay of all channels.
     slope : (p, m) array, optional
-        F; zero when not given.
+        Gain F of the derivative; zero when not given.
 
     Raises
     ------
@@ -150,7 +150,7 @@ class Delayed(Value):
     def pade(self, order: int) -> StateSpace:
         """Return the system with Pade's approximation of the delay, for designs that need states.
 
-        Its error is ``|1 - P(jw) e^(jw delay)|``: `pade_error` says it at a frequency.
+        Its error is ``|1 - P(jw) e^(jw delay)|``: `pade_error` gives it at a frequency.
         """
         if np.any(self.slope):
             raise ModelError(f"{self!r} is no state space. Add a filter to the derivative.")

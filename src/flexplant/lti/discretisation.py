@@ -33,7 +33,7 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
     Returns
     -------
     StateSpace
-        With dt = 1 / rate, the same names.
+        System with dt = 1 / rate and the same names.
 
     Raises
     ------

@@ -342,9 +342,9 @@ def symmetrised(X: FloatArray) -> FloatArray:
 def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
 
-    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. With
-    the terms before cancellation ``T = |A| |X| |A'| + |Q|``, entry (i, j) of the residual is at
-    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``.
+    The method is doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``, in scaled states.
+    Entry (i, j) of the residual is at most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``, where
+    ``T = |A| |X| |A'| + |Q|`` is the size of the terms before cancellation.
 
     Parameters
     ----------
@@ -391,12 +391,12 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
 def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Lyapunov equation ``A X + X A' + Q = 0``.
 
-    By Schur form (Bartels-Stewart) in scaled states, with one step of correction.
+    The method is the Schur form (Bartels-Stewart) in scaled states, with one step of correction.
 
     Parameters
     ----------
     A : (n, n) array
-        All eigenvalues with negative real parts.
+        State matrix; all its eigenvalues have negative real parts.
     Q : (n, n) array
         Symmetric.
 

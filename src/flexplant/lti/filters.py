@@ -72,12 +72,12 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     """Return the sampled filter with matched poles and zeros, ``z = e^(s / rate)``.
 
     Zeros at infinity go to z = -1, so that a roll-off ends in a zero at half the rate. The gain is
-    matched at one frequency. Notches keep their frequency and depth exactly, which Tustin only
-    does at one.
+    matched at one frequency. Notches keep their frequency and depth exactly; with Tustin this is
+    possible at one frequency only.
 
-    Only for systems of one input and one output, as in MATLAB's c2d, since zeros of several
-    channels belong to all of them. A filter with a section for each channel is sampled section by
-    section: ``append(*(matched(f, rate) for f in sections))``.
+    As in MATLAB's c2d, the method needs systems with one input and one output, because the zeros of
+    a system with several channels do not belong to single channels. A filter with a section for
+    each channel is sampled section by section: ``append(*(matched(f, rate) for f in sections))``.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def low_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateS
     order : {1, 2}
         Slope at high frequencies.
     gain : float
-        At low frequencies.
+        Gain at low frequencies.
 
     Returns
     -------
@@ -278,7 +278,7 @@ def lead_lag_filter(zero: float, pole: float, *, gain: float = 1.0) -> StateSpac
     zero, pole : float [Hz]
         Corner frequencies.
     gain : float
-        At low frequencies.
+        Gain at low frequencies.
 
     Returns
     -------

@@ -195,9 +195,10 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     resolution : float [Hz], optional
         Resolution of a measurement: inverse of the length of the transformed segment or period.
     window : str or tuple, optional
-        Window of a measurement averaged over windowed segments: their window, as
-        `scipy.signal.get_window` takes; needs `resolution`. Such lines leak, and their errors are
-        correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
+        Window of the segments over which a measurement was averaged, as `scipy.signal.get_window`
+        takes it; needs `resolution`. Such lines leak, and their errors are correlated
+        (`line_correlation`). None for responses without leakage: computed, or measured over whole
+        periods.
     overlap : float
         Fraction of a segment that overlaps with the next one, from 0 to below 0.95.
     units : mapping {channel: unit}, optional
@@ -213,8 +214,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     Raises
     ------
     ShapeError, ModelError, LabelError
-        When sizes do not match, entries are not finite, freq does not increase, or names are
-        doubled.
+        When sizes do not match, entries are not finite, freq does not increase, or names occur
+        twice.
 
     Examples
     --------
@@ -415,7 +416,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Lines averaged over windowed segments share data with their neighbours: under a Hann
         window errors of neighbours are correlated by 4/9, of lines two apart by 1/36, so that a
         mean over many lines has 1 + 2 (4/9 + 1/36) = 1.94 times the variance that independent
-        ones would give. None where lines are independent: computed, or of whole periods.
+        ones would give. The result is None if lines are independent: computed, or measured over
+        whole periods.
         """
         if self.window is None or self.resolution is None:
             return None
@@ -479,7 +481,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:
-        """Return a `control.FrequencyResponseData` of the same names; dt [s] is the system's."""
+        """Return a `control.FrequencyResponseData` with the same names and the system's dt [s]."""
         import control
 
         return control.FrequencyResponseData(

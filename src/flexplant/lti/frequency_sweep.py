@@ -31,11 +31,12 @@ SOUGHT = DRAWN[::2]
 def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) -> FloatArray:
     """Return a grid [Hz] that follows the resonances and antiresonances of every channel.
 
-    From a decade below the slowest pole to a decade above the fastest (or half the sampling rate),
-    with points through every resonance; then intervals are halved, the worst first, until in the
-    middle of each the logarithm of every channel's magnitude lies within `tolerance` of the line
-    between its ends, and no phase changes by more than 0.6 rad, so that a line through the points
-    shows the response. The grid has a gap at an undamped resonance, which has no finite response.
+    The grid extends from a decade below the slowest pole to a decade above the fastest (or half the
+    sampling rate), with points through every resonance. Its intervals are halved, the worst first,
+    until a line through the points shows the response. In the middle of each interval the logarithm
+    of every channel's magnitude is then within `tolerance` of the line between its ends, and no
+    phase changes by more than 0.6 rad. The grid has a gap at an undamped resonance, which has no
+    finite response.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ def parallel(first: System, second: System) -> StateSpace:
     Parameters
     ----------
     first, second : StateSpace
-        With the same channel names.
+        Systems with the same channel names.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def lft(P: System, K: System) -> StateSpace:
     Returns
     -------
     StateSpace
-        w -> z, states of P then of K.
+        System w -> z with the states of P, then those of K.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def connect(
     Returns
     -------
     StateSpace
-        With exactly these inputs and outputs, states of the blocks in order.
+        System with exactly these inputs and outputs, and with the states of the blocks in order.
 
     Raises
     ------

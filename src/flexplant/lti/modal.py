@@ -218,9 +218,9 @@ class StableSplit(Value):
     Parameters
     ----------
     stable : StateSpace
-        Strictly stable, with the feedthrough.
+        Strictly stable part, with the feedthrough.
     rest : StateSpace
-        Rigid-body, marginal and unstable modes, strictly proper.
+        Part with the rigid-body, marginal and unstable modes, strictly proper.
     separation : float
         Norm of the decoupling transformation, by which rounding grows; 0 if A had blocks.
     """
@@ -240,11 +240,12 @@ class StableSplit(Value):
 def split_stable(sys: System) -> StableSplit:
     """Return the additive decomposition into a stable part and the rest.
 
-    Where A is block diagonal and no block has poles of both kinds, its blocks are sorted, exactly.
-    Otherwise by ordered Schur form ``[[A1, A12], [0, A2]]`` and the Sylvester equation
-    ``A1 X - X A2 + A12 = 0`` that removes A12; a pole closer to the stability limit than its
-    rounding (of A, times the condition number of the eigenvalue) does not count as stable, and
-    neither does any pole that is closer than such a pole.
+    If A is block diagonal and no block has poles of both kinds, its blocks are sorted, which is
+    exact. Otherwise the ordered Schur form ``[[A1, A12], [0, A2]]`` is used, and the Sylvester
+    equation ``A1 X - X A2 + A12 = 0`` removes A12. A pole does not count as stable if its distance
+    to the stability limit is below its rounding error (the rounding of A times the condition number
+    of the eigenvalue). Poles that are closer to the limit than such a pole do not count as stable
+    either.
 
     Parameters
     ----------

@@ -51,13 +51,13 @@ class RiccatiSolution(Value):
         Symmetric.
     gain : (n, p) array
         ``K = (A P C' + S) (C P C' + R)^-1`` (or ``(P C' + S) R^-1``): the filter's closed loop is
-        A - K C. From the control forms it is F (m, n), closed loop A - B F.
+        A - K C. For the control equations it is F (m, n), with the closed loop A - B F.
     poles : (n,) array
         Eigenvalues of the closed loop.
     residual : float
         Norm of the equation's residual relative to P, states scaled to unit variance.
     iterations : int
-        Doubling and Newton steps.
+        Number of doubling and Newton steps.
     """
 
     P: FloatArray
@@ -88,9 +88,9 @@ def filter_dare(
 ) -> RiccatiSolution:
     """Return the stabilising solution of the discrete filter Riccati equation.
 
-    ``P = A P A' - (A P C' + S) (C P C' + R)^-1 (A P C' + S)' + Q``. Structure-preserving
-    doubling in scaled states, then Newton steps on the residual (each a Stein equation) in
-    states of unit variance.
+    ``P = A P A' - (A P C' + S) (C P C' + R)^-1 (A P C' + S)' + Q`` is solved by
+    structure-preserving doubling in scaled states. Newton steps on the residual follow (each a
+    Stein equation), in states of unit variance.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def filter_dare(
     Returns
     -------
     RiccatiSolution
-        P of x before its measurement, and the predictor gain.
+        Covariance P of x before its measurement, and the gain of the predictor.
 
     Raises
     ------
@@ -137,14 +137,15 @@ def filter_care(
 ) -> RiccatiSolution:
     """Return the stabilising solution of the continuous filter Riccati equation.
 
-    ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by the stable subspace of the Hamiltonian
-    in scaled states; where that has eigenvalues on the axis within rounding (poles of 1e-12 times
-    the fastest), by a Cayley transform to the doubling of `filter_dare`. Newton steps follow.
+    ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q`` is solved by the stable subspace of the
+    Hamiltonian in scaled states. If the Hamiltonian has eigenvalues on the axis within rounding
+    (poles of 1e-12 times the fastest), a Cayley transform leads to the doubling of `filter_dare`
+    instead. Newton steps follow.
 
     Parameters
     ----------
     A, C, Q, R, S : arrays
-        As in `filter_dare`; Q and R intensities instead of covariances.
+        As in `filter_dare`, but Q and R are intensities instead of covariances.
 
     Returns
     -------

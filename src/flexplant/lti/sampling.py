@@ -43,7 +43,7 @@ def discretized(
     Returns
     -------
     StateSpace
-        With dt = 1 / rate; states of `sys` first, then the delay lines `u1:delay1`, ...
+        System with dt = 1 / rate; states of `sys` first, then the delay lines `u1:delay1`, ...
 
     Raises
     ------

@@ -70,7 +70,7 @@ class StateSpace(Value):
     Raises
     ------
     ShapeError, ModelError, LabelError
-        When sizes do not match, entries are not finite, names are doubled or `blocks` do not
+        When sizes do not match, entries are not finite, names occur twice or `blocks` do not
         describe A.
 
     Examples
@@ -337,7 +337,7 @@ class StateSpace(Value):
     def dcgain(self) -> float | FloatArray:
         """Return the static gain ``C (-A)^-1 B + D`` (at z = 1 when sampled).
 
-        A number for one input and one output, else (p, m).
+        The result is a number for one input and one output, otherwise an array (p, m).
 
         Raises
         ------
@@ -405,9 +405,10 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     Raises
     ------
     ModelError
-        When it is neither a system nor a (p, m) array; for a StandardPlant, which holds four.
+        When it is neither a system nor a (p, m) array, or is a StandardPlant, which contains four
+        systems.
     ShapeError
-        When an array holds nothing.
+        When an array is empty.
 
     Examples
     --------

@@ -30,14 +30,14 @@ _FINE, _FEWEST, _MOST = 200.0, 500, 20_000
 class TimeResponse(Value):
     """Signals at the outputs of a system over time.
 
-    ``response["y1", "u1"]`` is the answer (n_time,) at one output to one input, and
+    ``response["y1", "u1"]`` is the response (n_time,) at one output to one input, and
     ``response["y1"]`` the same where a single input, or all inputs together, drove the system.
 
     Parameters
     ----------
     time : (n_time,) array [s]
     data : (n_out, n_in, n_time) array
-        In the units of the outputs. `lsim` drives all inputs together: n_in is then 1.
+        Signals in the units of the outputs. `lsim` drives all inputs together: n_in is then 1.
     outputs, inputs : sequences of str
     units : mapping {channel: unit}, optional
 
@@ -85,10 +85,10 @@ def step(
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
     time : (n_time,) array [s], optional
-        Equidistant instants from 0, of a sampled system its own ones.
+        Equidistant instants from 0; for a sampled system its sampling instants.
     duration : float [s], optional
-        Where `time` is not given; else until the slowest pole has decayed to 1 % or has turned
-        twenty times.
+        Length of the response if `time` is not given. By default until the slowest pole has decayed
+        to 1 % or made twenty oscillations.
 
     Returns
     -------
@@ -181,16 +181,16 @@ def lsim(
     u : (n_in, n_time) or (n_time,) array
         Inputs in their units; a single row for one input.
     time : (n_time,) array [s]
-        Equidistant from 0.
+        Equidistant instants from 0.
     start : (n,) array, optional
         States at the first instant; by default 0.
     between : {"held", "linear"}
-        What u does between two instants; of a sampled system u is "held".
+        Course of u between two instants; for a sampled system u is "held".
 
     Returns
     -------
     TimeResponse
-        With one column: `response["y1"]` is (n_time,).
+        Response with one column: `response["y1"]` is (n_time,).
 
     Raises
     ------
@@ -234,15 +234,15 @@ class StepInfo(Value):
     steady : float
         The value at rest, from the static gain.
     rise : float [s]
-        From 10 % to 90 % of the way.
+        Rise time from 10 % to 90 % of the way.
     settling : float [s]
-        Until the response stays within 2 % of the way (of `step_info`'s `band`).
+        Time until the response stays within 2 % of the way (or the `band` of `step_info`).
     overshoot, undershoot : float [%]
-        Beyond the value at rest, and to the other side of 0.
+        Overshoot beyond the value at rest, and undershoot on the other side of 0.
     peak : float
         Largest absolute value.
     peak_time : float [s]
-        When it is reached.
+        Time of the peak.
     unit : str, optional
         Unit of the output.
     """
@@ -279,7 +279,8 @@ def step_info(
     output, input : str, optional
         The channel; by default the only one.
     band : float
-        The response has settled when it stays this close to the value at rest, as a part of it.
+        Fraction of the value at rest: the response has settled when it stays this close to that
+        value.
 
     Returns
     -------
@@ -288,7 +289,7 @@ def step_info(
     Raises
     ------
     ModelError
-        When the channel is not said, the system is not stable, or its static gain is zero.
+        When the channel is not given, the system is not stable, or its static gain is zero.
 
     Examples
     --------
