@@ -3,12 +3,14 @@
 A `Controller` holds the results of its checks: the norm by two methods, stability, the loop on the
 evaluation model of the plant (with the truncated modes), and the allowed error of each mode.
 
-- `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
+- `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: its largest
+  bandwidth.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
 - `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf`;
   `design_structured` (fixed order, PID and notches; your own objective derives from
   `MeasuredObjective`).
-- `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
+- `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: also for a measured FRF
+  without a model.
 - `damp_modes`: velocity feedback, positive position feedback, integral resonant control.
 - `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
   uncertain plants, from machines (``plant.uncertain``) or your own blocks (`uncertain_system`).

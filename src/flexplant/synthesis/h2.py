@@ -38,7 +38,7 @@ def design_h2(
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
     A sampled plant is solved by its discrete equations; its K uses y of the same sample. The norm
-    is found a second time by Gramians of the loop, which have to agree with it.
+    is computed a second time by Gramians of the loop; both results must agree.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ def design_h2(
     Raises
     ------
     AssumptionError
-        When w reaches z at once in a continuous plant (infinite norm), or an undamped mode is
-        not seen, reached, costly or excited.
+        When w acts directly on z in a continuous plant (infinite norm), or an undamped mode is not
+        seen by y, reached by u, seen by z or excited by w.
     InfeasibleError, SolverError
-        When the norm falls to zero with what is added to a singular problem, or no stabilising
-        controller was found.
+        When the norm of a singular problem falls to zero together with the added noise and effort,
+        or no stabilising controller was found.
     CertificateError
         When the closed loop is not stable or its norm is not that of the formula.
     ModelError
@@ -76,9 +76,9 @@ def design_h2(
     noise (asd / sqrt(2) continuous, asd / sqrt(2 dt) sampled), ``z`` by one over the rms that is
     allowed of each motion and effort.
 
-    Where D12 or D21 has not full rank, a little noise on each sensor and effort of each actuator
-    is added, as for `design_hinf`, and lowered until that gains next to nothing. Where w and z miss
-    an undamped mode, w also acts a little where u does, and z sees a little of y.
+    If D12 or D21 does not have full rank, a little noise on each sensor and effort of each actuator
+    is added, as for `design_hinf`, and lowered until the norm hardly changes. If w or z misses an
+    undamped mode, a little of w is added at u, and a little of y to z.
 
     References
     ----------

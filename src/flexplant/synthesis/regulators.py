@@ -199,9 +199,9 @@ def lqg(
 ) -> StateSpace:
     """Return the controller of least quadratic cost from measurements y to inputs u.
 
-    State feedback of `lqr` (`lqi` where outputs are integrated) on the estimate of `lqe`. The sign
-    of the feedback is in the controller, as everywhere here: ``fx.lti.feedback(sys, K, sign=1)``,
-    or ``fx.loop.report_loops((sys, K))``.
+    The controller is the state feedback of `lqr` (`lqi` if outputs are integrated) on the estimate
+    of `lqe`. The sign of the feedback is in the controller, as everywhere here:
+    ``fx.lti.feedback(sys, K, sign=1)``, or ``fx.loop.report_loops((sys, K))``.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     ----------
     sys : StateSpace, or a system of python-control or SciPy
     poles : (n,) array [rad/s, or 1 where sampled]
-        In conjugate pairs; none more often than there are inputs.
+        Poles in conjugate pairs; each may be given at most as often as there are inputs.
 
     Returns
     -------

@@ -22,12 +22,12 @@ _PHASES = (0.1, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class RepeatedScalar(Value):
-    """An uncertainty ``w = delta z`` on `size` channels alike, delta one number.
+    """An uncertainty ``w = delta z`` with one number delta for `size` channels.
 
     Parameters
     ----------
     size : int
-        How many channels it acts on.
+        Number of channels on which it acts.
     real : bool
         Whether delta is a real number (a parameter) or a complex one.
     name : str

@@ -281,7 +281,8 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     Returns
     -------
     mapping {(output, input): (k, 6) array}
-        Rows [b0, b1, b2, 1, a1, a2], the form of `scipy.signal.sosfilt`; the gain is in the first.
+        Rows [b0, b1, b2, 1, a1, a2], as `scipy.signal.sosfilt` takes them; the first row has the
+        gain.
 
     Raises
     ------
@@ -383,11 +384,11 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
 
         x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
 
-    Where u_applied = u it is the controller. Where actuators saturate, its states follow those of
-    a controller that commanded what was applied, with the poles of A - L C. ``L = B D^-1`` (Hanus)
-    makes these the zeros of the controller. With `recovery`, poles of the controller that decay
-    more slowly, such as integrators, move to that time constant and keep their frequency; the
-    others stay. For a PI controller this is back-calculation with that time.
+    If u_applied = u, this system equals the controller. When actuators saturate, its states follow
+    those of a controller whose commands are the applied ones, with the poles of A - L C.
+    ``L = B D^-1`` (Hanus) makes these the zeros of the controller. With `recovery`, poles of the
+    controller that decay more slowly, such as integrators, move to that time constant and keep
+    their frequency; the others stay. For a PI controller this is back-calculation with that time.
 
     Parameters
     ----------

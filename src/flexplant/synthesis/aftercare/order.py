@@ -77,25 +77,26 @@ class _FactoredController(NamedTuple):
 def reduce_controller(
     plant: AnyPlant | System, controller: Any, *, order: int | None = None, loss: float = 0.1
 ) -> Controller:
-    """Return a controller of fewer states that keeps the closed loop, or none at all.
+    """Return a controller of fewer states that keeps the closed loop, or raise an error.
 
     With a normalised right coprime factorisation ``K = N M^-1``, ``[N; M]`` is truncated in states
     balanced with the weight through which its error enters the loop::
 
         W [dN; dM],   W = (M - P N)^-1 [P, -I]
 
-    Where that weighted error is below one the reduced loop is stable (small gain); it is closed
-    again, and refused when it is unstable or loses margin (of a weighted plant: gamma) beyond
-    `loss`.
+    If that weighted error is below one, the reduced loop is stable (small gain). The loop is closed
+    again in any case. An error is raised if it is unstable or loses more margin than `loss` allows;
+    for a weighted plant gamma counts instead of the margin.
 
     Parameters
     ----------
     plant : StandardPlant
-        What it was designed for, continuous or sampled like it; weighted ones keep gamma.
+        Plant of the design, continuous or sampled like the controller. For a weighted plant gamma
+        is kept.
     controller : StateSpace or Controller
         From y to u; its integrators and unstable poles stay as they are.
     order : int, optional
-        States of the result; by default the fewest that keep the loop.
+        Number of states of the result; by default the smallest that keeps the loop.
     loss : float
         Relative loss of the modulus margin, or growth of gamma, that is allowed.
 
@@ -311,11 +312,11 @@ def stable_before(plant: AnyPlant, controller: StateSpace) -> Any:
 def discretise_controller(
     plant: AnyPlant, controller: Any, *, prewarp: float | None = None, loss: float = 0.5
 ) -> Controller:
-    """Return a continuous controller at the rate of a sampled plant, and how its loop stands there.
+    """Return a continuous controller sampled at the rate of a plant, with the margin of its loop.
 
-    Bilinear (Tustin), the response kept at one frequency where `prewarp` is given. The loop on
-    the sampled and delayed plant is compared with the continuous loop it was designed for: what a
-    delay costs is in the margin. To design for the sampled plant from the start costs less.
+    The method is bilinear (Tustin) and keeps the response at one frequency if `prewarp` is given.
+    The loop on the sampled and delayed plant is compared with the continuous loop of the design;
+    the loss of margin includes the effect of the delay. A design for the sampled plant loses less.
 
     Parameters
     ----------

@@ -74,20 +74,22 @@ def design_hinf(
         singular, and a little disturbance where w or z misses an undamped mode. `Lmi()` finds
         gamma by a semidefinite program and suits up to 30 states.
     bandwidth : float [Hz], optional
-        For a stage without weights: those of `stage_weights` are used, for the POI's only
-        reference. `design_stage` finds the largest possible one.
+        Bandwidth for a stage without weights: those of `stage_weights` are used, and the POI must
+        have one reference. `design_stage` finds the largest possible bandwidth.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
         Uncertainty of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: the design
         tolerates its frequencies. Not needed where the plant itself is uncertain. Each mode gets a
-        channel through which a change of its frequency acts, with the shift of real mu; its scale
-        is found in a first design. `gamma` then includes these channels (above 1 is not a failure).
-        `certificate` has ``all frequencies at once``: below 1, no machine of the uncertainty has a
-        pole on the grid. ``ClosedLoop.mode_tolerances`` gives the allowed error of each.
+        channel through which a change of its frequency acts. The channel includes the scaling G of
+        real mu, and its size is found in a first design. `gamma` then includes these channels
+        (above 1 is not a failure). `certificate` has ``all frequencies at once``: below 1, no
+        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` gives the
+        allowed error of each.
     damped_below : float [Hz]
-        Uncertain modes below it that actuators push are damped, not only tolerated: their channel
-        then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
+        Frequency below which uncertain modes that actuators drive are damped, not only tolerated:
+        their channel then covers errors of 1 % and of their shapes. `design_stage` uses 3.5 times
+        the bandwidth.
     progress : bool, optional
         Whether to show a progress bar of the method's steps. None: on a terminal or in a
         notebook, for work of more than two seconds.

@@ -50,24 +50,24 @@ Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
 class Riccati(Value):
     """Synthesis by the two Riccati equations of Glover and Doyle, gamma by bounded bisection.
 
-    A gamma counts as reached only by the closed loop that it gives: stable, its gains below gamma.
-    The controller is taken back_off above the smallest one (at the optimum it is fast and badly
-    conditioned). The lower bound is the largest gamma that was refuted, not the largest that
-    failed.
+    A gamma counts as reached only if its closed loop is stable with all gains below gamma. The
+    controller is computed for a gamma `back_off` above the smallest one, because at the optimum it
+    is fast and badly conditioned. The lower bound is the largest gamma that was proven impossible,
+    not the largest one for which the computation failed.
 
     The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
-    boundary. Where a rank is missing, a little noise on each sensor and a little effort of each
-    actuator are added, at most 1e-3 of what the plant itself does at the speed of its loop; where
-    a mode is missed, or one that decays by less than 1e-4 of that speed, w also acts a little at
-    the actuators and z sees a little of the sensors. The loop is verified without them, and the
-    notes say what was added and what it costs in gamma.
+    boundary. If a rank is missing, a little noise on each sensor and a little effort of each
+    actuator are added, at most 1e-3 of the plant's own signals at the speed of its loop. If w or z
+    misses such a mode, or one that decays by less than 1e-4 of that speed, a little of w is added
+    at the actuators and a little of the sensors to z. The loop is verified without these additions.
+    The notes state what was added and what it costs in gamma.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. Unless given 0.5 % where D12 and D21 have
-        full rank (0.3 % with what is added for a missed mode or to a tiny effort or noise), and
-        5 % where they have not.
+        Relative distance from the smallest gamma found. By default 0.5 % if D12 and D21 have full
+        rank (0.3 % if something is added for a missed mode, or to a tiny effort or noise), and 5 %
+        otherwise.
     tolerance : float
         Relative width at which the bisection stops.
     regularised : bool, optional
@@ -100,8 +100,8 @@ class Riccati(Value):
         Raises
         ------
         AssumptionError
-            When z or w misses a mode on the stability boundary, or D12 or D21 has not full rank
-            and nothing may be added.
+            When z or w misses a mode on the stability boundary, or D12 or D21 does not have full
+            rank, and nothing may be added.
         InfeasibleError
             When gamma has a greatest lower bound that only infinite gain reaches.
         SolverError

@@ -54,9 +54,10 @@ def design_ncf(
 
         gamma_min = (1 + lambda_max(X Z))^(1/2),   gamma = (1 + back_off) gamma_min
 
-    with X and Z of the two Riccati equations of G_s: no search. ``K = before K_s after``. A
-    sampled plant is mapped to continuous time and the controller back, which keeps gains and
-    factors. Rigid-body modes and integrators are allowed in the plant and in `before` and `after`.
+    with X and Z of the two Riccati equations of G_s, so that no search is needed.
+    ``K = before K_s after``. A sampled plant is mapped to continuous time and the controller back,
+    which keeps gains and factors. Rigid-body modes and integrators are allowed in the plant and in
+    `before` and `after`.
 
     Parameters
     ----------
@@ -224,7 +225,7 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     Returns
     -------
     float
-        0.2 to 0.3 and more is called robust.
+        Margin; a value of 0.2 to 0.3 or more is called robust.
 
     Raises
     ------

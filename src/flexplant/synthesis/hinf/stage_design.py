@@ -89,9 +89,9 @@ def design_stage(
     margin : float
         Least modulus margin, broken at u.
     poi : str, optional
-        As for `stage_weights` and `reference_errors`.
+        POI as for `stage_weights` and `reference_errors`.
     disturbance, effort : float
-        As for `stage_weights` of an uncertain plant.
+        Sizes of the weights as for `stage_weights` of an uncertain plant.
     progress : as for `design_hinf`
 
     Returns

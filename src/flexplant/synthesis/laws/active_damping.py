@@ -51,8 +51,8 @@ class ActiveDamping(Value):
     freq : float [Hz]
         Frequency of the mode without the loop.
     before, damping : float
-        Damping ratio of the mode without the loop; least damping ratio of the mode and of the
-        poles of the filter with it.
+        Damping ratio of the mode without the loop; with the loop, least damping ratio of the mode
+        and the poles of the filter.
     margin : float
         Modulus margin of the loop.
     undamped : StandardPlant
@@ -69,7 +69,7 @@ class ActiveDamping(Value):
 
     @property
     def system(self) -> StateSpace:
-        """The controller, as blocks of `close_loop` have it."""
+        """The controller; `close_loop` reads it under this name."""
         return self.controller
 
     @cached_property
@@ -89,7 +89,7 @@ class ActiveDamping(Value):
 
     @property
     def loop_gain(self) -> StateSpace:
-        """L of negative feedback, 1 at the tuned gain: for `fx.plot.root_locus`."""
+        """Loop gain L of negative feedback for `fx.plot.root_locus`; factor 1 is the tuned gain."""
         gain: StateSpace = -series(self.undamped.Gyu.select(
             self.controller.inputs, self.controller.outputs), self.controller)  # fmt: skip
         return gain
@@ -111,12 +111,13 @@ def damp_modes(
     damping: float | None = None,
     margin: float = 0.3,
 ) -> ActiveDamping:
-    """Return the law that gives a mode a damping ratio, or the most on the loci of its kind.
+    """Return the law that gives a mode a damping ratio, or the largest one that its kind reaches.
 
-    Along root loci of all filters of the kind, for both signs: the damping ratio is the least of
-    the mode's pole and of those of the filter. Candidates keep the modulus margin, rigid-body
-    poles where they are or left of it, and at least 70 % of the damping of every other mode. Given
-    a damping ratio, the answer has the least gain over the resonance that reaches it.
+    The search follows the root loci of all filters of the kind, for both signs. The damping ratio
+    that counts is the smallest one of the mode's pole and the poles of the filter. Admissible laws
+    keep the modulus margin, do not move rigid-body poles to the right, and keep at least 70 % of
+    the damping of every other mode. If a damping ratio is given, the result is the law that reaches
+    it with the least gain over the resonance.
 
     Parameters
     ----------

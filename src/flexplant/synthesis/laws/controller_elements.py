@@ -118,7 +118,8 @@ class Lead(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        Where the phase is largest, ``asin((r - 1) / (r + 1))``; the zero lies at freq / sqrt(r).
+        Frequency of the largest phase, ``asin((r - 1) / (r + 1))``; the zero lies at freq /
+        sqrt(r).
     ratio : float
         Pole over zero; below 1 it is a lag.
 
@@ -150,7 +151,7 @@ class Lag(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        Its zero; the pole lies at freq / ratio.
+        Frequency of its zero; the pole lies at freq / ratio.
     ratio : float
         Gain at low frequency.
 
@@ -207,7 +208,7 @@ class Notch(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        Centre, of the zeros.
+        Centre frequency, that of the zeros.
     depth : float
         Gain at the centre, below 1; above 1 it is a resonance. depth times width is the damping
         ratio of the zeros.
@@ -244,7 +245,7 @@ class LowPass(SingleElement):
     freq : float [Hz]
         Corner.
     order : {1, 2}
-        Slope above it.
+        Order, the slope above the corner.
     damping : float
         Damping ratio of order 2; by default that of a Butterworth filter.
 
@@ -270,14 +271,14 @@ class LowPass(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FixedBlock(SingleElement):
-    """A system of one input and one output as it is, as an element of a law.
+    """A given system with one input and one output, used as an element of a law.
 
     Parameters
     ----------
     block : StateSpace
         From error to command, continuous or sampled; a sampled one runs at its own rate only.
     label : str
-        What it is, for those who read the law.
+        Description for the reader of the law.
 
     Examples
     --------
@@ -324,6 +325,6 @@ class FixedBlock(SingleElement):
 
     @cached_property
     def section(self) -> BlockSection:
-        """Its system, of a sampled one the continuous one that Tustin's rule samples to it."""
+        """Its system; for a sampled block, the continuous one from which Tustin's rule gives it."""
         rate, g = self.own_rate, self.block
         return BlockSection(bilinear(g, rate) if rate else g.replace(dt=0.0))

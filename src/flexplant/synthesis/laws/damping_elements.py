@@ -26,7 +26,8 @@ _CORNERS = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
 class DampingElement(SingleElement):
     """An element from error to command (``u = -L y``) whose gain damps a mode.
 
-    A new kind says its `section`, and by `candidates` which ones `damp_modes` tries.
+    A new kind defines `section`, its transfer function, and `candidates`, the elements that
+    `damp_modes` tries.
 
     Parameters
     ----------
@@ -129,9 +130,9 @@ class PositivePositionFeedback(DampingElement):
 class IntegralResonantControl(DampingElement):
     """``-gain / (1 + s / w)``: an integrator around the plant with a negative feedthrough.
 
-    With ``k / s`` behind ``y - d u``: gain = 1 / d and w = k d. The feedthrough d above the static
-    compliance puts a zero below each resonance of a collocated pair, and integral feedback damps
-    all modes that lie between its poles and zeros.
+    An integrator ``k / s`` that reads ``y - d u`` gives gain = 1 / d and w = k d. A feedthrough d
+    larger than the static compliance puts a zero below each resonance of a collocated pair, and
+    integral feedback damps all modes that lie between its poles and zeros.
 
     Parameters
     ----------

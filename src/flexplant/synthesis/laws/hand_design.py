@@ -110,8 +110,8 @@ class ShapedAxis(Value):
 class LoopDesign(Value):
     """Loops shaped by hand: elements of each axis, the decoupling, and what it was made on.
 
-    ``u = before diag(law_i) (r - after y)``, with feedforward where an axis has some. All of it is
-    plain numbers: the same value gives the same controller, to the last digit.
+    ``u = before diag(law_i) (r - after y)``, with feedforward for axes that have one. The design
+    consists of numbers only: equal designs give equal controllers, to the last digit.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ class LoopDesign(Value):
     references : mapping {axis: channel}
         References that axes follow. With feedforward an axis has one, ``axis:ref`` unless given.
     made_on : str
-        What the plant was, in words.
+        Description of the plant.
     fingerprint : str
-        A digest of it: see `is_made_on`.
+        Digest of the plant's numbers: see `is_made_on`.
 
     Examples
     --------
@@ -278,8 +278,8 @@ class LoopDesign(Value):
         """Return the system from y, and references where axes have one, to u.
 
         Its inputs after y are the references and those of their derivatives that a feedforward
-        uses, ``z:ref:acceleration`` say: what `close_loop`, `simulate` and `write_c` take. Axes
-        that are not closed while others are shaped take part.
+        uses, for example ``z:ref:acceleration``. `close_loop`, `simulate` and `write_c` take it. It
+        includes axes that are not closed while others are shaped.
         """
         axes = Axes(None, self.before, self.after, self.rate)
         feedback = connected(axes, axes_controller(axes, self.laws), self._followed)
@@ -342,8 +342,8 @@ class LoopDesign(Value):
         Parameters
         ----------
         plant : str, optional
-            The line that makes the plant, ``plant = fx.load("stage.npz")`` say: the script then
-            reports the loops on it.
+            The line that makes the plant, for example ``plant = fx.load("stage.npz")``; the script
+            then reports the loops on it.
         """
         return design_script(self, str(plant))
 

@@ -180,7 +180,7 @@ class SingleElement(LawElement):
 class Law(LawElement):
     """A product of elements, from error to command: ``gain F1(s) F2(s) ...``.
 
-    Sampled, each factor is mapped by Tustin's rule.
+    When the law is sampled, each factor is mapped by Tustin's rule.
 
     Parameters
     ----------
@@ -190,7 +190,8 @@ class Law(LawElement):
     rate : float [Hz]
         Sampling rate; 0 when continuous.
     prewarped : bool
-        Sampled, whether a notch, a lead and the corner of a low-pass stay where they are.
+        Whether a notch, a lead and the corner of a low-pass keep their frequencies when the law is
+        sampled.
 
     Examples
     --------

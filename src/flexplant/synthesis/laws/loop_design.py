@@ -35,7 +35,7 @@ class DesignedLoops(Value):
     laws : mapping {axis: Law}
         Error to command of each axis, positive for negative feedback.
     report : LoopReport
-        Crossovers and margins of each axis, the others closed, and stability.
+        Crossovers and margins of each axis with the others closed, and stability.
     left_out : SpillOver, optional
         Stability and margins on the plant with the truncated modes, where these are known.
     notes : sequence of str

@@ -47,9 +47,9 @@ class PidTuning(Value):
     integral, lead, roll_off : float [Hz]
         w_i, w_d and w_f over 2 pi; lead and roll-off are infinite if unused.
     crossover : float [Hz]
-        Where the loop gain is 1 for the first time.
+        Lowest frequency at which the loop gain is 1.
     bandwidth : float [Hz]
-        Where |S| passes 1 for the first time.
+        Lowest frequency at which |S| passes 1.
     margin : float
         Modulus margin.
     """
@@ -103,7 +103,7 @@ def tune_pid(
         Rate of the controller; the plant is then sampled exactly with its dead time. By default the
         controller is continuous.
     dead_time : float [s]
-        From u to y; it needs a rate.
+        Dead time from u to y; it needs a rate.
 
     Returns
     -------

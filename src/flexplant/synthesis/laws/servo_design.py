@@ -65,16 +65,17 @@ def design_servo(
     free body, or above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``,
     on a damper line ``k (1 + w_i / s) F(s)``, on a spring line ``k F(s) / s``, and ``k F(s)`` if
     the response is zero at rest. F is a second-order roll-off and the notches. The gain k makes the
-    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. Next to a
-    resonance, where the law of that gain does not hold 6 dB, the gain on the real axis is used if
-    its law does. If two lines are close, the one with the smaller peak of |S| at u is used. In the
-    same way the lead of a mass line is chosen wide (16 instead of 4, or 64 where 16 does not hold
-    6 dB) if a mode lies above the bandwidth within a factor of 4. A wide lead suppresses the error
-    up to a higher frequency, but less at low frequencies, and passes more noise to the actuators. A
-    notch has the damping of its mode, which it meets or, of a fast mode, stands below: there the
-    loop tolerates a mode that is elsewhere. Its width is chosen by |S|. The certificate is for the
-    loop that will run: with observer, flexible modes and delay, and with the truncated modes if
-    they are known. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
+    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. If that law
+    does not keep |S| at u below 6 dB next to a resonance, the gain on the real axis is used if its
+    law does. If the slope lies between two lines, the law with the smaller peak of |S| at u is
+    used. In the same way the lead of a mass line is chosen wide (16 instead of 4, or 64 if 16 does
+    not keep 6 dB) if a mode lies above the bandwidth within a factor of 4. A wide lead suppresses
+    the error up to a higher frequency, but less at low frequencies, and passes more noise to the
+    actuators. A notch has the damping of its mode. Its frequency is that of the mode or, for a fast
+    mode, lies below it, so that the loop tolerates an error of that frequency. Its width is chosen
+    by |S|. The certificate is for the complete loop: with observer, flexible modes and delay, and
+    truncated modes if they are known. `servo_bandwidth` gives the largest bandwidth with a peak of
+    6 dB.
 
     Parameters
     ----------

@@ -58,15 +58,16 @@ def tune_loops(
     the loop gain is kept small. The result is the best of many starts, without proof that it is
     optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
 
-    An axis is a mass, a velocity or a spring, whose line its law is made for. A single axis that
-    integrates an odd number of times, as motors do, or is unstable has the law of `tune_pid`.
+    The law of an axis depends on its line: that of a mass, a velocity (damper) or a spring. A
+    single axis that integrates an odd number of times, as motors do, or is unstable has the law of
+    `tune_pid`.
 
     Parameters
     ----------
     plant, before, after, rate, delay, hold : as for `design_loops`
     peak : float
-        Bound on |S| at u and of each axis, and at y if each axis has one sensor; 2 is a modulus
-        margin of 6 dB.
+        Bound on |S| at u and of each axis, and at y if each axis has one sensor; 2 is 6 dB, a
+        modulus margin of 0.5.
     rigid : int, optional
         Number of rigid-body modes; by default the number of axes, or those of a model. 0 if the
         machine is on springs and the suspension modes lie within the lines.

@@ -240,20 +240,20 @@ class Lmi(Value):
     """Synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
 
     One semidefinite program gives the smallest gamma, in states that are balanced by the solutions
-    of least quadratic cost. What is proved: the eigenvalues of its X and Y show that the gamma can
-    be reached, to the accuracy of the solver, and the Riccati equations show what no controller
-    undercuts. A program whose optimum is more than 2 % above that bound is refused. The controller
-    is not computed from X and Y: next to the optimum ``I - X Y`` is nearly singular, and digits are
-    lost. It is the central controller of the Riccati equations, as for `Riccati()`, at a small
-    distance from that gamma, which is taken at most 0.5 % above the bound. Noise, effort and
+    of least quadratic cost. The eigenvalues of its X and Y prove that this gamma can be reached, to
+    the accuracy of the solver. The Riccati equations prove a lower bound for all controllers. An
+    optimum more than 2 % above that bound is refused. The controller is not computed from X and Y,
+    because ``I - X Y`` is nearly singular next to the optimum, and digits would be lost. It is the
+    central controller of the Riccati equations, as for `Riccati()`, for a gamma a little larger
+    than the smallest one, which is taken at most 0.5 % above the bound. Noise, effort and
     disturbance are added as for `Riccati()`. Plants of up to 24 states take at most about 10 s; the
     time grows with the sixth power of the number of states.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma. Unless given 0.5 % where D12 and D21 have full
-        rank, otherwise as for `Riccati()`.
+        Relative distance from the smallest gamma. By default 0.5 % if D12 and D21 have full rank,
+        otherwise as for `Riccati()`.
     tolerance : float
         Tolerance of the solver: gap and residuals, relative.
     max_states : int

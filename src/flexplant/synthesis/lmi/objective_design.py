@@ -68,7 +68,8 @@ def design_lmi(
         Relative distance of the minimised norm from its optimum, at which gains may be infinite. It
         is increased if no controller keeps the bounds; the certificate states the value.
     max_states : int
-        Larger problems are refused: the time grows with the sixth power.
+        Largest number of states; larger problems are refused, since the time grows with the sixth
+        power.
     u, y : sequence of str, optional
         As for `design_hinf`.
 

@@ -49,7 +49,7 @@ class H2(MeasuredObjective):
     w, z : sequences of str, optional
         Channels; by default all.
     below : float, optional
-        What it has to stay below; none for what is minimised.
+        Bound on the norm; none for the norm that is minimised.
 
     Examples
     --------
@@ -65,7 +65,7 @@ class H2(MeasuredObjective):
         return h2_norm(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return what finds the norm for controllers of an order."""
+        """Return the judges (`Judge`) that compute the norm for controllers of an order."""
         w, z = self.chosen(plant)
         require_finite_h2(plant, w, z)
         return [H2Judge(problem_on(plant, w, z), order)]
@@ -91,7 +91,7 @@ class Hinf(MeasuredObjective):
         return peak_gain(closed)[0]
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return what finds the norm for controllers of an order."""
+        """Return the judges (`Judge`) that compute the norm for controllers of an order."""
         return [GainJudge(problem_on(plant, *self.chosen(plant)), order)]
 
 
@@ -99,8 +99,9 @@ class Hinf(MeasuredObjective):
 class PeakGain(MeasuredObjective):
     """The largest amplitude of z for w of amplitude one: peak to peak.
 
-    The LMI bounds the length of z for w of length one (the star norm); what is verified is the
-    integral (sampled: the sum) of the absolute impulse response of each channel, its gain exactly.
+    The LMI bounds the length of z for w of length one (the star norm). The result is verified by
+    the integral (sampled: the sum) of the absolute impulse response of each channel, which is its
+    exact gain.
 
     Parameters
     ----------
@@ -122,24 +123,25 @@ class PeakGain(MeasuredObjective):
         return impulse_sum(closed) if closed.dt else impulse_integral(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return what finds the sum of each channel for controllers of an order."""
+        """Return the judges (`Judge`) that compute the sum of each channel for an order."""
         w, z = self.chosen(plant)
         return [PeakJudge(problem_on(plant, [i], [o]), order) for i in w for o in z]
 
 
 @dataclass(frozen=True, eq=False)
 class PoleRegion(Value):
-    """Where all poles of the closed loop lie, those of the weights that the plant carries too.
+    """A region for all poles of the closed loop, including those of weights in the plant.
 
     Parameters
     ----------
     decay : float [rad/s]
-        Real parts are below -decay; of a sampled plant magnitudes below e^(-decay dt).
+        Least decay rate: real parts are below -decay, or magnitudes below e^(-decay dt) for a
+        sampled plant.
     damping : float, optional
-        Smallest damping ratio, of a sampled pole z that of ``log(z) / dt``.
+        Smallest damping ratio; for a sampled pole z that of ``log(z) / dt``.
     bandwidth : float [Hz], optional
-        Largest magnitude of s over 2 pi: no faster poles than the sampling bears; below half the
-        rate of a sampled plant.
+        Largest magnitude of s over 2 pi, which excludes poles that are too fast for the sampling;
+        below half the rate of a sampled plant.
 
     Examples
     --------

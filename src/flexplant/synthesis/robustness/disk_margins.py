@@ -28,7 +28,7 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DiskMargin(Value):
-    """How large a complex change of the gain a loop bears.
+    """The largest complex change of the gain at which a loop is guaranteed to stay stable.
 
     Every loop gain is multiplied by ``f = (2 + (1 - sigma) d) / (2 - (1 + sigma) d)``; the loop
     stays stable for all complex ``|d| < alpha``, with ``alpha = 1 / max |S + (sigma - 1) / 2|``.
@@ -39,10 +39,10 @@ class DiskMargin(Value):
         Skew sigma of 0, 1 or -1: factors as large as their reciprocals, changes of 1 / L (whose
         alpha is the modulus margin), and changes of L relative to itself.
     alpha : float
-        Guaranteed: no smaller change makes the loop unstable.
+        Guaranteed size: no smaller change makes the loop unstable.
     reached : float
-        A change of this size that does. It equals alpha for one loop; for several together it is
-        the other bound of mu.
+        Size of a change that makes the loop unstable. It equals alpha for one loop; for several
+        loops together it is the other bound of mu.
     freq : float [Hz]
         Frequency at which the loop is closest to the critical point.
 
@@ -85,7 +85,7 @@ class DiskMargin(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MarginTable(Value):
-    """All margins of a loop as people quote them; `print` shows one table with units.
+    """All usual margins of a loop; `print` shows one table with units.
 
     Parameters
     ----------

@@ -93,16 +93,17 @@ def design_mu(
 
     D-K iteration: an H-infinity controller for the plant with its Deltas scaled by D(s), then D
     for the best loop so far, a filter of few states per Delta, and so on. Each D is multiplied by
-    the number that gives the smallest H-infinity norm; where Deltas are real, the iteration is also
-    made with D as it is, and the better one is kept. In the design real Deltas count as complex,
-    which is cautious; what is judged, and kept, is the controller of the smallest mixed mu, real
-    Deltas real, between all frequencies. The first candidates are those without uncertainty and for
-    a constant D.
+    the number that gives the smallest H-infinity norm. If Deltas are real, the iteration is also
+    made without this factor, and the better result is kept. The design treats real Deltas as
+    complex, which is conservative. The result is the controller with the smallest mixed mu, for
+    which real Deltas stay real and which holds at all frequencies, also between grid points. The
+    first candidates are those without uncertainty and for a constant D.
 
-    Where all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
-    plant, with the shift of real mu and a constant D, evened out in closed loop; the bound is that
-    of a grid through the places of the modes, to first order in their changes. Machines at corners
-    of the uncertainty are closed exactly. Where that shows no controller, the general way follows.
+    If all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
+    plant, with the scaling G of real mu and a constant D that is balanced in closed loop. The bound
+    is then computed on a grid through the modes, to first order in their changes. Machines at
+    corners of the uncertainty are closed exactly. If this gives no controller, the general
+    iteration follows.
 
     Parameters
     ----------
@@ -114,16 +115,16 @@ def design_mu(
         None leaves a channel out, as does not naming it.
     method : as for `design_hinf`, optional
     iterations : int
-        Most steps.
+        Largest number of steps.
     order : int
-        Most states of D for each Delta and side.
+        Largest number of states of D for each Delta and side.
     progress
         As for `design_hinf`, with its warning of truncated modes.
 
     Returns
     -------
     Controller
-        `gamma` is mu of robust performance from above: below 1 all machines are stable with
+        `gamma` is the upper bound of mu of robust performance: below 1 all machines are stable with
         weighted gains below 1. The certificate holds mu of every step.
 
     Raises

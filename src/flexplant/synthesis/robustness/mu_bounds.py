@@ -58,10 +58,10 @@ class MuBounds(Value):
     Parameters
     ----------
     upper : float
-        No Delta of the structure smaller than 1 / upper makes ``I - M Delta`` singular, at any
-        frequency.
+        Upper bound: no Delta of the structure smaller than 1 / upper makes ``I - M Delta``
+        singular, at any frequency.
     lower : float
-        The perturbation of size 1 / lower does; 0 when none was found.
+        Lower bound: the perturbation of size 1 / lower makes it singular; 0 when none was found.
     freq : float [Hz]
         Frequency where the upper bound is largest; NaN for a matrix.
     perturbation : (w, z) complex array
@@ -70,7 +70,7 @@ class MuBounds(Value):
         Upper bounds that were computed at single frequencies; where they are not near the largest
         they need not be the smallest.
     intervals : int
-        Number of intervals that cover the frequency axis, 0 of a matrix.
+        Number of intervals that cover the frequency axis; 0 for a matrix.
     """
 
     upper: float
@@ -94,10 +94,11 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
 
         mu(M) = 1 / min { |Delta| : det(I - M Delta) = 0 },   Delta = diag(delta_1 I, ..., Delta_F)
 
-    From above by scalings D and G: ``mu^2 D - M* D M + j (G M - M* G) > 0``; of a system these
-    hold on intervals whose ends are eigenvalues of a Hamiltonian matrix, and the intervals cover
-    all frequencies, so that no peak lies between. From below by power iterations with random
-    restarts; of a system the eigenvalues of the closed loop with the perturbation decide.
+    The upper bound uses scalings D and G: ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system
+    they are valid on intervals whose ends are eigenvalues of a Hamiltonian matrix. The intervals
+    cover all frequencies, so that no peak is missed. The lower bound uses power iterations with
+    random restarts; for a system it is verified by the eigenvalues of the closed loop with the
+    perturbation.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ def robust_performance(
     Returns
     -------
     MuBounds
-        `lower` is 0 where modes are neglected, whose weights are kept apart.
+        `lower` is 0 for a plant with neglected modes: no lower bound is then computed.
 
     Raises
     ------

@@ -71,7 +71,7 @@ def uncertain_system(
     Parameters
     ----------
     M : StateSpace or control.StateSpace
-        With named channels, continuous or sampled, weights of Deltas in it.
+        System with named channels, continuous or sampled, which includes the weights of the Deltas.
     blocks : sequence of RepeatedScalar and FullBlock
         In the order of the channels; those without a name are called `delta1`, `delta2`, ...
     u, y : sequences of str

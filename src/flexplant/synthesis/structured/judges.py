@@ -236,18 +236,18 @@ _CLOSE = 1e-7
 
 
 class Judge(Protocol):
-    """A number that a stable loop has, in logarithms, with its gradient: what is minimised.
+    """A number of a stable loop that is minimised, as a logarithm with its gradient.
 
-    The controllers that it is given are in the user's units. The problem that `problem_on`
-    prepares is scaled: one unit of its time is ``1 / p.speed`` seconds, so that a judge that works
-    on its matrices turns its number back into the user's units itself, as `H2Judge` does.
+    The controllers that it receives are in the user's units. The prepared problem p of an objective
+    is scaled: one unit of its time is ``1 / p.speed`` seconds. A judge that works on the matrices
+    of p therefore has to convert its number back into the user's units.
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
-        """Return the number, infinite when the loop is not stable, and its place."""
+        """Return the number (infinite for an unstable loop), and the place where it is reached."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
-        """Return logarithms of functions near it, the number of the place among them."""
+        """Return logarithms of functions near the number, including the one at the place."""
         # `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
         # the place alone counts
 

@@ -25,17 +25,17 @@ from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
 class MeasuredObjective(Value):
     """The base class of objectives of your own: a positive number of the closed loop.
 
-    A new objective gives `measured`, a smooth function of the loop from w to z in seconds and the
-    user's units; infinite for a stable loop that is out of the question. It follows from the loop
-    alone, whatever its states. Its derivatives by the controller's n parameters are found by
-    differences: each gradient closes 2 n loops more, which `evaluations` does not count.
+    A new objective defines `measured`, a smooth function of the loop from w to z in seconds and the
+    user's units; it is infinite for a stable loop that is not acceptable. It must not depend on the
+    choice of states. Its derivatives with respect to the n parameters of the controller are found
+    by differences: each gradient closes 2 n more loops, which `evaluations` does not count.
 
     Parameters
     ----------
     w, z : sequences of str, optional
         Channels; by default all.
     below : float, optional
-        The number is counted in multiples of this bound.
+        Bound; the number is expressed as a multiple of it.
 
     Examples
     --------
@@ -69,7 +69,7 @@ class MeasuredObjective(Value):
         """Return the number of a closed loop from w to z."""
 
     def judges(self, plant: AnyPlant, order: int) -> Sequence[Judge]:
-        """Return what finds the number for controllers of an order."""
+        """Return the judges (`Judge`) that compute the number for controllers of an order."""
         return [MeasuredJudge(plant, self, order)]
 
 

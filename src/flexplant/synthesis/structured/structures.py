@@ -91,19 +91,20 @@ class ControllerStructure(Protocol):
 class FixedOrder(Value):
     """A controller of given order, all entries of A, B, C and (unless left out) D free.
 
-    Starts are the controller of full order, reduced, and the best of each lower order in turn,
-    one state added at a time.
+    The search starts from the reduced controller of full order, and from the best controller of
+    each lower order with one state added.
 
     Parameters
     ----------
     order : int
         Number of states; 0 for a static gain.
     pattern : (nu, ny) array of bool, optional
-        For a static gain: which entries are free; the others are zero (decentralised feedback).
+        Free entries of a static gain; the others are zero (decentralised feedback).
     start : StateSpace, optional
-        A controller y -> u to begin with, of this order; of an earlier design.
+        Controller y -> u of this order with which the search begins, for example of an earlier
+        design.
     direct : bool
-        Whether D is free; zero when not: a controller that rolls off.
+        Whether D is free; otherwise D is zero and the controller rolls off.
 
     Examples
     --------
@@ -287,7 +288,7 @@ class Parametrised:
         Function of an (n,) array that returns a StateSpace y -> u, always of the same order,
         sampled like the plant, and smooth in the parameters.
     start : (n,) array
-        Where the search begins; steps are taken in multiples of each entry (of 1 where it is 0).
+        Parameters at which the search begins; steps are multiples of each entry (of 1 if it is 0).
     spread : float
         Relative size of the differences between starts.
 
@@ -338,17 +339,17 @@ class TunedLaws(Value):
     """A decoupled controller ``u = -before diag(laws) after y`` whose numbers are free.
 
     Each number that is not zero moves by a factor and keeps its sign: gains, corners, centres of
-    notches. No corner moves above half the rate, or ten times the fastest pole of a continuous
-    plant; one that was given higher stays at most where it is. The laws given are where the search
-    begins.
+    notches. No corner moves above half the rate, or above ten times the fastest pole of a
+    continuous plant; a corner that was given above this limit does not rise further. The search
+    begins with the given laws.
 
     Parameters
     ----------
     laws : as for `design_loops`
     before, after : as for `design_loops`, optional
     free : sequence of str
-        Which numbers of the elements are free, of p, i, d, pole, freq, ratio, width, damping and
-        depth; by default all but the depth.
+        Names of the free numbers of the elements, among p, i, d, pole, freq, ratio, width, damping
+        and depth; by default all but the depth.
 
     Examples
     --------
