@@ -8,6 +8,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.simulation import input_shaper, residual_vibration
+from judge import closed
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +62,25 @@ def test_predicted_and_simulated_and_by_hand():
     real = np.abs(values.imag) < 1e-12
     slow = (values[real, None] ** np.arange(2000) * parts[real, None]).sum(axis=0)
     assert np.abs(slow).max() == pytest.approx(found.decaying, rel=1e-6)
+
+
+@pytest.mark.parametrize("delay", [0.0, 2.0, 3.5, 5.0])
+def test_a_loop_with_long_delays(delay):
+    """Chains of delays have no basis of eigenvectors: the sum of modes is the run all the same."""
+    plant = fx.testbeds.flexible_joint(delay=delay)
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=2.0, observer=observer)
+    move = fx.setpoint(1.0, velocity=2.0, acceleration=10.0, jerk=200.0)
+    found = residual_vibration(fx.close_loop(plant, observer, servo), move)
+    assert found.predicted == pytest.approx(found.simulated, rel=1e-6)
+    A, B, C, D, inputs, outputs = closed(plant, [observer.system, servo.system])
+    i, o = inputs.index("tip:ref"), outputs.index("tip:error")
+    last = int(np.ceil(move.duration / plant.dt - 1e-9))
+    error, x = [], np.zeros(len(A))
+    for r in np.asarray(move.at(np.arange(last + 500) * plant.dt).position):
+        error.append(C[o] @ x + D[o, i] * r)
+        x = A @ x + B[:, i] * r
+    assert np.abs(error[last + 1 :]).max() == pytest.approx(found.simulated, rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["ZV", "ZVD", "EI"])

@@ -13,7 +13,7 @@ from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..plant.evaluation_model import NOT_JUDGED
 from ..store import Value
-from ..tolerances import SAME
+from ..tolerances import NEGLIGIBLE, SAME
 from ..words import instance, with_unit
 from .motion import SetPointProfile
 from .sampled_runs import known_inputs, named_references, simulate
@@ -168,13 +168,13 @@ class _Modes:
 
     def __init__(self, loop: ClosedLoop, channel: str) -> None:
         self.system = loop.system.select([channel], loop.machine.w)
-        values, right = la.eig(self.system.A)
-        same, left = la.eig(self.system.A.T)
-        self.values = values[np.abs(values) > SAME]
-        self.right = right[:, np.abs(values) > SAME]
-        rows = left[:, np.abs(same) > SAME].T
-        # rows of one space, in any order: duals of the columns
-        self.rows = np.linalg.solve(rows @ self.right, rows)
+        # delays are chains of states whose poles, zero to some root of rounding, have no basis of
+        # eigenvectors: these and poles that a sample takes away are split off as a whole
+        T, Z, k = la.schur(self.system.A, output="complex", sort=lambda z: abs(z) > NEGLIGIBLE)
+        coupled = la.solve_sylvester(T[:k, :k], -T[k:, k:], T[:k, k:])
+        self.values, vectors = np.linalg.eig(T[:k, :k])
+        self.right = Z[:, :k] @ vectors
+        self.rows = np.linalg.solve(vectors, np.hstack([np.eye(k), coupled]) @ Z.conj().T)
         self.logs = np.log(self.values)
 
     def shown(self, duration: float) -> float:
