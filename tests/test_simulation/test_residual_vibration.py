@@ -64,12 +64,12 @@ def test_predicted_and_simulated_and_by_hand():
     assert np.abs(slow).max() == pytest.approx(found.decaying, rel=1e-6)
 
 
-@pytest.mark.parametrize("delay", [0.0, 2.0, 3.5, 5.0])
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.0, 3.5, 5.0])
 def test_a_loop_with_long_delays(delay):
     """Chains of delays have no basis of eigenvectors: the sum of modes is the run all the same."""
     plant = fx.testbeds.flexible_joint(delay=delay)
     observer = fx.design_kalman(plant)
-    servo = fx.design_servo(plant, bandwidth=2.0, observer=observer)
+    servo = fx.design_servo(plant, bandwidth=3.0, observer=observer)
     move = fx.setpoint(1.0, velocity=2.0, acceleration=10.0, jerk=200.0)
     found = residual_vibration(fx.close_loop(plant, observer, servo), move)
     assert found.predicted == pytest.approx(found.simulated, rel=1e-6)
