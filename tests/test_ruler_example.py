@@ -33,6 +33,8 @@ def test_a_ruler_is_a_free_beam_and_its_own_responses_bear_the_controller_out(ex
     assert np.abs(found.freq / [39.5, 108.5, 212.5, 269.7, 352.3] - 1).max() < 5e-3
     assert any("3 x 50 Hz" in reason for _, _, reason in found.rejected)
     assert "3 x 50 Hz" in repr(found)
+    # places disagree by 0.05 %: either that is said, or deviations are as large
+    assert found.inconsistency is not None or found.std.imag[0] > 3e-4 * abs(found.poles[0])
     assert found.mass_normalised
     # Euler and Bernoulli: cos x cosh x = 1, no number of the measurement in it
     roots = np.array(example.ROOTS)

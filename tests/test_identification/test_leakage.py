@@ -185,6 +185,8 @@ def test_segments_too_short_for_the_damping_are_warned_of():
         assert bool(texts) == narrow
         if narrow:
             assert "segment= of at least" in texts[0]
+            assert np.abs(found.freq / freqs[: len(found)] - 1).max() < 2e-3
+            assert "240 Hz" in repr(found)  # four times the mains, and as narrow
         else:
             assert np.abs(found.freq / freqs - 1).max() < 2e-3
 
