@@ -15,7 +15,8 @@ both, and prints the following, among other things::
     camera = 0.83 +- 0.57 kg
     column = -0.12 +- 0.074
     feet = 0.038 +- 0.038
-    modulus margin 0.635 of the model, 0.629 on the measured responses
+    modulus margin 0.636 of the model, 0.629 on the measured responses
+    its interval: 0.634 to 0.636 on 95 % of such machines
     the tool's error in a move of 20 mm: 108 um, with feedforward 0.4 um
 """
 
@@ -104,7 +105,12 @@ def identified(frf: fx.Frf, drawing: fx.Modes) -> fx.MeasuredModes:
         modes = fx.identify_modes(part, band=BAND, dofs=at)
         found.append(fx.numbered(modes, drawing, partial=True))
     poles, modes = (np.concatenate([getattr(one, n) for one in found]) for n in ("poles", "modes"))
-    return fx.MeasuredModes(poles, modes=modes.tolist())
+    m, first = len(modes), len(found[0].poles)
+    both = np.zeros((2, m, 2, m))  # of real and imaginary parts of all poles
+    for one, part in zip(found, (slice(first), slice(first, m)), strict=True):
+        count = len(one.poles)
+        both[:, part, :, part] = one.covariance.reshape(2, count, 2, count)
+    return fx.MeasuredModes(poles, modes=modes.tolist(), covariance=both.reshape(2 * m, 2 * m))
 
 
 # %% Update: which parameters explain the measured poles?
@@ -124,7 +130,7 @@ def updated(model: fx.FEModel, measured: fx.MeasuredModes) -> fx.UpdateResult:
     rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 14).labels))
     camera = fx.AddedMass(TOOL, direction="xyz", name="camera")
     unknown = [camera, scaled(model, "column", COLUMN), scaled(model, "feet", FEET)]
-    return fx.update(rom, unknown, [fx.Eigenvalues(measured)])
+    return fx.update(rom, unknown, [fx.Eigenvalues(measured.replace(covariance=None))])
 
 
 # %% Design on the updated model, and judge on the measured responses
@@ -193,7 +199,7 @@ def table(result: dict[str, Any]) -> str:
     none, fed = (1e6 * np.max(run.peak("tool_y:error")) for run in result["runs"].values())
     margins = (
         f"modulus margin {loop.modulus_margin:.3f} of the model, {result['by_frf']:.3f} on the "
-        f"measured responses\non machines like it: {machines}"
+        f"measured responses\nits interval: {machines}"
     )
     errors = f"the tool's error in a move of 20 mm: {none:.0f} um, with feedforward {fed:.1f} um"
     shown = [result[name] for name in ("model", "measured", "fit", "loop")]

@@ -99,6 +99,19 @@ def test_close_pairs_without_shapes_are_named():
     assert trend.replace(shaped=True).unshaped_pairs == ()
 
 
+def test_a_mode_within_its_noise_is_no_outlier():
+    """Exact but for one frequency: by its own deviation, and then by twenty of them."""
+    trend = trend_of(np.random.default_rng(8), m=9, q=1, s=1e-6, b=0.0)
+    noise = np.full(9, 1e-6)
+    noise[3] = 3e-4
+    freq = trend.freq * np.exp(np.where(np.arange(9) == 3, 3e-4, 0.0))
+    assert trend.replace(freq=freq).outlier[0] == trend.modes[3]
+    assert trend.replace(freq=freq, noise=np.full(9, 1e-6)).outlier[0] == trend.modes[3]
+    assert trend.replace(freq=freq, noise=noise).outlier is None
+    further = freq * np.exp(np.where(noise > 1e-5, 20.0 * noise, 0.0))
+    assert trend.replace(freq=further, noise=noise).outlier[0] == trend.modes[3]
+
+
 def test_too_few_modes_say_how_many_are_needed():
     trend = trend_of(np.random.default_rng(7), m=3, q=2)
     assert trend.dof == 0

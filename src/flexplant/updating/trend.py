@@ -53,6 +53,8 @@ class Trend(Value):
         Numbers of the model's modes below `highest` that were not measured.
     unmeasured_freq : array [Hz]
         Their frequencies.
+    noise : (m,) array
+        Relative standard deviations of the measured frequencies by noise; empty if not known.
 
     Examples
     --------
@@ -72,6 +74,7 @@ class Trend(Value):
     shaped: bool = False
     unmeasured: tuple[int, ...] = ()
     unmeasured_freq: FloatArray = field(default_factory=lambda: np.zeros(0))
+    noise: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def highest(self) -> float:
@@ -156,7 +159,8 @@ class Trend(Value):
         """The mode that is an outlier, and its error relative to the others; or None.
 
         By its externally studentised residual, which follows Student's distribution with one degree
-        of freedom less: chance alone names a mode in 0.3 % of fits.
+        of freedom less; the noise of the mode's own measurement adds to it. Chance alone names a
+        mode in 0.3 % of fits.
         """
         from scipy.special import stdtr
 
@@ -169,7 +173,9 @@ class Trend(Value):
         left, free = y - Q @ (Q.T @ y), 1.0 - np.sum(Q**2, axis=1)
         alone = left / np.maximum(free, ROUNDING)
         others = np.maximum(left @ left - left * alone, TINY) / (dof - 1)
-        chance = 2.0 * m * stdtr(dof - 1, -np.abs(alone) * np.sqrt(free / others))
+        own = self.noise**2 if self.noise.size else np.zeros(m)
+        expected = np.sqrt(others / np.maximum(free, ROUNDING) + own)
+        chance = 2.0 * m * stdtr(dof - 1, -np.abs(alone) / expected)
         worst = int(np.argmin(chance))
         return (self.modes[worst], float(alone[worst])) if chance[worst] < LEVEL else None
 
@@ -246,7 +252,7 @@ def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
     found = eigenvalue_sensitivities(fit.model, about, modes=numbers)
     own = [found.modes.index(number) for number in numbers]
     poles, S = found.poles[own], found.S[own]
-    relative = np.real(S / poles[:, None])
+    relative, std = np.real(S / poles[:, None]), measured.std
     size = np.abs(relative).max(axis=0, initial=0.0) * _amounts(fit)
     moves = np.flatnonzero(size > ROUNDING * np.max(size, initial=0.0))
     return Trend(
@@ -257,6 +263,7 @@ def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
         tuple(moves.tolist()),
         measured.shapes is not None,
         *_unmeasured(fit, numbers, float(np.max(np.abs(measured.poles))) / (2 * np.pi)),
+        np.zeros(len(numbers)) if std is None else std.imag / np.abs(measured.poles),
     )
 
 
