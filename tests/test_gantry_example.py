@@ -66,6 +66,8 @@ def test_the_story_of_the_gantry(tmp_path):
     margin = min(margins)
     assert found["loop"].modulus_margin == pytest.approx(margin, rel=0.03)
     assert found["by_frf"] == pytest.approx(margin, rel=0.03)  # lines 0.5 Hz apart
+    low, high, _ = found["loop"].interval("modulus_margin")
+    assert 0.999 * low <= margin <= 1.001 * high
     none, fed = (run.peak("tool_y:error") for run in found["runs"].values())
     assert np.max(fed) < 0.05 * np.max(none)
     # the docstring says what the run says
