@@ -92,7 +92,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
         plant, SENSORS, 25, ModeInformation(), constraints=[off], method=RowSelection()
     )
     return {
-        "the die's error": best(goal),
+        "the die's error": best(goal, method=Exchange(starts=5)),  # one ends 0.6 % higher
         "variance within 12 %, proven": best(goal, method=BranchAndBound(gap=0.12, starts=1)),
         "0.25 m apart": best(goal, constraints=[MinimumDistance(0.25)]),
         "none at the cable": best(goal, constraints=[Excluded(CABLE)]),

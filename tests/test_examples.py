@@ -374,7 +374,7 @@ def test_the_story_of_placement(later, tmp_path):
     assert proven.gap <= 0.12 or proven.stopped
     assert proven.bound <= min(v for k, v in value.items() if not k.startswith("25"))
     for name in ("0.25 m apart", "none at the cable", "worst machine of three", "one may fail"):
-        assert value[name] >= best * (1 - proven.gap)  # exchanges end at a local optimum
+        assert value[name] >= best * (1 - 1e-9)
     assert not any(
         example.DIE.holds(np.array([port.at[:2]]))[0]
         for found in result["sensors"].values()
