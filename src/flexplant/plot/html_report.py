@@ -391,9 +391,9 @@ def _margins(loop: ClosedLoop, row: LoopFigures) -> list[Tile]:
         f"; {loop.interval(name).sentence}" if known else "" for name in (MARGIN, BANDWIDTH)
     )
     peak = 20.0 * np.log10(1.0 / row.margin)
-    tiles: list[Tile] = [
-        ("|S| at u, largest", f"{peak:.1f} dB", f"modulus margin {row.margin:.3g}{margin}", "")
-    ]
+    judged = "" if loop.left_out is None else " with the truncated modes"
+    most = f"modulus margin {row.margin:.3g}{judged}{margin}"
+    tiles: list[Tile] = [("|S| at u, largest", f"{peak:.1f} dB", most, "")]
     if np.isfinite(row.bandwidth):
         most = f"|S| at most {20.0 * np.log10(row.peak):.1f} dB, at {row.peak_freq:.4g} Hz"
         tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most + reached, ""))
