@@ -171,6 +171,34 @@ def test_disturbances_along_levers_have_sizes():
 
 
 @pytest.mark.parametrize("rate", [0.0, RATE])
+def test_a_signal_is_a_sensor_without_its_noise(rate):
+    """A weight of `y1:signal` adds the channel, before or after a block and other weights."""
+    plant = assemble_plant(some_modes(), ports())
+    plant = plant.discretized(rate, delay=1) if rate else plant
+    low = low_pass_filter(100.0, gain=2.0)
+    gain = gain_of(plant.system.select(["y2"]))[0].copy()
+    gain[plant.system.inputs.index("y2:noise")] -= 1.0
+    factor = gain_of(tustin(low, rate) if rate else low)[0, 0]
+    block = StateSpace([], [], [], [[1.0, -1.0]], inputs=["y1", "y2"], outputs=["apart"])
+    louder = 1.0 + 2.0 * (np.array(plant.system.inputs) == "amp1")
+    shown = {"z": {"y2:signal": low}}
+    read = plant.through(block)
+    for heavy in (
+        plant.weighted(**shown, w={"amp1": 3.0}),
+        read.weighted(**shown).weighted(w={"amp1": 3.0}),
+        read.weighted(w={"amp1": 3.0}).weighted(**shown),
+        read.weighted(z={"y1:signal": 1.0}, w={"amp1": 3.0}).weighted(**shown),
+    ):
+        found = gain_of(heavy.system.select(["y2:signal"]))[0]
+        wanted = gain * louder[:, None] * factor
+        np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-12 * np.abs(wanted).max())
+        assert heavy.around(plant).z == heavy.z
+        assert "y2:signal" not in heavy.select(z=plant.z).z
+    with pytest.raises(LabelError, match="y9:signal"):
+        plant.weighted(z={"y9:signal": 1.0})
+
+
+@pytest.mark.parametrize("rate", [0.0, RATE])
 def test_a_push_at_an_actuator_needs_no_noise(rate):
     """A weight of `u1:disturbance` adds the channel: it moves what u1 moves, and no effort."""
     plant = assemble_plant(some_modes(), ports())

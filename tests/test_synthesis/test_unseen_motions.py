@@ -149,3 +149,16 @@ def test_tuned_loops_of_a_gantry_that_turns_freely():
     verdict = judged(plant, fx.tune_loops(plant, progress=False))
     assert verdict.radius < 1.0 - 1e-6
     assert verdict.serves()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_h_infinity_of_gantries_that_turn_freely(seed):
+    (plant,) = islice(loose(np.random.default_rng([81, seed])), 1)
+    weights, errors = fx.stage_weights(plant, 3.0), fx.reference_errors(plant)
+    (held,) = {"Y1_scale:signal", "Y2_scale:signal"} & set(weights.z)
+    assert f"{held.removesuffix(':signal')} held at zero" in repr(weights)
+    law = fx.design_hinf(plant.through(errors).weighted(weights))
+    verdict = judged(plant, errors, law)
+    assert verdict.radius < 1.0 - 1e-6
+    assert verdict.serves(3.0)

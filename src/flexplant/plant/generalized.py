@@ -150,16 +150,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     def around(self, machine: Any) -> GeneralizedPlant:
         """Return the same weights and blocks around another machine with the same channels."""
-        found = machine
-        for step in self.steps:  # in their order
-            if isinstance(step, StateSpace):
-                found = measured_through(found, at_rate(step, "y", machine.dt))
-            else:
-                z, w = map(dict, step)  # a selection may have taken channels away
-                kept = {name: weight for name, weight in z.items() if name in found.z}
-                known = {*found.w, *pushes(found)}
-                found = weighted(found, kept, {n: own for n, own in w.items() if n in known})
-        return found  # type: ignore[no-any-return]
+        return _applied(machine, self.steps)  # type: ignore[no-any-return]
 
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Return changes of fields; those of the machine are changed there."""
@@ -257,10 +248,11 @@ def both_weights(
 
 
 def weighted(plant: PartitionedSystem, z: Any, w: Any) -> GeneralizedPlant:
-    """Return ``W_z P W_w``; a weight None drops its channel, one of a push at u adds it."""
+    """Return ``W_z P W_w``; a weight None drops its channel, a push at u or a signal is added."""
     z, w = _mapping(z, "z"), _mapping(w, "w")
     added = [name for name in pushes(plant) if w.get(name) is not None]
-    require_known("channel of z", z, plant.z)
+    require_known("channel of z", z, [*plant.z, *signals(plant)])
+    plant = _shown(plant, [name for name in signals(plant) if z.get(name) is not None])
     require_known("channel of w", w, [*plant.w, *pushes(plant)])
     keep_z = [name for name in plant.z if name not in z or z[name] is not None]
     keep_w = [name for name in (*plant.w, *added) if name not in w or w[name] is not None]
@@ -299,6 +291,47 @@ def _pushed(system: StateSpace, added: Sequence[str]) -> StateSpace:
         D=np.hstack([system.D, direct]),
         inputs=[*system.inputs, *added],
     )
+
+
+def signals(plant: PartitionedSystem) -> dict[str, str]:
+    """Return the sensors of the signals without noise, `y1:signal`, that are not channels of z."""
+    own = {f"{sensor.name}:signal": sensor.name for sensor in plant.ports.y}
+    return {channel: name for channel, name in own.items() if channel not in plant.z}
+
+
+def _shown(plant: PartitionedSystem, added: Sequence[str]) -> PartitionedSystem:
+    """Return a plant with signals of sensors in z, behind the same weights and blocks."""
+    if not added:
+        return plant
+    machine = plant.machine
+    g, count = machine.system, len(machine.z)
+    names = [name for name in plant.z if name in signals(machine)] + list(added)
+    sensors = [signals(machine)[name] for name in names]
+    rows = g.output_index(sensors)
+    direct = g.D[rows]
+    direct[:, [name.endswith(":noise") for name in g.inputs]] = 0.0
+    z = (*machine.z, *names)
+    system = g.replace(
+        C=np.insert(g.C, count, g.C[rows], axis=0),
+        D=np.insert(g.D, count, direct, axis=0),
+        outputs=[*z, *machine.y],
+        units=g.units | {n: g.units[s] for n, s in zip(names, sensors, strict=True) if s in g.units},
+    )
+    whole = GeneralizedPlant(system, machine.w, machine.u, z, machine.y, machine.asd, machine)
+    return _applied(whole, _steps(plant))  # type: ignore[no-any-return]
+
+
+def _applied(plant: Any, steps: Sequence[Any]) -> Any:
+    """Return a plant with weights and blocks, in their order."""
+    for step in steps:
+        if isinstance(step, StateSpace):
+            plant = measured_through(plant, at_rate(step, "y", plant.dt))
+        else:
+            z, w = map(dict, step)  # a selection may have taken channels away
+            shown, pushed = {*plant.z, *signals(plant)}, {*plant.w, *pushes(plant)}
+            kept = {name: weight for name, weight in z.items() if name in shown}
+            plant = weighted(plant, kept, {n: own for n, own in w.items() if n in pushed})
+    return plant
 
 
 def _dropped(plant: PartitionedSystem, side: str, names: Sequence[str] | None) -> dict[str, None]:

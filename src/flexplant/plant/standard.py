@@ -132,7 +132,8 @@ class StandardPlant(Partition):
             A weight is a number or a system with one input and one output, with the plant's dt or
             continuous (then it is sampled at the plant's rate by Tustin). None removes the channel;
             channels that are not named are unchanged. A weight of `u1:disturbance` of w adds this
-            disturbance at the actuator u1 if the actuator has no noise.
+            disturbance at the actuator u1 if the actuator has no noise; a weight of `y1:signal` of
+            z adds the signal of the sensor y1 without its noise.
 
         Returns
         -------

@@ -221,9 +221,12 @@ def stage_weights(
         error, ref = goal.derived(axis, "error"), goal.derived(axis, "ref")
         z |= {name: None for name in (channel, error) if name in plant.z}
         if channel in sizes.axes:
-            weight = series(sense, np.array([[unit * sizes.axes[channel]]]))
-            z[error if error in plant.z else channel] = _at_plant_rate(weight, plant)
+            own = error if error in plant.z else channel
+            z[own] = _at_plant_rate(series(sense, unit * sizes.axes[channel]), plant)
             w |= {ref: 1.0 / sizes.axes[channel]} if ref in plant.w else {}
+    held = [name for name in sizes.axes if name in sizes.sensors]  # motions that no POI shows
+    for name in held:
+        z[f"{name}:signal"] = _at_plant_rate(series(sense, unit * sizes.axes[name]), plant)
     for name, force in sizes.forces.items():
         rolloff = lead_lag_filter(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
         z[f"{name}:effort"] = _at_plant_rate(rolloff, plant)
@@ -248,6 +251,8 @@ def stage_weights(
     if left:
         text += f"; left out of z: {', '.join(left)}"
         text += " (moved by the reference)" if ports.references else ""
+    if held:
+        text += f"; {', '.join(held)} held at zero, because no POI shows this motion"
     return StageWeights(z, w, text, known)
 
 
