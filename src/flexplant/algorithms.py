@@ -102,8 +102,9 @@ with 1/W_S rising as f/f_c up to `peak`, W_u letting the efforts roll off from 6
 the disturbances of w and the noise of actuators leave an axis at rest, every actuator gets a
 disturbance. Sensors of velocity (acceleration) do not show where the machine rests: W_S then has a
 high-pass of first (second) order at f_c. Where a sensor is the axis of a free motion that no POI
-shows, z contains its signal without noise (`y1:signal`), so that it is held at zero. K P W_d is the complementary sensitivity T at u, and the weights of z are divided by
-``peak disturbance effort``, so that gamma = 1 requires |T| < peak at u: with the default ratios
+shows, z contains its signal without noise (`y1:signal`), so that it is held at zero. K P W_d is the
+complementary sensitivity T at u, and the weights of z are divided by ``peak disturbance effort``,
+so that gamma = 1 requires |T| < peak at u: with the default ratios
 this block decides, and gamma is how far the loop is from it. The controller lists what each block
 reaches (`Controller.reached`).
 

@@ -167,6 +167,26 @@ def test_readmes_design_runs_in_c_against_the_virtual_machine(kind, tmp_path):
     agree(got, run, loop.driven, loop.watched, 1e-9)
 
 
+@compiles
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "bandwidth"),
+    [("gantry", 4.0), ("hexapod", 4.0), ("dual_stage", 10.0), ("ball_screw", 5.0)],
+)
+def test_driven_machines_run_in_c(kind, bandwidth, tmp_path):
+    """Also laws of six axes on springs, whose slow poles no change of states keeps."""
+    made = getattr(fx.testbeds, kind)()
+    observer = fx.design_kalman(made)
+    servo = fx.design_servo(made, bandwidth=bandwidth, observer=observer)
+    loop = fx.close_loop(made, observer, servo)
+    led = [name for name in made.y if name.endswith(":ref")]
+    move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
+    run = fx.simulate(loop, reference={led[0]: move}, duration=0.03, noise=False)
+    refs = dict.fromkeys(led, np.zeros(run.time.size)) | {led[0]: move.at(run.time).position}
+    got = closed(loop.plant, Compiled(tmp_path, loop), loop.driven, refs, run.time.size)
+    agree(got, run, loop.driven, loop.watched, 1e-8)
+
+
 @pytest.mark.slow
 @compiles
 def test_an_observer_a_servo_and_feedforward_in_one_file_with_limits(tmp_path):
@@ -492,8 +512,8 @@ def test_a_wrong_block_is_found(monkeypatch, tmp_path):
 
     right = two_state._arranged
 
-    def wrong(*args):
-        form = right(*args)
+    def wrong(*args, **options):
+        form = right(*args, **options)
         return form._replace(B=(1 + 1e-6) * form.B)
 
     monkeypatch.setattr(two_state, "_arranged", wrong)

@@ -310,12 +310,12 @@ def _shown(plant: PartitionedSystem, added: Sequence[str]) -> PartitionedSystem:
     rows = g.output_index(sensors)
     direct = g.D[rows]
     direct[:, [name.endswith(":noise") for name in g.inputs]] = 0.0
-    z = (*machine.z, *names)
+    z, shown = (*machine.z, *names), zip(names, sensors, strict=True)
     system = g.replace(
         C=np.insert(g.C, count, g.C[rows], axis=0),
         D=np.insert(g.D, count, direct, axis=0),
         outputs=[*z, *machine.y],
-        units=g.units | {n: g.units[s] for n, s in zip(names, sensors, strict=True) if s in g.units},
+        units=g.units | {name: g.units[own] for name, own in shown if own in g.units},
     )
     whole = GeneralizedPlant(system, machine.w, machine.u, z, machine.y, machine.asd, machine)
     return _applied(whole, _steps(plant))  # type: ignore[no-any-return]

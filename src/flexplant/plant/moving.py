@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray, number, real_array
-from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_label
+from ..errors import AssumptionError, LabelError, ModelError, only_one, short, unknown_label
 from ..store import Value
 from ..words import function, instance
 from .axes import real_gain
@@ -75,6 +75,8 @@ def moved_ports(ports: Ports, places: Any) -> Ports:
 
 def _put(port: Any, place: Any, ports: Ports) -> Any:
     """Return a port elsewhere; one that moves goes on from there."""
+    if not isinstance(place, Mapping):
+        _require_single(port)
     moves = getattr(port, "moves", None)
     if moves is None:
         return port.replace(at=place)
@@ -124,6 +126,7 @@ def along(plant: Partition, name: str, points: npt.ArrayLike) -> PortPath:
     """Return what depends on the place of a POI or a force, at many points at once."""
     places = real_array(points, "points", (None, 3))
     port = _port(plant.assembled.ports, name)
+    _require_single(port)
     if isinstance(port, Poi):
         return _poi_along(plant, port, places)
     if isinstance(port, Actuator | Disturbance):
@@ -147,6 +150,17 @@ def _port(ports: Ports, name: str) -> Any:
     if not hasattr(found[0], "at"):
         raise LabelError(f"{name!r} has no place: it is a {type(found[0]).__name__}.")
     return found[0]
+
+
+def _require_single(port: Any) -> None:
+    """Raise ModelError for a port between points: one place does not say where all of them are."""
+    weights = list(port.at.values()) if isinstance(port.at, Mapping) else []
+    if weights and min(weights) < 0.0 < max(weights):
+        raise ModelError(
+            f"{port.name!r} is a motion or force between points, {short(dict(port.at))}: one place "
+            "does not say where each of them moves. Pass the new mapping, "
+            "plant.at({name: mapping}), for each position."
+        )
 
 
 def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> PortPath:

@@ -59,6 +59,9 @@ class DesignHistory:
 #: first crossover relative to the lowest resonance, and to the first line; its low-pass relative
 #: to it; loop gain at resonances that is small; times that the crossover is lowered until it is
 _BELOW, _ABOVE, _ROLL, _QUIET, _TRIES = 0.12, 10.0, 8.0, 0.4, 12
+#: first crossover of velocities relative to the springs; factor over which a slope is taken; where
+#: a loop of the first power is small, relative to its crossover
+_OVER, _BESIDE, _BEYOND = 3.0, 1.25, 3.0
 
 
 class Bench:
@@ -180,11 +183,14 @@ def first_axis(machine: BenchMachine, index: int, design: LoopDesign) -> ShapedA
         return ShapedAxis()
     first, low = float(measured.resonances.min(initial=measured.ceiling)), float(machine.freq[0])
     cross = max(_BELOW * first, min(_ABOVE * low, 0.3 * first))
+    least = 4.0 * low
+    if _line(machine, index, cross) < 0:  # velocities of a body on springs: that of a mass is above
+        cross, least = min(_OVER * first, measured.ceiling / _ROLL), 0.5 * _OVER * first
     for _ in range(_TRIES):
         axis = crossing_axis(machine, index, design, cross)
-        beyond = machine.freq > 2.0 * cross
+        beyond = machine.freq > _BEYOND * cross
         L = axis.law.replace(rate=design.rate).at(machine.freq) * G
-        if np.abs(L[beyond]).max(initial=0.0) < _QUIET or cross < 4.0 * low:
+        if np.abs(L[beyond]).max(initial=0.0) < _QUIET or cross < least:
             break
         cross *= 0.8
     return axis
@@ -193,13 +199,24 @@ def first_axis(machine: BenchMachine, index: int, design: LoopDesign) -> ShapedA
 def crossing_axis(
     machine: BenchMachine, index: int, design: LoopDesign, cross: float
 ) -> ShapedAxis:
-    """Return PID and low-pass around a crossover [Hz], with the sign of the plant."""
+    """Return the law and low-pass for a crossover [Hz], by the line and sign of the plant there."""
     cross = float(f"{cross:.3g}")
     top = 0.95 * (min(machine.freq[-1], 0.45 * design.rate) if design.rate else machine.freq[-1])
+    line = _line(machine, index, cross)
     pid = Pid.corners(1.0, integrator=cross / 6.0, zero=cross / 3.0, pole=min(3.0 * cross, top))
-    axis = ShapedAxis((pid, LowPass(min(_ROLL * cross, top))))
+    # velocities say nothing of rest, which an integrator would look for
+    action = {2: (pid,), 0: (Pid(0.0, i=1.0),)}
+    axis = ShapedAxis((*action.get(line, ()), LowPass(min(_ROLL * cross, top))))
     there = np.array([cross])
     G = complex(machine.respond(there)[index, index][0])
     gain = 1.0 / abs(complex(axis.law.replace(rate=design.rate).at(there)[0]) * G)
-    # a free body is half a turn behind its force, where the sign is right
-    return axis.replace(gain=float(f"{gain if G.real < 0.0 else -gain:.6g}"))
+    right = (G * 1j**line).real > 0.0  # each power of 1 / s turns back a quarter
+    return axis.replace(gain=float(f"{gain if right else -gain:.6g}"))
+
+
+def _line(machine: BenchMachine, index: int, freq: float) -> int:
+    """Return the power of 1 / s of an axis at a frequency [Hz]: 2 of a mass, 0 of a spring."""
+    near = np.clip([freq / _BESIDE, freq * _BESIDE], machine.freq[0], machine.freq[-1])
+    size = np.abs(machine.respond(near)[index, index])
+    slope = -np.diff(np.log(size))[0] / np.diff(np.log(near))[0]
+    return int(np.clip(np.round(slope), -1, 2))
