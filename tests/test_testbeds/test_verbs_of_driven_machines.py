@@ -122,7 +122,7 @@ def test_a_poi_moves_over_a_free_block():
     """The response of the POI at a place that is stated is that of the place along a path."""
     plant = plant_of("maglev_block")
     poi = plant.assembled.ports.z[0]
-    places = np.array([poi.at, np.array(poi.at) + [0.02, -0.01, 0.0]])
+    places = np.array([poi.at, np.add(poi.at, [0.02, -0.01, 0.0])])
     path = plant.along(poi.name, places)
     for k, place in enumerate(places):
         moved = plant.at({poi.name: place.tolist()}).system
