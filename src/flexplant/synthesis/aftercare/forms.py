@@ -140,7 +140,7 @@ def _as_given(
     K: StateSpace, d: FloatArray, driven: Sequence[slice], inputs: int | None, single: bool
 ) -> TwoStateForm:
     """Return a system as full matrices in its own states, each in units of a scale (n,)."""
-    d = 2.0 ** np.round(np.log2(d))  # so that no digit changes
+    d = np.asarray(np.exp2(np.round(np.log2(d))), dtype=np.float64)  # so that no digit changes
     K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
     own = _arranged(K, [K.n_states], driven, inputs, paired=0)
     own = _in_single(own) if single else own

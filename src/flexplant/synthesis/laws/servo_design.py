@@ -278,8 +278,7 @@ _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 #: raises |S| and lowers the frequency up to which |S| of the references is below 1 by at most this
 #: factor. Those above it are for axes on springs that would follow too little otherwise
 _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
-#: a wide lead has less gain at low frequencies: |S| that an axis is to have at this fraction of its
-#: bandwidth, which a free mass has with the usual lead
+#: |S| that an axis is to have at this fraction of its bandwidth, as a mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
 #: a bandwidth is next to a resonance when a mode lies within this of it, and the gain of the axis
 #: differs by more than this from that on the real axis; in logarithms
