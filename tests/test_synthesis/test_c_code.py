@@ -181,7 +181,7 @@ def test_driven_machines_run_in_c(kind, bandwidth, tmp_path):
     loop = fx.close_loop(made, observer, servo)
     led = [name for name in made.y if name.endswith(":ref")]
     move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
-    run = fx.simulate(loop, reference={led[0]: move}, duration=0.03, noise=False)
+    run = fx.simulate(loop, reference={led[0]: move}, duration=0.04, noise=False)
     refs = dict.fromkeys(led, np.zeros(run.time.size)) | {led[0]: move.at(run.time).position}
     got = closed(loop.plant, Compiled(tmp_path, loop), loop.driven, refs, run.time.size)
     agree(got, run, loop.driven, loop.watched, 1e-8)
