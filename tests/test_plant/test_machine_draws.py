@@ -9,11 +9,12 @@ import scipy.linalg as la
 import scipy.stats
 
 import flexplant as fx
-from flexplant.errors import ModelError
+from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation.machine_noise import _difference, _driven_modes
 from flexplant.plant.machine_draws import MachineFamily, _exponential
 from flexplant.plant.machine_plants import interval_of, interval_text
 from flexplant.plant.realisation import realise
+from flexplant.simulation import exposure_errors
 from flexplant.updating.machines import Draw
 
 STEEL = {"density": 7850.0, "youngs_modulus": 210e9, "area": 1e-3, "inertia": 8e-8}
@@ -283,8 +284,8 @@ def test_intervals_are_predictive_of_a_log_normal_figure():
         low, high = interval_of(values, 0.9)
         held.append(low < np.exp(0.1 + 0.2 * rng.normal()) < high)
     assert np.mean(held) == pytest.approx(0.9, abs=0.03)
-    with pytest.raises(ModelError, match="positive"):
-        interval_of(np.array([1.0, 0.0]), 0.9)
+    with pytest.raises(AssumptionError, match=r"positive and finite, .* on 2 of 3 machines"):
+        interval_of(np.array([1.0, 0.0, np.inf]), 0.9)
 
 
 def test_an_observer_says_where_its_error_lies(plant):
@@ -434,6 +435,47 @@ def test_any_figure_of_a_loop_has_an_interval(plant):
     each = [ma(loop.around(loop.plant.around(one))) for one in plant.machines.plants]
     assert (low, high) == pytest.approx(interval_of(np.array(each)))
     assert sentence.endswith("m on 95 % of such machines")
+
+
+def test_a_specification_says_what_is_met_on_machines(plant):
+    """Each value of a verdict against loops that are closed around the machines one by one."""
+    observer = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    move = fx.setpoint(1e-4, velocity=0.01, acceleration=1.0, jerk=200.0)
+
+    def run(one):
+        return fx.simulate(one, reference={"die:ref": move}, duration=0.06, noise=False)
+
+    limits = fx.Specification(
+        ma=1e-4, settling=1e-3, noise=1e-6, bandwidth=1.0, modulus_margin=0.1,
+        channel="die:error", start=0.04,
+    )  # fmt: skip
+    found = limits.check(loop, run)
+    loops = [loop.around(loop.plant.around(one)) for one in plant.machines.plants]
+    each = {
+        "MA": [exposure_errors(run(one), start=0.041)["die:error"].ma for one in loops],
+        "noise": [one.rms("die:error") for one in loops],
+        "modulus margin": [one.modulus_margin for one in loops],
+        "bandwidth": [fx.loop.bandwidth(one) for one in loops],
+    }
+    for name, values in each.items():
+        at = found.names.index(name)
+        wanted = interval_of(np.array(values))
+        assert (found.low[at], found.high[at]) == pytest.approx(wanted, rel=1e-6)
+        assert "on 95 % of such machines" in found.sentences[at]
+    assert found.passed and np.all(found.met_on_machines[np.array(found.names) != "settling"])
+    # a limit that the design model keeps and a part of the machines does not
+    middle = float(np.sqrt(found.high[found.names.index("MA")] * found["MA"]))
+    tight = limits.replace(ma=middle).check(loop, run)
+    assert tight.met[tight.names.index("MA")] and not tight.met_on_machines[tight.names.index("MA")]
+    (row,) = (line for line in repr(tight).splitlines() if line.startswith("MA"))
+    assert " to " in row and row.endswith("NO")
+    # one run cannot be repeated elsewhere, and without machines the table is as short as ever
+    single = limits.check(loop, run(loop))
+    assert np.isnan(single.low[single.names.index("MA")]) and "lambda one:" in repr(single)
+    alone = fx.close_loop(plant.replace(evaluation=None), observer, servo)
+    assert "such machines" not in repr(limits.check(alone, run))
 
 
 def test_the_response_of_the_fit_judges_loops(case):

@@ -333,11 +333,24 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     assert page.loop.is_stable is bool(
         np.abs(closed_poles(plant.Gyu.select(feedback.inputs), feedback)).max() < 1.0
     )
+    assert "of machines" not in page.further.object
     high = page.loop.margins.modulus_margin
     page.gain.text.value = f"{40 * page.design.axes['die:x'].gain:g}"
     assert "UNSTABLE" in verdict(page)
     assert "unstable" in page.further.object
     assert page.loop.margins.modulus_margin != high
+
+
+@pytest.mark.slow
+def test_with_a_plant_whose_machines_are_known_the_page_has_their_intervals():
+    plant = fx.testbeds.three_masses().uncertain(frequency=0.01, damping=0.3)
+    page = Page(fx.workbench.open_page(plant, open_browser=False))
+    loop = fx.close_loop(plant, page.design.controller())
+    for name in ("die:error", "modulus margin", "bandwidth"):
+        low, high, sentence = loop.interval(name)
+        assert low < high and "on 95 % of such machines" in sentence
+        row = page.further.object.split(f"{name} of machines")[1].split("</tr>")[0]
+        assert sentence in row
 
 
 @pytest.mark.slow

@@ -216,8 +216,11 @@ def interval_of(values: FloatArray, level: float = INTERVAL) -> tuple[float, flo
     from scipy.special import stdtrit
 
     share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
-    if np.any(values <= 0.0):
-        raise ModelError("a figure of a log-normal distribution is positive.")
+    if without := int(np.count_nonzero(~((values > 0.0) & np.isfinite(values)))):
+        raise AssumptionError(
+            f"a figure of a log-normal distribution is positive and finite, and it is not on "
+            f"{without} of {len(values)} machines"
+        )
     logs, n = np.log(values), len(values)
     half = stdtrit(n - 1, 0.5 * (1 + share)) * np.std(logs, ddof=1) * np.sqrt(1 + 1 / n)
     centre = float(np.mean(logs))

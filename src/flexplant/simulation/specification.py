@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cache
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..arrays import FloatArray, positive
 from ..errors import AssumptionError, ModelError, aligned, only_one, require_known, short
 from ..loop import ClosedLoop, bandwidth
+from ..loop.machine_figures import MARGIN
+from ..plant import FigureInterval
+from ..plant.machine_plants import interval_text
 from ..store import Value, checked
+from ..tolerances import INTERVAL
 from ..words import in_unit, instance
 from .exposure import exposure_errors, settling_time
 from .response import Response
@@ -20,6 +25,11 @@ from .response import Response
 _OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
 #: limits of the loop itself
 _OF_LOOPS = ("noise", "bandwidth", "modulus_margin")
+
+#: name, unit, value and limit of a requirement, and whether the limit is a lower one
+_Row: TypeAlias = tuple[str, str, float, float, bool]
+#: a run, or the function of a loop that makes it
+_Run: TypeAlias = "Response | Callable[[ClosedLoop], Response]"
 
 
 def _efforts(value: Any, name: str) -> float | dict[str, float]:
@@ -44,6 +54,12 @@ class Verdict(Value):
         Achieved and allowed values; NaN where nothing is measured.
     at_least : (n,) bool array
         Whether the limit is a lower one.
+    low, high : (n,) arrays, optional
+        Ends of each value's interval on 95 % of the machines that agree with the measurement; NaN
+        where no interval is stated.
+    sentences : sequence of n str, optional
+        The intervals in words, or the reason why there is none; empty where the plant of the loop
+        knows no such machines.
 
     Examples
     --------
@@ -61,6 +77,9 @@ class Verdict(Value):
     values: FloatArray
     limits: FloatArray
     at_least: Any
+    low: FloatArray = field(default_factory=lambda: np.zeros(0))
+    high: FloatArray = field(default_factory=lambda: np.zeros(0))
+    sentences: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return self.passed
@@ -81,6 +100,14 @@ class Verdict(Value):
         """The requirements that are not met."""
         return tuple(name for name, met in zip(self.names, self.met, strict=True) if not met)
 
+    @property
+    def met_on_machines(self) -> Any:
+        """Whether each requirement is met over its whole interval (n,); False without one."""
+        if not self.sentences:
+            return np.zeros(len(self.names), dtype=bool)
+        above, below = self.low >= self.limits, self.high <= self.limits
+        return np.where(self.at_least, above, below)
+
     def __getitem__(self, name: str) -> float:
         """Return the achieved value of a requirement."""
         require_known("requirement", [name], self.names)
@@ -95,7 +122,43 @@ class Verdict(Value):
             factor, shown = in_unit(float(limit), unit) if np.isfinite(limit) else (1.0, unit)
             must = f"{'>=' if least else '<='} {limit / factor:.4g}"
             rows.append((name, f"{value / factor:.4g}", must, shown, "" if met else "FAILED"))
-        return "\n".join([*lines, *aligned(("", "reached", "limit", "", ""), rows)])
+        head = ("", "reached", "limit", "", "")
+        if not self.sentences:
+            return "\n".join([*lines, *aligned(head, rows)])
+        there = zip(self.low, self.high, self.units, self.met_on_machines, strict=True)
+        rows = [(*r[:-1], *_on_machines(*one), r[-1]) for r, one in zip(rows, there, strict=True)]
+        head = (*head[:-1], f"on {100 * INTERVAL:.3g} % of such machines", "met there", "")
+        reasons: dict[str, list[str]] = {}
+        for i in np.flatnonzero(np.isnan(self.low)).tolist():
+            reasons.setdefault(self.sentences[i], []).append(self.names[i])
+        said = [f"{', '.join(names)}: {reason}" for reason, names in reasons.items()]
+        return "\n".join([*lines, *aligned(head, rows), *said])
+
+
+def _on_machines(low: float, high: float, unit: str, met: bool) -> tuple[str, str]:
+    """Return the cells of an interval, and of whether a requirement is met all over it."""
+    if np.isnan(low):
+        return "not stated", "not known"
+    return interval_text(low, high, unit), "yes" if met else "NO"
+
+
+#: figures of a loop, by the name of their row
+_FIGURES = {"bandwidth": bandwidth, "modulus margin": MARGIN}
+_ONE_RUN = (
+    "no interval of a single run: pass a function of a loop, lambda one: simulate(one, ...), "
+    "which is repeated on other machines"
+)
+
+
+def _stable(loop: ClosedLoop) -> FigureInterval:
+    """Return whether a loop is stable on all machines, as an interval of 0 or 1."""
+    margin = loop.interval(MARGIN)
+    if loop.plant.machine.machines.missing:
+        return margin
+    loops = loop.on_machines
+    count = len(loops.loops)
+    low, high = float(loops.unstable == 0), float(loops.unstable < count)
+    return FigureInterval(low, high, f"stable on {count - loops.unstable} of {count} such machines")
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,15 +226,26 @@ class Specification(Value):
         if self.settling is not None and self.ma is None:
             raise ModelError("settling is the time to reach ma (and msd): give ma as well.")
 
-    def check(
-        self, loop: ClosedLoop, run: Response | None = None, *, exposures: Any = None
-    ) -> Verdict:
+    def check(self, loop: ClosedLoop, run: _Run | None = None, *, exposures: Any = None) -> Verdict:
         """Return the achieved values of a loop, on the machine or its model, and of a run.
 
-        All runs of the run count; `exposures` (k, 2) [s] are as for `exposure_errors`, all after
-        `start` (and `settling`) when not given. Limits on errors and efforts need a run.
+        Where the plant of the loop knows the machines that agree with a measurement, each value has
+        its interval on 95 % of them.
+
+        Parameters
+        ----------
+        loop : ClosedLoop
+            The loop.
+        run : Response or callable, optional
+            Limits on errors and efforts need a run, of which all runs count, or a function of a
+            loop that returns one: ``lambda one: simulate(one, reference=move, duration=0.1)``. Only
+            a function can be repeated on other machines, so that its values have intervals.
+        exposures : (k, 2) array [s], optional
+            As for `exposure_errors`; by default all after `start` (and `settling`).
         """
         instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+        again = run if callable(run) else None
+        run = again(loop) if again is not None else run
         needed = [name for name in _OF_RUNS if getattr(self, name) is not None]
         if needed and not isinstance(run, Response):
             raise ModelError(
@@ -182,7 +256,36 @@ class Specification(Value):
         if run is not None:
             rows += self._of_run(loop, run, exposures)
         names, units, values, limits, least = zip(*rows, strict=True)
-        return Verdict(names, units, np.array(values), np.array(limits), np.array(least))
+        found = self._intervals(loop, again, rows, exposures)
+        ends = np.array([one[:2] for one in found], dtype=float).reshape(-1, 2)
+        said = tuple(one.sentence for one in found)
+        return Verdict(
+            names, units, np.array(values), np.array(limits), np.array(least), *ends.T, said
+        )
+
+    def _intervals(
+        self, loop: ClosedLoop, run: Callable[[ClosedLoop], Any] | None, rows: Any, exposures: Any
+    ) -> list[FigureInterval]:
+        """Return the interval of each row over the machines of the plant; none without machines."""
+        if loop.plant.machine.machines is None:
+            return []
+
+        @cache
+        def values(one: ClosedLoop) -> dict[str, float]:
+            return {row[0]: row[2] for row in self._of_run(one, run(one), exposures)}
+
+        found = []
+        for name, unit, *_ in rows:
+            if name == "stable":
+                found.append(_stable(loop))
+            elif name in _FIGURES or name == "noise":
+                figure = _FIGURES.get(name) or self._watched(loop)
+                found.append(loop.interval(figure, unit=unit))
+            elif run is None:
+                found.append(FigureInterval(None, None, _ONE_RUN))
+            else:
+                found.append(loop.interval(lambda one, n=name: values(one)[n], unit=unit))
+        return found
 
     def _watched(self, loop: ClosedLoop) -> str:
         """Return the named channel, or the only error."""
