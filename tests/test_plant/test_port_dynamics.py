@@ -207,6 +207,21 @@ def test_the_flow_is_the_dense_exponential():
             wanted = la.expm(A * t)
             size = np.abs(wanted).max()
             np.testing.assert_allclose(flow.at(t), wanted, rtol=1e-9, atol=1e-14 * size)
+            np.testing.assert_allclose(flow.on(np.eye(len(A)), t), flow.at(t))
+
+
+def test_the_flow_of_modes_alone_acts_on_vectors_without_its_matrix():
+    """Modes of two states, of one and undamped ones, in units that differ by five decades."""
+    rng = np.random.default_rng(2)
+    sizes = [2, 1, 2, 2, 1, 2]
+    blocks = [-rng.uniform(1.0, 50.0, (1, 1)) if n == 1 else
+              np.array([[0.0, 1.0], [-rng.uniform(1e2, 1e6), -rng.uniform(0.0, 5.0)]])
+              for n in sizes]  # fmt: skip
+    A, vectors = la.block_diag(*blocks), rng.normal(size=(sum(sizes), 3))
+    flow = Flow(A, sizes, 10.0 ** rng.integers(-2, 3, len(A)))
+    for t in (1e-5, 3e-3):
+        wanted = la.expm(A * t) @ vectors
+        np.testing.assert_allclose(flow.on(vectors, t), wanted, rtol=1e-9, atol=1e-11)
 
 
 def test_a_filter_of_several_sections_keeps_its_blocks():

@@ -289,11 +289,11 @@ def _sampled_noise(
     for start, end in pairwise(edges):
         G = flow.noise(force, end - start)
         column = np.zeros((layout.size, G.shape[1]))
-        column[states] = flow.at(h - end) @ G
+        column[states] = flow.on(G, h - end)
         for instant, seen in taken.items():
             if end <= instant:
                 rows = [layout.line(j)[-1] for j in seen]
-                column[rows] = g.C[seen] @ flow.at(instant - end) @ G
+                column[rows] = g.C[seen] @ flow.on(G, instant - end)
         parts.append(column)
     return compressed(np.hstack(parts))
 
@@ -362,9 +362,17 @@ class Flow:
         E[at[:, :, None], at[:, None, :]] = own
         return np.asarray(E[:n, :n] * self.units[:, None] / self.units)
 
+    def on(self, vectors: FloatArray, time: float) -> FloatArray:
+        """Return ``e^(A time)`` times vectors (n, r), without (n, n) matrices for modes alone."""
+        if not self.modal or self.h or self.t:
+            return self.at(time) @ vectors
+        wide = np.vstack([vectors / self.units[:, None], np.zeros((1, vectors.shape[1]))])
+        wide[self.at_modes] = pair_expm(self.pairs, time) @ wide[self.at_modes]
+        return np.asarray(wide[:-1] * self.units[:, None])
+
     def noise(self, force: FloatArray, time: float) -> FloatArray:
         """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
-        return accumulated_noise(self.at, force, time, self.rate)
+        return accumulated_noise(self.on, force, time, self.rate)
 
 
 def _held_flow(g: StateSpace, units: FloatArray) -> HeldFlow:
@@ -493,9 +501,12 @@ _NODES = 10
 
 
 def accumulated_noise(
-    at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
+    on: Callable[[FloatArray, float], FloatArray], force: FloatArray, time: float, rate: float
 ) -> FloatArray:
-    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
+    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
+
+    ``on(vectors, t)`` are vectors times ``e^(A t)``.
+    """
     # Gauss-Legendre quadrature. It covers the whole interval where the number of nodes for rounding
     # accuracy gives less than n columns, as for a large structure with few forces. Otherwise it
     # covers an interval so short that ten nodes are exact, followed by `G(2 t) = [G(t), e^(A t)
@@ -512,12 +523,12 @@ def accumulated_noise(
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
     parts = [
-        np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
+        np.sqrt(0.5 * piece * weight) * on(force, 0.5 * piece * (node + 1.0))
         for node, weight in zip(nodes, weights, strict=True)
     ]
     G = compressed(np.hstack(parts))
     for k in range(doublings):
-        G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
+        G = compressed(np.hstack([G, on(G, piece * 2**k)]))
     return G
 
 

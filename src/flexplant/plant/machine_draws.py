@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -36,13 +36,21 @@ _MOST_DAMPING = 0.9
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DrawnModes(ModalRealisation):
-    """Modes of a drawn machine over columns (n, c) of DOFs, which all machines share."""
+    """Modes of a drawn machine over columns (n, c) of DOFs, which all machines share.
+
+    `rows` are the rows of places over these columns, found once for all machines.
+    """
 
     over: FloatArray = None  # type: ignore[assignment]
+    rows: dict[str, FloatArray] = field(default_factory=dict)
 
     def row(self, at: Place, direction: str) -> FloatArray:
         """Return the row (c,) over the columns for a place."""
-        return self.load(super().row(at, direction))
+        place = at if isinstance(at, str | Mapping) else tuple(map(float, at))
+        name = f"{direction} at {place!r}"
+        if name not in self.rows:
+            self.rows[name] = self.load(super().row(at, direction))
+        return self.rows[name]
 
     def load(self, forces: FloatArray) -> FloatArray:
         """Return forces on the model's DOFs over the columns."""
@@ -73,6 +81,7 @@ class ModeSpace:
             whole.static_outputs,
         )
         self.over: FloatArray = np.hstack([self.shapes, *fixed])
+        self.rows: dict[str, FloatArray] = {}
 
     def mixed(self, M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return omega (b,) and shapes (b, b) of mass and stiffness over the modes that mix.
@@ -115,6 +124,7 @@ class ModeSpace:
                 "static_outputs": static[:, p:],
             },
             over=self.over,
+            rows=self.rows,
         )
 
 
