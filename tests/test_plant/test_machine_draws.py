@@ -478,6 +478,19 @@ def test_a_specification_says_what_is_met_on_machines(plant):
     assert "such machines" not in repr(limits.check(alone, run))
 
 
+@pytest.mark.long
+def test_a_stage_is_judged_on_the_machines_of_its_fit(plant):
+    """Without stated frequencies they decide; with them the certificate has their margin too."""
+    promised = "least modulus margin of 20 machines "
+    for given, name in ((plant, "drawn"), (plant.uncertain(frequency=0.02), "of the fit")):
+        found = fx.design_stage(given, bandwidth=20.0)
+        loop = fx.close_loop(plant, found)
+        each = [loop.around(one).modulus_margin for one in plant.machines.plants[:20]]
+        assert found.certificate[promised + name] == pytest.approx(min(each))
+        assert min(each) >= 0.35
+    assert found.certificate[promised + "drawn"] != pytest.approx(min(each))
+
+
 def test_the_response_of_the_fit_judges_loops(case):
     """A plant of a model that was fitted to a response says the same as plant.measured(frf)."""
     system = case.plant().continuous.Gyu.select(["y1", "y2"], ["u1", "u2"])
