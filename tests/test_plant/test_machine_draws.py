@@ -437,6 +437,7 @@ def test_any_figure_of_a_loop_has_an_interval(plant):
     assert sentence.endswith("m on 95 % of such machines")
 
 
+@pytest.mark.slow
 def test_a_specification_says_what_is_met_on_machines(plant):
     """Each value of a verdict against loops that are closed around the machines one by one."""
     observer = fx.design_static(plant)
