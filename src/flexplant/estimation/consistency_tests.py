@@ -63,7 +63,7 @@ _AGREES = 1e-4
 #: largest number of modes that are fitted one after the other until no peak remains
 _MOVED = 6
 #: band of a mode in half-widths and in lines to each side, with nearly all of its power
-_HALF_WIDTHS, _BESIDE = 3.0, 2
+_HALF_WIDTHS, _LINES = 3.0, 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -354,7 +354,7 @@ def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float,
     decay = -0.5 * np.trace(blocks, axis1=1, axis2=2) / (2.0 * np.pi)
     expected = facts.parts.pooled.sum(axis=0)
     for n, at, width in zip(kept.numbers.tolist(), folded(kept.freq, rate), decay, strict=True):
-        reach = _HALF_WIDTHS * width * plant.dt + _BESIDE * step
+        reach = _HALF_WIDTHS * width * plant.dt + _LINES * step
         band = np.flatnonzero(np.abs(lines - at * plant.dt) <= reach)
         if band.size:
             ratio = float(np.mean(facts.lines.pooled.density[band] / expected[band]))
@@ -390,11 +390,11 @@ class _Facts(NamedTuple):
     @property
     def explained(self) -> bool:
         """Whether the lines have the density of the plant with the levels stated."""
-        beside = self.lines.beside(self.parts.both)
-        count = 2 * beside.density.size * beside.channels
-        total = level_test(count * float(np.mean(beside.density)), count)
-        p = min(total.p_value, cumulative_periodogram(beside).p_value)
-        return p >= _AGREES and not excess_peaks(beside, _AGREES)
+        relative = self.lines.relative_to(self.parts.both)
+        count = 2 * relative.density.size * relative.channels
+        total = level_test(count * float(np.mean(relative.density)), count)
+        p = min(total.p_value, cumulative_periodogram(relative).p_value)
+        return p >= _AGREES and not excess_peaks(relative, _AGREES)
 
 
 def _tested(

@@ -139,7 +139,7 @@ class InnovationLines(NamedTuple):
         """The periodogram, mean over the channels."""
         return PooledSpectrum(self.freq, np.mean(np.abs(self.X) ** 2, axis=1), self.X.shape[1])
 
-    def beside(self, S: ComplexArray) -> PooledSpectrum:
+    def relative_to(self, S: ComplexArray) -> PooledSpectrum:
         """Return ``X* S^-1 X / p``: 1 on average if the innovations have the density S."""
         solved = np.linalg.solve(S, self.X[:, :, None])[:, :, 0]
         density = np.sum(self.X.conj() * solved, axis=1).real / self.X.shape[1]

@@ -48,7 +48,7 @@ from .refine import Exhausted, Lines, PoleFit, Products, pivoted, refined, scale
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
 
 #: distance from a pole, in half-widths, within which another one may belong to the same resonance
-BESIDE = 3.0
+SAME_RESONANCE = 3.0
 
 
 def gated(
@@ -89,11 +89,11 @@ def steady(
     # (95 %), represents their difference; a pole with a mean damping known no better is without
     # information
     damping, m = -fit.poles.real, fit.m
-    beside = np.array([
+    close = np.array([
         np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
         for k, pole in enumerate(fit.poles)
     ])  # fmt: skip
-    differs = beside & (1.96 * apart.spread[:m] > damping)
+    differs = close & (1.96 * apart.spread[:m] > damping)
     unknown = apart.deviation[:m] >= -apart.poles.real
     side = fit.lines.side
     reasons = (
@@ -159,7 +159,7 @@ def lesser(fit: PoleFit, vectors: ComplexArray, alike: float = 0.0) -> list[int]
     """Return the weaker of neighbouring poles with a MAC above a limit, the weakest first."""
     height, found = strength(fit), []
     for k in np.argsort(height):
-        reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
+        reach = SAME_RESONANCE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
         if np.any(mac_matrix(vectors[:, near], vectors[:, [k]]) >= alike):
             found.append(int(k))

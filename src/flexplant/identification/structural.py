@@ -100,12 +100,12 @@ def structural_modes(
     free, labels = flag(rigid, "rigid"), at.labels
     shapes = at.shapes()
     imaginary = float(np.max(_imaginary(shapes)))
-    beside = at.beside()
-    A, G, fast = at.smooth(beside)
+    outside = at.outside()
+    A, G, fast = at.smooth(outside)
     body = at.rigid(A, dofs, rows) if free else np.zeros((len(labels), 0))
     residual = at.residual(G, fast)
     certificate = Certificate.of({"imaginary": imaginary}, route="imaginary parts of the shapes")
-    columns = [body, shapes.real, np.hstack([beside.shapes.real, residual])]
+    columns = [body, shapes.real, np.hstack([outside.shapes.real, residual])]
     place = dofs
     if over is not None:
         E = expansion(over, rows)
@@ -134,7 +134,7 @@ def structural_modes(
         )
     body, phi, vectors = columns
     m = residual.shape[1]
-    near = beside.poles
+    near = outside.poles
     zeta = np.concatenate([np.zeros(body.shape[1]), measured.zeta])
     return Modes(
         np.concatenate([np.zeros(body.shape[1]), np.abs(measured.poles)]),
@@ -179,7 +179,7 @@ def measured_places(
     return MeasuredPlaces(measured, labels), dofs, dofs.indices(labels)
 
 
-class Beside(NamedTuple):
+class OutsideBand(NamedTuple):
     """Modes just outside the band, from the fit and by places."""
 
     poles: ComplexArray
@@ -216,7 +216,7 @@ class MeasuredPlaces:
         found = np.matmul(self.maps(poles), channels)[:, :, 0].T
         return np.asarray(found, dtype=np.complex128)
 
-    def beside(self) -> Beside:
+    def outside(self) -> OutsideBand:
         """Return the poles outside the band that are modes of a structure."""
         poles, shapes, part = self.measured.unreported
         phi = self._at(poles, shapes, part)
@@ -226,9 +226,9 @@ class MeasuredPlaces:
         off = np.hypot(off, np.linalg.norm(made.imag - known.imag, axis=(0, 1)))
         like = off < ALIKE * np.linalg.norm(known, axis=(0, 1))
         keep = np.flatnonzero(like & (_imaginary(phi) < ALIKE))
-        return Beside(poles[keep], known[:, :, keep], phi[:, keep])
+        return OutsideBand(poles[keep], known[:, :, keep], phi[:, keep])
 
-    def smooth(self, beside: Beside) -> tuple[FloatArray, FloatArray, float]:
+    def smooth(self, outside: OutsideBand) -> tuple[FloatArray, FloatArray, float]:
         """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes."""
         # the residual terms and the poles outside the band that are not modes of a structure, at
         # 200 frequencies of the band, relative to the whole response; w is searched
@@ -238,8 +238,8 @@ class MeasuredPlaces:
         whole = measured.replace(hold=None, delay=0.0).frf(freq).data
         s = 2j * np.pi * freq
         part: ComplexArray = np.asarray(measured.shapes)[:, None, :] * measured.participation
-        poles = np.concatenate([measured.poles, beside.poles])[:, None]
-        part = np.concatenate([part, beside.residues], axis=2)
+        poles = np.concatenate([measured.poles, outside.poles])[:, None]
+        part = np.concatenate([part, outside.residues], axis=2)
         modal = part @ (1 / (s - poles)) + part.conj() @ (1 / (s - poles.conj()))
         rest = np.real(whole - modal).reshape(-1, freq.size)
         weight = 1 / np.sqrt(np.mean(np.abs(whole) ** 2, axis=(0, 1)))

@@ -164,8 +164,8 @@ def warn_of_bending(
             mean, A, _ = patch.mean(side.dofs, patch.point(side.dofs))
             channels = [side.channels[row] for row in patch.rows(side.dofs)]
             moved = frf.data[[frf.outputs.index(channel) for channel in channels]]
-            beside = moved - np.einsum("ij,jkf->ikf", A @ mean, moved)
-            part = np.linalg.norm(beside, axis=(0, 1)) / np.linalg.norm(moved, axis=(0, 1))
+            bending = moved - np.einsum("ij,jkf->ikf", A @ mean, moved)
+            part = np.linalg.norm(bending, axis=(0, 1)) / np.linalg.norm(moved, axis=(0, 1))
             if np.median(part) > _BENDS:
                 warn(
                     f"{end!r} bends: {100 * np.median(part):.0f} % of its measured motion at the "

@@ -335,9 +335,9 @@ class JoinedMachine:
             stretch[np.abs(stretch) <= SAME * most[:, None]] = 0.0  # rounding of terms that cancel
             size = np.linalg.norm(stretch, axis=1)
             allowed = la.null_space(stretch / divisor(size)[:, None], rcond=SAME)
-            beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
+            rest = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
             size = np.linalg.norm(whole, axis=0)
-            clean = (missed < NEGLIGIBLE) & (size > 0) & (beside <= SAME * size)
+            clean = (missed < NEGLIGIBLE) & (size > 0) & (rest <= SAME * size)
             candidates = motions[self.done.kept] @ np.hstack([whole[:, clean], allowed])
             found.append(orthonormalised(self.matrices["M"], candidates, dependent="drop"))
         return np.hstack(found)
@@ -461,9 +461,9 @@ def compliances(
     W, A = W[list(axes)], A[:, list(axes)]
     mean = np.diag(W @ C @ W.T)
     # motions of A cost no energy here, so that C is invertible where the patch can move
-    beside = float(np.trace(C)) / max(float(np.sum(A**2)), TINY)
-    stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
-    rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
+    weight = float(np.trace(C)) / max(float(np.sum(A**2)), TINY)
+    stiffness = la.pinvh(C + weight * A @ A.T, rtol=_RANK)
+    rigid = np.diag(la.inv(A.T @ stiffness @ A)) - weight
     return np.asarray(mean), np.asarray(rigid)
 
 

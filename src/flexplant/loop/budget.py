@@ -233,7 +233,7 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
 #: function that gives densities (n_source, n_freq) at frequencies [Hz]
 Densities = Callable[[FloatArray], FloatArray]
 #: number of edges over all frequencies for a picture; distances from resonances in half-widths
-_STAIRS, _BESIDE = 150, (0.0, 3.0, 20.0)
+_STAIRS, _AROUND = 150, (0.0, 3.0, 20.0)
 
 
 class Spectrum(NamedTuple):
@@ -294,7 +294,7 @@ def integrated(
     # by adaptive Gauss-Kronrod quadrature:
     # intervals are halved where 7 and 15 points differ; continuous: to infinity, t = f / (f + f_c)
     top = 0.5 / monitored.dt if monitored.dt else np.inf
-    grid = resonance_grid(monitored.poles(), monitored.dt, points=_STAIRS, around=_BESIDE)
+    grid = resonance_grid(monitored.poles(), monitored.dt, points=_STAIRS, around=_AROUND)
     grid = np.concatenate([[0.0], grid[grid < top], [top]])
     centre = float(np.sqrt(grid[1] * grid[-2]))
     edges = grid if monitored.dt else np.append(grid[:-1] / (grid[:-1] + centre), 1.0)

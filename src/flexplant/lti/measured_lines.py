@@ -229,12 +229,12 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
         near = np.clip(p.real, -0.5 * wide, 0.5 * wide)
         left, right = (ends[k] - rho / ((k - 0.5) * wide - p) for k in (0, 1))
         moved = (at / (middle + near)) ** slope
-        beside = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
+        scale = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
         poles.append(p)
-        moves.append(moved * rho / beside)
+        moves.append(moved * rho / scale)
         # rho of another mode in the middle, if one fit shows more
         more = np.max(np.abs(p[:, None] - p) * tail, axis=1)
-        others.append(more / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside)))
+        others.append(more / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(scale)))
     found = (np.concatenate(parts) for parts in (poles, moves, others))
     return _hidden_modes(freq, F, *found)
 

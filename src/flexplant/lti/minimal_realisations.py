@@ -23,7 +23,7 @@ from .statespace import StateSpace, System, as_statespace
 DEFECTIVE = (1.0 / ROOT, 1.0 / ROUNDING)
 #: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
 #: resonances and zeros
-BESIDE = 0.1
+FAR_OFF = 0.1
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
@@ -196,21 +196,21 @@ def _visible(groups: list[_Group], tol: float) -> list[_Group]:
     """Return the groups whose contribution around their frequency exceeds rounding."""
     slowest = _frequencies(groups)[0]
     omega = [np.maximum(np.unique(group.omega), slowest) for group in groups]
-    whole = sum(_gains(group.part, np.concatenate(omega), BESIDE) for group in groups)
+    whole = sum(_gains(group.part, np.concatenate(omega), FAR_OFF) for group in groups)
     size = _equalisers(np.abs(np.asarray(whole)))
     last = np.cumsum([len(w) for w in omega])
     kept = []
     for group, w, end in zip(groups, omega, last, strict=True):
         unit = size[end - len(w) : end]
-        beside, near = (np.abs(_gains(group.part, w, off)) * unit for off in (BESIDE, SAME))
-        if np.max(beside) > RANK and np.max(near) > tol:
+        far, near = (np.abs(_gains(group.part, w, off)) * unit for off in (FAR_OFF, SAME))
+        if np.max(far) > RANK and np.max(near) > tol:
             kept.append(group)
     return kept
 
 
-def _gains(g: StateSpace, omega: FloatArray, beside: float) -> ComplexArray:
-    """Return the gains (n, p, m) at points ``(beside + j) omega`` in the unstable half plane."""
-    s = (beside + 1j) * omega
+def _gains(g: StateSpace, omega: FloatArray, offset: float) -> ComplexArray:
+    """Return the gains (n, p, m) at points ``(offset + j) omega`` in the unstable half plane."""
+    s = (offset + 1j) * omega
     s = np.exp(s * g.dt) if g.dt else s
     shifted = s[:, None, None] * np.eye(g.n_states) - g.A
     return np.asarray(g.C @ np.linalg.solve(shifted, np.broadcast_to(g.B, (s.size, *g.B.shape))))

@@ -191,10 +191,10 @@ def _among_others(g: Subsystem, first: int, end: int, blocks: Sequence[int]) -> 
     modes = _modal(Subsystem(g.A[own, own], inputs[:, used], outputs, g.dt, blocks))
     head, *_ = dense_solver(Subsystem(g.A[h, h], np.eye(first), g.C[:, h], g.dt))
     tail, *_ = dense_solver(Subsystem(g.A[t, t], g.B[t], np.eye(n - end), g.dt))
-    beside = np.block([[np.zeros((p, m)), g.C[:, t]], [g.B[h], g.A[h, t]]])
+    direct = np.block([[np.zeros((p, m)), g.C[:, t]], [g.B[h], g.A[h, t]]])
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
-        gain = np.repeat(beside[:, :, None], s.size, axis=2).astype(np.complex128)
+        gain = np.repeat(direct[:, :, None], s.size, axis=2).astype(np.complex128)
         shown, known, both = (
             np.zeros((*size, s.size), dtype=np.complex128)
             for size in ((p, first), (n - end, m), (p + first, used.size))

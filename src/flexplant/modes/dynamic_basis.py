@@ -332,7 +332,7 @@ def _dense_complex(matrix: Any) -> ComplexArray:
 #: beams of 360 DOFs)
 SILENT = SAME
 #: relative distance from a resonance that is still within its peak
-_BESIDE = SPLIT
+_WITHIN_PEAK = SPLIT
 #: number of rounds in which direct solutions extend a basis that is not accurate enough
 _ROUNDS = 3
 #: number of grid frequencies that bracket antiresonances, over the band and between two resonances
@@ -444,7 +444,7 @@ def _points(
         size = np.abs(find(inside))
         share = (size / np.maximum(size.max(axis=0), TINY)).max(axis=(1, 2))
         # next to them, since one of two repeated modes may be undamped
-        peaks = (inside * (1 + _BESIDE))[np.argsort(-share, kind="stable")].tolist()
+        peaks = (inside * (1 + _WITHIN_PEAK))[np.argsort(-share, kind="stable")].tolist()
     deep = antiresonances(find, basis.freq, low, high).tolist() if high > low else []
     edges = [high, low] if high > low else [high]
     while True:
@@ -460,7 +460,7 @@ def antiresonances(
 ) -> FloatArray:
     """Return the antiresonances [Hz] of responses in a band, the deepest first."""
     start = low if low > 0 else high / 1000
-    inside = resonances[(resonances > start) & (resonances < high)] * (1 + _BESIDE)
+    inside = resonances[(resonances > start) & (resonances < high)] * (1 + _WITHIN_PEAK)
     ends = np.concatenate([[start], inside, [high]])
     share = np.linspace(0.0, 1.0, _BETWEEN + 2)
     between = (ends[:-1, None] + np.diff(ends)[:, None] * share).ravel()

@@ -165,10 +165,10 @@ def _search(
     start = None if locked.shape[1] >= held.shape[1] else held
     squares, found = _search_once(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
-        beside, missing = np.hstack([locked, found]), want - found.shape[1]
+        known, missing = np.hstack([locked, found]), want - found.shape[1]
         # a block of vectors finds at most as many copies of a repeated mode as it has vectors
         block = min(2 * block, max(block, missing))
-        more = _search_once(model, factor, beside, missing, rng, None, block)
+        more = _search_once(model, factor, known, missing, rng, None, block)
         if not more[0].size:
             break
         squares, found = _merge_modes(model, found, *more)

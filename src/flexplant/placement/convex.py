@@ -36,7 +36,7 @@ class Branch:
     groups: Groups
 
     @classmethod
-    def beside(cls, required: Sequence[int], free: Sequence[int], count: int) -> Branch:
+    def containing(cls, required: Sequence[int], free: Sequence[int], count: int) -> Branch:
         """Return all choices of `count` that hold the required and else any of the free ones."""
         kept, more = np.array(sorted(required), np.int64), np.array(free, np.int64)
         groups = ((kept, kept.size), (more, count - kept.size))
@@ -273,7 +273,7 @@ class Convex(Scorer, ABC):
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return a lower bound over all choices of `count` candidates: tangent after tangent."""
         free = [i for i in range(self.total) if i not in required]
-        return self.relaxation(Branch.beside(required, free, count))[0]
+        return self.relaxation(Branch.containing(required, free, count))[0]
 
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
         """Return a lower bound over a branch, and weights near the least relaxed cost."""

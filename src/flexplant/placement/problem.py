@@ -340,7 +340,7 @@ class Problem:
     @property
     def root(self) -> Branch:
         """All choices, apart from those constraints that exclude no single candidate."""
-        return Branch.beside(self.required, self.free, self.count)
+        return Branch.containing(self.required, self.free, self.count)
 
     def bound(self) -> float:
         """Return a number below the score of every choice; minus infinity when none is known."""

@@ -357,7 +357,7 @@ def mark_devices(
     various = differ(kinds) if various is None else various
     extent = np.ptp(ax.dataLim.get_points(), axis=0).max() or 1.0
     names: dict[tuple[float, ...], list[str]] = {}
-    beside: set[tuple[float, ...]] = set()
+    arrows_up: set[tuple[float, ...]] = set()
     for kind, listed in kinds.items():
         if not listed:
             continue
@@ -371,7 +371,7 @@ def mark_devices(
             spot = tuple(np.round(point[:2] / extent, 2))
             names.setdefault(spot, []).append(text)
             if various and one.direction == "y":
-                beside.add(spot)
+                arrows_up.add(spot)
             if various and arrow:
                 turned = np.array(one.along)[:2] * _ARROW * extent
                 look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"]}
@@ -380,7 +380,7 @@ def mark_devices(
                 )
     for spot, texts in names.items():
         place: Any = {"xytext": (0, 9), "ha": "center", "va": "bottom"}
-        if spot in beside:  # above is the arrow
+        if spot in arrows_up:  # above is the arrow
             place = {"xytext": (9, 0), "ha": "left", "va": "center"}
         shown = ax.annotate(
             ", ".join(texts), (spot[0] * extent, spot[1] * extent), textcoords="offset points",

@@ -34,7 +34,7 @@ from .run_pictures import shade, time_axis
 
 #: hatching of the areas, which then differ without colour too
 _HATCHES = ("", "//", "", "\\\\", "", "..")
-_BESIDE: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+_RIGHT_OF_AXES: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
 
 
 def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes:
@@ -88,7 +88,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
         )  # fmt: skip
         base = base + rows
     ax.set(xscale="log", ylim=(0.0, None))
-    where = {"loc": "upper left"} if given else _BESIDE
+    where = {"loc": "upper left"} if given else _RIGHT_OF_AXES
     ax.legend(reverse=True, frameon=False, **where)  # the uppermost area comes first
     total = f"{found.channel}: {with_unit(found.rms, found.unit)} rms"
     squared = f"({unit})^2" if set(unit) & set(" /") else f"{unit}^2" if unit else ""

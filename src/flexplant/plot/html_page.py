@@ -112,8 +112,8 @@ def tiles(found: Iterable[tuple[str, str, str, str]]) -> str:
         + "".join(
             f'<div class="tile {kind}"><div class="what">{escape(what)}</div>'
             f'<div class="figure">{escape(figure)}</div>'
-            f'<div class="beside">{escape(beside)}</div></div>'
-            for what, figure, beside, kind in found
+            f'<div class="detail">{escape(detail)}</div></div>'
+            for what, figure, detail, kind in found
         )
         + "</div>"
     )

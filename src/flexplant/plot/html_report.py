@@ -358,14 +358,14 @@ def html_or_why(make: Callable[[], str]) -> str:
 def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
     if found is None:
         return (f"{channel}, rms", "none", "see below", "bad")
-    beside, kind = "truncated modes: not known", ""
+    detail, kind = "truncated modes: not known", ""
     if np.isinf(found.left_out):
-        beside, kind = "unstable with the truncated modes", "bad"
+        detail, kind = "unstable with the truncated modes", "bad"
     elif np.isfinite(found.left_out):
-        beside = f"with the truncated modes {with_unit(found.left_out, found.unit)}"
+        detail = f"with the truncated modes {with_unit(found.left_out, found.unit)}"
     if found.interval:
-        beside += f"; {found.interval}"
-    return (f"{channel}, rms", with_unit(found.rms, found.unit), beside, kind)
+        detail += f"; {found.interval}"
+    return (f"{channel}, rms", with_unit(found.rms, found.unit), detail, kind)
 
 
 def _stability(loop: ClosedLoop) -> list[Tile]:
@@ -378,9 +378,9 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     if left is None:
         return [*found, ("with the truncated modes", NOT_JUDGED, "assemble_plant(evaluation=)", "")]
     word, kind = "stable" if left.is_stable else "UNSTABLE", "good" if left.is_fine else "bad"
-    beside = left.named_modes if left.modes else one_line({stability_name(sampled): left.stability})
+    detail = left.named_modes if left.modes else one_line({stability_name(sampled): left.stability})
     what = f"with the truncated modes ({counted(left.states, 'state')})"
-    return [*found, (what, word, beside, kind)]
+    return [*found, (what, word, detail, kind)]
 
 
 def _margins(loop: ClosedLoop, row: LoopFigures) -> list[Tile]:

@@ -58,10 +58,10 @@ def _same_memory(a: IntArray, b: IntArray) -> bool:
 def with_pattern_of(given: Any, other: Matrix) -> Any:
     """Return a matrix that shares the index arrays of another where both store the same entries."""
     matrix: Any = given
-    beside: Any = other
+    shared: Any = other
     if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
         return given
-    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
+    return sp.csc_array((matrix.data, shared.indices, shared.indptr), shape=shared.shape)
 
 
 def without_zeros(matrix: Any) -> Any:

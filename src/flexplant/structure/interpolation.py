@@ -239,9 +239,9 @@ class _Field:
     def _check(self, points: FloatArray) -> None:
         offset = points - self.centre
         flat = offset @ self.axes.T
-        beside = np.linalg.norm(offset - flat @ self.axes, axis=1)
+        aside = np.linalg.norm(offset - flat @ self.axes, axis=1)
         outside = np.max(flat @ self._walls[:, :-1].T + self._walls[:, -1], axis=1)
-        miss = np.maximum(beside, outside)
+        miss = np.maximum(aside, outside)
         worst = int(np.argmax(miss))
         if miss[worst] > self.margin + SAME * self.extent:
             low, high = self.nodes.min(axis=0), self.nodes.max(axis=0)

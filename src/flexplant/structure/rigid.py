@@ -49,14 +49,14 @@ def unheld(
     if not motions.size:
         return mix
     size_of_K = Absolute(K)
-    mix = mix @ _beside_few_springs(K, size_of_K, motions, max(rounding, PRECISION * far))
+    mix = mix @ _without_few_springs(K, size_of_K, motions, max(rounding, PRECISION * far))
     if mix.shape[1]:
         # errors of coordinates have a second-order effect on the energy
-        mix = mix @ _beside_many_springs(K, size_of_K, motions @ mix, rounding)
+        mix = mix @ _without_many_springs(K, size_of_K, motions @ mix, rounding)
     return mix
 
 
-def _beside_few_springs(
+def _without_few_springs(
     K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float
 ) -> FloatArray:
     """Return the combinations (r, m) without outliers among the forces."""
@@ -76,7 +76,7 @@ def _beside_few_springs(
     return _in_their_order(null, np.all(part[rows] <= _OUTLIER * usual, axis=0))
 
 
-def _beside_many_springs(
+def _without_many_springs(
     K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float
 ) -> FloatArray:
     """Return the combinations (r, m) whose energy is within rounding."""

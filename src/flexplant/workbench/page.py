@@ -285,7 +285,7 @@ class Page:
             buttons.append(button)
         self.kept_row[:] = buttons
         for i, (_, design, answer) in enumerate(self.kept):
-            self.views.show_beside(f"kept {i}", self._of(self.machine, design))
+            self.views.show_other(f"kept {i}", self._of(self.machine, design))
             if answer is not None:
                 self.views.show_time(f"kept {i}", answer.time, answer.error)
 
@@ -388,7 +388,7 @@ class Page:
         """Draw the model with a measurement."""
         model = self.bench.model
         if model is not None and model is not self.machine and self.machine.is_measured:
-            self.views.show_beside("model", self._of(model, design))
+            self.views.show_other("model", self._of(model, design))
 
     def _draw_fleet(self) -> None:
         if len(self.fleet) < 2:
@@ -396,7 +396,7 @@ class Page:
         self.views.show_fleet(self.fleet)
         self.fleet_text, worst = of_fleet(self.fleet)
         shown = self.fleet[worst]
-        self.views.show_beside("worst", None if shown is self.loop else shown)
+        self.views.show_other("worst", None if shown is self.loop else shown)
 
     def _judge(self) -> None:
         """Show limits, fleet, and what the consequences say."""

@@ -320,7 +320,7 @@ class Views:
             self._drawn["nyquist main"].glyph.line_color = color
         self._put(f"nyquist {name}", x=near.real, y=near.imag)
 
-    def show_beside(self, name: str, loop: AxisLoop | None) -> None:
+    def show_other(self, name: str, loop: AxisLoop | None) -> None:
         """Show or hide the curves of another loop: kept 0, model, worst."""
         if loop is not None:
             self._curves(name, loop)

@@ -28,7 +28,7 @@ Pair: TypeAlias = tuple[StateSpace, StateSpace]
 #: the weights lie this far above the largest difference found
 _MARGIN = 1.05
 #: offsets from a resonance, in its half widths, at which the bound is checked as well
-_BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
+_OFFSETS = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -273,8 +273,8 @@ def _resonance_grid(poles: ComplexArray) -> FloatArray:
     """Return 0 and frequencies [Hz] from a hundredth of the first resonance, through all."""
     own = np.abs(poles) / (2 * np.pi)
     flat = np.geomspace(0.01 * own[0], 10 * own[-1], 500)
-    beside = (own[:, None] - _BESIDE * poles.real[:, None] / (2 * np.pi)).ravel()
-    grid = np.unique(np.concatenate([flat, beside]))
+    near = (own[:, None] - _OFFSETS * poles.real[:, None] / (2 * np.pi)).ravel()
+    grid = np.unique(np.concatenate([flat, near]))
     return np.concatenate([[0.0], grid[(grid >= flat[0]) & (grid <= flat[-1])]])
 
 
@@ -282,8 +282,8 @@ def _verifying(grid: FloatArray, poles: ComplexArray) -> FloatArray:
     """Return frequencies between those of a grid, and others near the resonances."""
     inner = [grid[:-1] + part * np.diff(grid) for part in (0.29, 0.5, 0.83)]
     own, half = np.abs(poles) / (2 * np.pi), -poles.real / (2 * np.pi)
-    beside = own[:, None] + np.array([-0.43, 0.11, 0.57]) * half[:, None]
-    return np.unique(np.concatenate([[0.0], beside.ravel(), *inner]))
+    near = own[:, None] + np.array([-0.43, 0.11, 0.57]) * half[:, None]
+    return np.unique(np.concatenate([[0.0], near.ravel(), *inner]))
 
 
 def _poles(g: StateSpace) -> ComplexArray:

@@ -30,7 +30,7 @@ _DEPTH, _WIDTH = (0.01, 1.0), (0.02, 1.0)
 #: loop gain at the last line, above which the plant is unknown, relative to the gain that keeps |S|
 _BEYOND = 0.1
 #: how far a notch below the bandwidth may lie from a mode, as a factor
-_BESIDE = 1.3
+_NEIGHBOUR = 1.3
 #: depth and width of a notch from which a better one is sought, gain in bandwidth that it has to
 #: bring; closest points, highest modes and multiples of the bandwidth where it is tried
 _SLIGHT, _WORTH, _TRIED, _ABOVE = (0.7, 0.3), 1.02, 2, (1.3, 1.8, 2.7)
@@ -164,8 +164,8 @@ class AxisLaw:
             centre = float(np.exp(numbers[i]))
             modes = self.axis.resonances
             near = modes[np.argmin(np.abs(np.log(modes / centre)))] if modes.size else np.inf
-            if abs(np.log(near / centre)) <= np.log(_BESIDE):
-                span = (near / _BESIDE, min(top, near * _BESIDE))
+            if abs(np.log(near / centre)) <= np.log(_NEIGHBOUR):
+                span = (near / _NEIGHBOUR, min(top, near * _NEIGHBOUR))
             else:
                 span = (self.lowest, top)
                 row = np.zeros((1, numbers.size))

@@ -264,12 +264,12 @@ class Variables:
         C = cp.hstack([C1 @ self.Y + D12 @ self.K_C, C1 + D12 @ self.K_D @ p.C2])
         return B, C, p.D11[np.ix_(rows, columns)] / unit + D12 @ self.K_D @ D21
 
-    def sampled(self, rows: list[list[Any]], beside: list[Any]) -> Any:
+    def sampled(self, rows: list[list[Any]], further: list[Any]) -> Any:
         """Return a block matrix, of a sampled system with the row [t^(1/2) A'; P; ...] second."""
         if not self.root:
             return symmetric_blocks(rows)
         (first, *others), rest = rows[0], rows[1:]
-        return symmetric_blocks([[first, self.root * self.A, *others], [self.P, *beside], *rest])
+        return symmetric_blocks([[first, self.root * self.A, *others], [self.P, *further], *rest])
 
     def positive(self) -> list[Any]:
         """Return ``[Y t; t X] > 0``, t above 1: away from the singular I - X Y."""

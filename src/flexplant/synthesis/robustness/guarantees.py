@@ -186,9 +186,9 @@ def robust_stability(
     values, machine, lower = _worst_machine(loop, worst)
     names = [name for name, _ in loop.channels.deltas]
     # for systems of many states, samples between the frequencies replace the Hamiltonians
-    beside = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
+    further = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
     if loop.dt:
-        beside["distance of channels"] = loop.channels.distance
+        further["distance of channels"] = loop.channels.distance
     return RobustStability(
         upper,
         min(lower, upper),
@@ -197,7 +197,7 @@ def robust_stability(
         machine,
         loop.freq(found.frequencies),
         np.sqrt(np.maximum(found.bounds, 0.0)),
-        *_tried_on(uncertain, loop.loop, names, upper, count, chance, beside),
+        *_tried_on(uncertain, loop.loop, names, upper, count, chance, further),
     )
 
 
@@ -260,9 +260,9 @@ def _quick(
     # the grid goes through the places of the modes at Deltas of a size, not beyond
     size = 1.0 / max(upper, 1.0 / _REACH)
     upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
-    none, beside = np.zeros(0), {"modes, each by one channel": float(len(channels))}
+    none, further = np.zeros(0), {"modes, each by one channel": float(len(channels))}
     names = [delta.name for delta in uncertain.deltas]
-    tried = _tried_on(uncertain, loop, names, upper, count, rng, beside)
+    tried = _tried_on(uncertain, loop, names, upper, count, rng, further)
     return RobustStability(upper, 0.0, float("nan"), {}, None, none, none, *tried)
 
 
@@ -273,7 +273,7 @@ def _tried_on(
     upper: float,
     count: int,
     rng: np.random.Generator,
-    beside: Mapping[str, float],
+    further: Mapping[str, float],
 ) -> tuple[Certificate, SpillOver | None]:
     """Return how stable machines at corners are, each closed exactly, and the truncated modes."""
     size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
@@ -291,7 +291,7 @@ def _tried_on(
         kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
         found[f"{kind} of {counted(count, 'machine')}"] = worst
     left_out = nominal.left_out
-    tried = Certificate.of(found | dict(beside), route="machines at corners, each closed exactly")
+    tried = Certificate.of(found | dict(further), route="machines at corners, each closed exactly")
     return tried if left_out is None else tried | left_out.certificate, left_out
 
 

@@ -42,7 +42,7 @@ INTERVALS = "intervals of frequency"
 #: intervals at most; larger systems are covered by sampling instead of Hamiltonians
 _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
-_BESIDE = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
+_OFFSETS = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
 _POINTS = 24  # evenly, and by the logarithm
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
@@ -405,8 +405,8 @@ class Cover:
     def _points(self, low: float, high: float, omega: float) -> FloatArray:
         """Return frequencies in an interval, at and around the resonances."""
         swing, width = self.poles.imag, np.abs(self.poles.real)
-        beside = np.concatenate([-_BESIDE[:0:-1], _BESIDE])
-        near = (swing[:, None] + width[:, None] * beside).ravel()
+        offsets = np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
+        near = (swing[:, None] + width[:, None] * offsets).ravel()
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
         end = min(high, max(top, 10 * low))
         base = np.linspace(low, end, _POINTS)

@@ -177,9 +177,9 @@ class _Model:
     """Gradients of pieces in the directions of |H|, H of the weights that the step finds."""
 
     def __init__(self, pieces: Pieces, value: float, weights: FloatArray | None) -> None:
-        self.pieces, self.beside = pieces, pieces.value - value
+        self.pieces, self.below = pieces, pieces.value - value
         if weights is None:  # of the largest alone
-            weights = (np.arange(self.beside.size) == np.argmax(self.beside)).astype(float)
+            weights = (np.arange(self.below.size) == np.argmax(self.below)).astype(float)
         self.weights = weights
 
     def step(self, mu: float) -> tuple[FloatArray, FloatArray, float]:
@@ -190,12 +190,12 @@ class _Model:
             values, vectors = la.eigh(sum(weights[i] * self.pieces.hessian(i) for i in active))
             self.size = float(np.abs(values).max())
             root = np.sqrt(np.abs(values) + mu)
-            weights, y = downhill(self.pieces.gradient @ vectors / root, self.beside)
+            weights, y = downhill(self.pieces.gradient @ vectors / root, self.below)
             step = vectors @ (y / root)
-        return step, weights, -float(np.max(self.beside + self.pieces.gradient @ step))
+        return step, weights, -float(np.max(self.below + self.pieces.gradient @ step))
 
 
-def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, FloatArray]:
+def downhill(gradients: FloatArray, below: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the weights and the minimum y of ``max_i (c_i + g_i' y) + |y|^2 / 2``."""
     # y = -G' w with w >= 0, sum(w) = 1: the point of a polyhedron next to the origin
     # [LawsonHanson1995]_
@@ -204,7 +204,7 @@ def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, Flo
     size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny ** 0.5)
     # small against the rest of the quadratic program, large against the rounding of its squares
     lift = NEGLIGIBLE
-    G, c = gradients / size, np.maximum(beside / size**2, -1.0 / lift)
+    G, c = gradients / size, np.maximum(below / size**2, -1.0 / lift)
     lifted = np.vstack([-lift * G.T, np.ones((1, c.size)), lift * c[None] + 1.0 / lift])
     right = np.zeros(lifted.shape[0])
     right[-1] = 1.0
@@ -216,19 +216,19 @@ def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, Flo
 def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
     """Return the least slope of convex combinations of the gradients, and the decrease left."""
     # -min_(|d| <= r) max_i (c_i + g_i' d), by bisection over the weight of |d|^2
-    beside = pieces.value - pieces.value.max()
-    top = pieces.gradient[np.argmax(beside)]
+    below = pieces.value - pieces.value.max()
+    top = pieces.gradient[np.argmax(below)]
     low, high = 0.0, np.log(1e3 * (1.0 + float(np.linalg.norm(top)) / radius))
     low, slope, gained = -high, 0.0, 0.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         root = np.exp(0.5 * middle)
-        weights, y = downhill(pieces.gradient / root, beside)
+        weights, y = downhill(pieces.gradient / root, below)
         step = y / root
         if float(np.linalg.norm(step)) > radius:
             low = middle
         else:
             high = middle
             slope = float(np.linalg.norm(weights @ pieces.gradient))
-            gained = max(gained, -float(np.max(beside + pieces.gradient @ step)))
+            gained = max(gained, -float(np.max(below + pieces.gradient @ step)))
     return slope, gained

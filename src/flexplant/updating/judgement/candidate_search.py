@@ -105,8 +105,8 @@ def localise(
     """
     listed = checked_parameters(candidates)
     none = isinstance(nuisance, list | tuple) and not nuisance
-    beside = () if none else checked_parameters(nuisance)
-    both = sorted({q.name for q in listed} & {q.name for q in beside})
+    extra = () if none else checked_parameters(nuisance)
+    both = sorted({q.name for q in listed} & {q.name for q in extra})
     if both:
         raise ModelError(
             f"{', '.join(both)}: both a candidate and a nuisance parameter. Leave it out of one "
@@ -115,12 +115,12 @@ def localise(
     given = checked_residuals(residuals)
     most, screen = counted(most, "most"), counted(screen, "screen")
     if isinstance(model, FEModel) and model.n_dof > LARGE:
-        model = FullBasis(model, [*listed, *beside], given).at(np.zeros(len(listed) + len(beside)))
-    whole = Objective(model, [*listed, *beside], given, prior=False)
+        model = FullBasis(model, [*listed, *extra], given).at(np.zeros(len(listed) + len(extra)))
+    whole = Objective(model, [*listed, *extra], given, prior=False)
     fits = Subsets(whole, given, len(listed))
-    if fits.rows <= len(beside):
+    if fits.rows <= len(extra):
         raise ModelError(
-            f"{fits.rows} data do not determine {counted(len(beside), 'nuisance parameter')} and "
+            f"{fits.rows} data do not determine {counted(len(extra), 'nuisance parameter')} and "
             "a candidate: measure more modes or lines."
         )
     values, score, criterion = _singles(fits, screen, progress)
@@ -144,7 +144,7 @@ def localise(
         chosen_values=np.array(p[: len(best)]),
         chosen_bic=fits.score(best),
         nothing_bic=fits.score(()),
-        nuisance=tuple(q.name for q in beside),
+        nuisance=tuple(q.name for q in extra),
         nuisance_values=np.array(p[len(best) :]),
         chi2=chi2,
         dof=dof,
@@ -333,11 +333,11 @@ class Localisation(Value):
             for name, value in zip(self.chosen[:4], self.chosen_values.tolist(), strict=False)
         )
         if self.nuisance:
-            beside = ", ".join(
+            together = ", ".join(
                 f"{name} = {value:.4g}"
                 for name, value in zip(self.nuisance, self.nuisance_values.tolist(), strict=True)
             )
-            found = f"{found or 'no change'} with {beside}"
+            found = f"{found or 'no change'} with {together}"
         text = (
             f"<Localisation: {found or 'no change'} (BIC {self.chosen_bic:.4g}, no change "
             f"{self.nothing_bic:.4g})\n  explained alone: {best}"

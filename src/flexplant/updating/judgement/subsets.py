@@ -58,13 +58,13 @@ class Subsets:
 
     def __init__(self, whole: Objective, residuals: Any, count: int) -> None:
         self.whole, self.residuals, self.count = whole, residuals, count
-        self.beside = list(range(count, len(whole.parameters)))
+        self.nuisance = list(range(count, len(whole.parameters)))
         self.start = whole.default_start
         self.done: dict[Subset, SubsetFit | None] = {}
         #: value of each candidate alone, to first order
         self.linear: FloatArray | None = None
         #: the points each fit went through, and the model where it ended
-        self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
+        self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.nuisance]]}
         #: values near those of a set's fit, where they are known from elsewhere
         self.guesses: dict[Subset, FloatArray] = {}
         self.ends: dict[Subset, Point] = {}
@@ -78,10 +78,10 @@ class Subsets:
         #: the least criterion of all fits
         self.least = np.inf
         self.error_without = float(np.sum(whole.values(point) ** 2))
-        if self.beside:
+        if self.nuisance:
             self.done[()] = self._fitted(())
             self.start = self.start.copy()
-            self.start[self.beside] = self.ways[()][-1]
+            self.start[self.nuisance] = self.ways[()][-1]
         else:
             self.done[()], self.ends[()] = self._left(whole, self.start[:0], point, ()), point
 
@@ -97,9 +97,9 @@ class Subsets:
 
     def polish(self, subset: Subset) -> None:
         """Fit a subset to full accuracy, from the end of its previous fit."""
-        if self.fit(subset) is None or not (subset or self.beside):
+        if self.fit(subset) is None or not (subset or self.nuisance):
             return
-        objective = self._objective([*subset, *self.beside])
+        objective = self._objective([*subset, *self.nuisance])
         # fits in few coordinates may pass through impossible values
         way = self.ways[subset][:-1]
         objective.path = [p for p in way if is_physical(objective.family, p)]
@@ -112,7 +112,7 @@ class Subsets:
 
     def worst(self, subset: Subset) -> str:
         """Return the residuals that the fit of a subset explains least, in words."""
-        picked = [*subset, *self.beside]
+        picked = [*subset, *self.nuisance]
         objective = self._objective(picked)
         return worst(objective, self._end_of(objective, range(len(picked)), subset))
 
@@ -131,14 +131,14 @@ class Subsets:
         free = np.full(point.p.size, bool(values.size))
         chi2 = noise_misfit(objective, point, free) if objective.noise_known else None
         misfit = error if chi2 is None else chi2
-        score = bic(misfit, self.rows, k + len(self.beside), chi2 is not None)
+        score = bic(misfit, self.rows, k + len(self.nuisance), chi2 is not None)
         return SubsetFit(values, error, chi2, score + 2 * log(comb(self.count, k)))
 
     def chi2(self, subset: Subset) -> tuple[float | None, int]:
         """Return the chi-square of a subset (None if the noise is not known) and its freedom."""
         found = self.fit(subset)
         lost = sum(bound.lost for bound in self.whole.bounds)
-        dof = self.rows - lost - len(subset) - len(self.beside)
+        dof = self.rows - lost - len(subset) - len(self.nuisance)
         return (None if found is None else found.chi2), dof
 
     def runner_up(self, best: Subset) -> tuple[Subset, float]:
@@ -156,7 +156,7 @@ class Subsets:
         """Return the subset of up to `most` candidates with the least extended BIC."""
         best: Subset = ()
         layer: list[Subset] = [(i,) for i in singles]
-        for size in range(1, min(most, self.rows - 1 - len(self.beside)) + 1):
+        for size in range(1, min(most, self.rows - 1 - len(self.nuisance)) + 1):
             ranked = sorted(layer, key=self.score)[:BEAM]
             if not ranked or not np.isfinite(self.score(ranked[0])):
                 break
@@ -183,7 +183,7 @@ class Subsets:
         # `(J_c^T r)^2 / (J_c^T J_c)` with r and J_c free of them
         if self.fit(subset) is None:
             return np.zeros(self.count)
-        fixed = [*subset, *self.beside]
+        fixed = [*subset, *self.nuisance]
         try:
             point = self._end_of(self.whole, fixed, subset)
             r = self.whole.values(point)
@@ -200,7 +200,7 @@ class Subsets:
     def _alone(self, candidate: int, subset: Subset, r: FloatArray) -> float:
         if candidate in subset:
             return 0.0
-        fixed = [*subset, *self.beside]
+        fixed = [*subset, *self.nuisance]
         alone = self._objective([candidate, *fixed])
         J = alone.slopes(self._end_of(alone, range(1, len(fixed) + 1), subset))
         return float(_explained(J[:, :1], J[:, 1:], r)[0])
@@ -246,11 +246,11 @@ class Subsets:
 
     def _pairs(self) -> list[Subset]:
         """Return the pairs that explain most together, to first order."""
-        point = self._end_of(self.whole, self.beside, ())
+        point = self._end_of(self.whole, self.nuisance, ())
         if point.turned:
             return []
         J, r = self.whole.slopes(point), self.whole.values(point)
-        J, r = _beside(J[:, : self.count], J[:, self.beside], r)
+        J, r = _without(J[:, : self.count], J[:, self.nuisance], r)
         length = np.linalg.norm(J, axis=0)
         J = J / np.where(length > NULL * length.max(initial=0.0), length, np.inf)
         a, overlap = J.T @ r, J.T @ J
@@ -288,7 +288,7 @@ class Subsets:
         return coordinates(self.whole.family, np.hstack(found), self.top)
 
     def _fitted(self, subset: Subset) -> SubsetFit:
-        picked = [*subset, *self.beside]
+        picked = [*subset, *self.nuisance]
         exact = self._objective(picked)
         B = self._coordinates(picked)
         if B is not None:
@@ -312,7 +312,7 @@ class Subsets:
 
     def _searched(self, objective: Objective, subset: Subset) -> tuple[SearchEnd, list[FloatArray]]:
         """Return the end of the search for a subset's values, and the points on the way there."""
-        picked = [*subset, *self.beside]
+        picked = [*subset, *self.nuisance]
         first, guess = self.start[picked], self._guess(subset)
         method = TrustRegion()
         if guess is not None:
@@ -356,33 +356,33 @@ class Subsets:
             best = min(parts, key=self._error)
             fit = self.done[best]
             assert fit is not None  # noqa: S101 - just selected
-            own = dict(zip([*best, *self.beside], fit.p.tolist(), strict=True))
-            return np.array([own.get(k, 0.0) for k in [*subset, *self.beside]])
+            own = dict(zip([*best, *self.nuisance], fit.p.tolist(), strict=True))
+            return np.array([own.get(k, 0.0) for k in [*subset, *self.nuisance]])
         if len(subset) != 1 or self.linear is None:
             return None
-        return np.array([self.linear[subset[0]], *self.start[self.beside]])
+        return np.array([self.linear[subset[0]], *self.start[self.nuisance]])
 
     def _error(self, subset: Subset) -> float:
         found = self.done.get(subset)
         return np.inf if found is None else found.error
 
 
-def _beside(J: FloatArray, beside: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return J and r without their projection on the columns `beside`."""
-    Q = np.linalg.qr(beside)[0]
+def _without(J: FloatArray, nuisance: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return J and r without their projection on the columns `nuisance`."""
+    Q = np.linalg.qr(nuisance)[0]
     return J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
 
 
-def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+def _alone(J: FloatArray, nuisance: FloatArray, r: FloatArray) -> FloatArray:
     """Return the first-order value of each single parameter in addition to others."""
-    J, r = _beside(J, beside, r)
+    J, r = _without(J, nuisance, r)
     length = np.sum(J**2, axis=0)
     return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
 
 
-def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+def _explained(J: FloatArray, nuisance: FloatArray, r: FloatArray) -> FloatArray:
     whole = np.sum(J**2, axis=0)
-    J, r = _beside(J, beside, r)
+    J, r = _without(J, nuisance, r)
     length = np.sum(J**2, axis=0)
     # a candidate that depends on nuisance parameters explains nothing
     own = length > NULL * whole

@@ -53,8 +53,8 @@ def _twins(fits: Subsets, member: int, value: float) -> list[int]:
     others = [i for i in range(fits.count) if fits.whole.parameters[i].unit == unit and i != member]
 
     def left(candidate: int, size: float) -> FloatArray | None:
-        nuisance = fits.start[fits.beside]
-        return _values(fits.few([candidate, *fits.beside]), np.array([size, *nuisance]))
+        nuisance = fits.start[fits.nuisance]
+        return _values(fits.few([candidate, *fits.nuisance]), np.array([size, *nuisance]))
 
     own, nothing = left(member, value), left(member, 0.0)
     if own is None or nothing is None:
@@ -75,7 +75,7 @@ def _values(objective: Objective, p: FloatArray) -> FloatArray | None:
 
 def _predicted(fits: Subsets, subset: Subset, p: FloatArray) -> float:
     """Return the sum of squares that a fit of a set leaves, to first order from some values."""
-    objective = fits.few([*subset, *fits.beside])
+    objective = fits.few([*subset, *fits.nuisance])
     r = _values(objective, p)
     if r is None:
         return np.inf
