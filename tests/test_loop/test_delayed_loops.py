@@ -121,7 +121,7 @@ def test_bad_input_is_refused():
         Delayed(lag, -1.0)
     with pytest.raises(ModelError, match="differentiates twice"):
         Delayed.tf([1.0, 0.0, 0.0], [1.0])
-    with pytest.raises(ModelError, match="is no state space"):
+    with pytest.raises(ModelError, match="has no state space"):
         Delayed.tf([1.0, 0.0], [1.0], delay=1.0).pade(2)
     with pytest.raises(ModelError, match="which must"):
         DelayedLoop(Delayed(lag, 1.0), -lag).response("X", 1.0)

@@ -389,7 +389,7 @@ class PoiEstimator(Value):
         Parameters
         ----------
         other : KalmanEstimator or StaticEstimator
-            Of the same POIs, on a plant of the same machines.
+            Estimator of the same POIs, on a plant of the same machines.
         channel : str
             A POI's motion under any of its names, as for `rms`.
         level : float
@@ -404,8 +404,8 @@ class PoiEstimator(Value):
         Raises
         ------
         LabelError, ModelError
-            When it is no motion of a POI, the level is out of range, or the other estimator's plant
-            has another number of machines.
+            When it is not a motion of a POI, the level is out of range, or the other estimator's
+            plant has another number of machines.
         """
         own, others = (row_of(poi_channels(one.plant), channel) for one in (self, other))
 

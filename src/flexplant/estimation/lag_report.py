@@ -83,10 +83,7 @@ class LagReport(Value):
         return np.asarray(self.rms[list(self.names).index(row)])
 
     def recovered(self, row: str, channel: str) -> float:
-        """Return which part of the variance that smoothing can take away a row ("1 ms") takes away.
-
-        Of a POI's motion.
-        """
+        """Return the fraction of smoothing's decrease of a variance that a row ("1 ms") reaches."""
         i = row_of(self.channels, channel)
         filtered, smooth = self[FILTER][i] ** 2, self[SMOOTHER][i] ** 2
         return float((filtered - self[row][i] ** 2) / (filtered - smooth))

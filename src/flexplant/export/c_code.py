@@ -63,8 +63,9 @@ def write_c(
     limits : float, (low, high) or mapping {actuator: one of these}, optional
         Limits of the actuators in the units of u, to which commands are limited.
     anti_windup : float [s], optional
-        Recovery time of a ClosedLoop as for `simulate`. For a single controller that does not read
-        the applied commands, `recovery` of `anti_windup_form`; limits without it need Hanus' form.
+        Recovery time of a ClosedLoop, as for `simulate`. For a single controller that does not read
+        the applied commands it is the `recovery` of `anti_windup_form`; where it is not given,
+        limits need a controller of which Hanus' form exists.
     schedule : str, optional
         Input whose value is the place, for a mapping.
     single : bool

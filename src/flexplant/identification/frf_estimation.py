@@ -125,14 +125,15 @@ def estimate_frf(
     biased towards ``-1/K``. References r that are not correlated with the noise give the process
     sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the plant is their
     quotient (the three-point method): r is an excitation added to the commands, or set-points, one
-    for each input. Periodic signals reduce the noise first; they need as many experiments as
-    inputs, with and without r. The inputs are the signals that act on the machine: the commands
-    plus the added excitation.
+    for each input. Periodic signals need as many experiments as inputs, with and without r;
+    averaging over their periods reduces the noise before the division. The inputs are the signals
+    that act on the machine: the commands plus the added excitation.
 
     Parameters
     ----------
     inputs : (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping
-        Signals that act on the machine; a mapping {name: (n_time,) or (n_exp, n_time)} names them.
+        Signals that act on the machine; the keys of a mapping {name: (n_time,) or (n_exp, n_time)
+        array} are their names.
     outputs : (n_out, n_time) or (n_exp, n_out, n_time) array, or mapping
         Measured signals, in the same form.
     rate : float [Hz]
@@ -214,11 +215,11 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
     .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
 
-    The noise of an output does not depend on the excited input, so that variances have product
-    form: the few repetitions are averaged to
-    ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``. The correlation of the errors of two
-    outputs is pooled over the inputs. The degrees of freedom of the variance (`freedom`) follow
-    from R, the inputs and the number of outputs with independent errors.
+    The noise of an output does not depend on which input is excited, so that the variance is a
+    factor of the output times a factor of the input. The spread of a few repetitions is therefore
+    averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``. The correlation of the
+    errors of two outputs is pooled over the inputs. The degrees of freedom of the variance
+    (`freedom`) follow from R, the inputs and the number of outputs with independent errors.
 
     Use another `rng` of `multisine` for each run. With the same signal, quantisation without dither
     is equal in every run and not part of the spread, and the variance is 28 to 300 times too small.

@@ -247,8 +247,8 @@ class Task:
         rows = RUNS if self.side == RUNS and ready.side == "outputs" else ready.side
         upper = self.upper
         if upper is None:
-            # modes folded by a hold are too weak for poles of their own and too strong for few
-            # terms: outputs would seem to disagree
+            # modes folded by a hold are too weak for separate poles and too strong for few terms:
+            # outputs would seem to disagree
             most = afforded_terms(ready.freq.size, self.lower)
             upper = UPPER[-1] if self.hold is None else max(UPPER[-1], *most, 0)
         return Lines(

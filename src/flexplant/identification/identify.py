@@ -143,10 +143,10 @@ def identify_modes(
     frf : Frf, or list of Frf
         Measured FRF, or several runs with the same channels between which the machine may have
         drifted (a mean of the runs would have broader resonances). Poles are then means over the
-        runs, with deviations from their differences. With a variance, errors are weighted by it and
-        the covariance follows from it (and from the correlation between outputs, and between lines
-        by the window, where known); without a variance, both come from the residual of the fit,
-        averaged over 41 lines.
+        runs, with deviations from their differences. Where the FRF has a variance, it weights the
+        errors and gives the covariance of the poles, together with the correlation between outputs
+        and between neighbouring lines (from the window) where these are known. Without a variance,
+        both follow from the residual of the fit, averaged over 41 lines.
     band : (low, high) [Hz], optional
         Frequency band of the fit and of the reported modes; all lines by default.
     orders : iterable of int, optional
@@ -157,14 +157,14 @@ def identify_modes(
         Number of residual terms of rigid-body modes and modes below the band.
     upper : int, optional
         Number of residual terms of modes above the band. None: 3, and up to 25 where the data
-        require them. With too few terms, the poles are biased by a standard deviation before the
-        misfit shows it.
+        require more. Too few terms bias the poles, by up to a standard deviation before the misfit
+        shows it.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
         sampled plant. Modes above half the rate then appear folded, as broad modes with several per
         cent of damping, unless a filter removes them.
     delay : float [samples]
-        Delay of the response in samples of the hold, also a fraction of a sample, as for
+        Delay of the response in periods of the hold, fractions included, as for
         `StandardPlant.discretized`.
     dofs : mapping {channel: DOF label}, optional
         DOFs of outputs and inputs. They label the shapes, which are mass-normalised where an input
@@ -173,10 +173,10 @@ def identify_modes(
         Groups of outputs (or inputs) that were measured together, when a sensor (or a hammer) was
         moved: poles may differ between groups. None: every channel is a separate group.
     refine : bool, optional
-        Whether to fit by maximum likelihood. None: where it is cheap (values of the FRF times
-        (poles times references) squared up to 5e7 at each step, 5e10 in total) and useful; it is
-        not useful where separate poles of the outputs explain the data and shared ones do not.
-        False takes about a second.
+        Whether to refine the poles by maximum likelihood. None: yes where this is useful and takes
+        at most one or two minutes (number of values of the FRF times the square of poles times
+        references below 5e7 for each step, 5e10 in total). It is not useful where each output has
+        its own poles. False gives the first result, in about a second.
     most : int
         Largest number of poles of the fit, the strongest ones; others of the diagram are in
         `rejected`.
@@ -195,10 +195,10 @@ def identify_modes(
     Warns
     -----
     FlexplantWarning
-        When the residual of a group of lines is more than noise (a missed or merged mode); when a
-        resonance is narrower than half a line of Hann-windowed segments, or than about four lines
-        where the fit does not include the window; when the FRF uses the convention exp(-i omega t),
-        so that its conjugate is used.
+        When the residual of a group of lines exceeds the noise, because a mode was missed or two
+        were merged. When a resonance is narrower than half the distance of the lines (Hann-windowed
+        segments), or than about four lines where the fit does not include the window. When the FRF
+        uses the convention exp(-i omega t), so that its conjugate is used.
 
     Raises
     ------

@@ -67,9 +67,10 @@ class ImpactTest(Value):
     Parameters
     ----------
     frf : Frf
-        ``H(s + 1/decay)`` at ``s = i omega``: every pole has moved by ``-1/decay``. The window
-        correlates the errors of neighbouring lines, which fits do not model. The variance is
-        therefore enlarged by `dependence`, so that a mean over lines has the correct variance.
+        FRF ``H(s + 1/decay)`` at ``s = i omega``, in which every pole has moved by ``-1/decay``.
+        The window correlates the errors of neighbouring lines, which fits do not model. The
+        variance is therefore enlarged by `dependence`, so that a mean over lines has the correct
+        variance.
     used, refused : sequences of Blow
         Averaged blows, and refused blows with the reason.
     segment : float [s]
@@ -114,16 +115,16 @@ class ImpactTest(Value):
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
         r"""Return modes identified from `frf` without the window's damping.
 
-        Poles whose damping beyond the window is within its deviation are moved to `rejected`. Force
-        and responses times ``exp(-t/tau)`` belong to ``H(s + 1/tau)``: poles move by exactly
-        -1/tau, and residues do not change. For white noise, a fit of ``g = t exp(-(a + 1/tau) t)``,
-        the derivative of a pole, has the variance
+        Poles whose remaining damping is smaller than its standard deviation are moved to
+        `rejected`. Force and responses times ``exp(-t/tau)`` belong to ``H(s + 1/tau)``: poles move
+        by exactly -1/tau, and residues do not change. For white noise, a fit of ``g = t exp(-(a +
+        1/tau) t)``, the derivative of a pole, has the variance
 
         .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
             \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
 
-        relative to that of independent lines, without the enlarged variance of `frf`; for residues
-        the same without the cube.
+        relative to that of independent lines with the variance before the enlargement in `frf`. For
+        residues the exponent is 1 in place of 3.
 
         Parameters
         ----------
@@ -133,8 +134,8 @@ class ImpactTest(Value):
         Raises
         ------
         ModelError, SolverError
-            When the damping of the window was removed before, or no pole has damping beyond it and
-            its deviation.
+            When the damping of the window was removed before, or no pole has more damping than the
+            window and its own standard deviation.
         """
         instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):

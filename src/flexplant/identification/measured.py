@@ -43,7 +43,7 @@ class MeasuredModes(Value):
         Variance E|d lambda|^2 of each pole, its real and imaginary parts equally uncertain and
         independent, or the covariance matrix of [Re lambda; Im lambda]; stored as the latter.
     shapes : (n, m) complex array, optional
-        Mode shapes at n measured DOFs; conjugated where the pole is.
+        Mode shapes at n measured DOFs; the shape of a conjugated pole is conjugated too.
     dofs : sequence of n str, optional
         Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
     xyz : (n, 3) array [m], optional
@@ -332,12 +332,12 @@ def numbered(
 
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
-    over the measured DOFs. The residues of a pair differ by at most a factor of 30 where the model
-    has the places of the inputs: a mode that the sensors do not see has a shape of rounding there,
-    and a folded mode may have its frequency. For repeated modes of the model (within 0.5 %) the MAC
-    is that with the closest shape of their span, which does not distinguish them: they are numbered
-    by frequency. Where fewer poles than modes of one frequency are measured, they get the lowest
-    numbers.
+    over the measured DOFs. Where the model has the places of the inputs, the residues of a pair may
+    differ by a factor of at most 30. This excludes modes of the model that the sensors do not see,
+    whose shapes there are rounding, and folded modes that happen to have the right frequency. Modes
+    of the model within 0.5 % of each other count as repeated. Their MAC is that of the closest
+    combination of their shapes; it does not distinguish them, and they are numbered by frequency.
+    Where fewer poles than modes of one frequency are measured, they get the lowest numbers.
 
     Parameters
     ----------

@@ -56,11 +56,11 @@ def identify_output_only(
     lowest order that has most of them, since more states add noise. White noise of the sensors is
     in
     :math:`R_0` only, which is not used. H without each of some blocks of the record (a jackknife)
-    gives the covariance of each pole, made larger by (b - 1)/(b - 3) of b blocks: squares of errors
-    over deviations, of Student's distribution, are then 1 in the mean. Poles whose frequency varies
-    by more than 2 % or whose damping varies by more than 60 % count as noise and are left out. A
-    rotating part or mains hum appears as a mode with almost no damping, and excitation that is not
-    white as additional modes.
+    gives the covariance of each pole. With b blocks it is multiplied by (b - 1)/(b - 3), so that
+    squared errors relative to the variance (Student's distribution) have a mean of 1. Poles whose
+    frequency varies by more than 2 % or whose damping varies by more than 60 % count as noise and
+    are left out. A rotating part or mains hum appears as a mode with almost no damping, and
+    excitation that is not white as additional modes.
 
     Parameters
     ----------

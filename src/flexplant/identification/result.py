@@ -280,7 +280,7 @@ class IdentifiedModes(MeasuredModes):
     delay : float [samples]
         Delay of the measurement, in samples of the hold.
     segment : float [s], optional
-        Length of the Hann-windowed segments through which the poles were fitted.
+        Length of the Hann-windowed segments of the measurement, whose effect the fit includes.
     unreported : complex array
         Poles just outside the band that improve the fit, with their shapes and participation.
     mass_normalised : bool
@@ -297,15 +297,15 @@ class IdentifiedModes(MeasuredModes):
     rejected : sequence of (frequency [Hz], damping ratio, reason)
         Poles and mains lines that are not reported.
     first_answer : str
-        Reason why the poles are those of the first result; empty for the complete maximum
-        likelihood fit (`refined`).
+        Reason why the poles were not refined by maximum likelihood; empty where they were
+        (`refined`).
     inconsistency : float, optional
         Relative deviation of the frequencies between outputs (or inputs), where they disagree:
         poles are then means over these, and their covariance follows from the differences.
     inconsistent : str
         Kind of the channels that disagree, "outputs", "inputs" or "runs"; empty if they agree.
     undamped : float [rad/s]
-        Damping of an exponential window that was subtracted.
+        Damping of an exponential window, already subtracted from the poles.
     """
 
     participation: ComplexArray = field(kw_only=True)

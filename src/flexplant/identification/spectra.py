@@ -60,7 +60,7 @@ class H2Estimator(SpectralMethod):
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`, as are errors and source.
+        As for `H1Estimator`, with the same errors raised and the same source.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class HvEstimator(SpectralMethod):
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`, as are errors and source.
+        As for `H1Estimator`, with the same errors raised and the same source.
 
     Examples
     --------

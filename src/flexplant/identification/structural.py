@@ -65,12 +65,12 @@ def structural_modes(
     Returns
     -------
     Modes
-        Modes with rigid-body modes first. `certificate` contains the size of the neglected
-        imaginary parts ("imaginary") and, with `over`, the relative error of the expansion of
-        measured shapes in modes of the model ("expansion"); above 0.1 a warning is given.
-        ``plant.uncertain(numbered(measured, modes))`` passes the covariance of the poles to the
-        plant, with ``Shapes(shape_deviations(measured, dofs), measured.modes)`` also that of
-        shapes.
+        Modes of the structure, rigid-body modes first. `certificate` contains the size of the
+        neglected imaginary parts ("imaginary") and, with `over`, the relative error of the
+        expansion of measured shapes in modes of the model ("expansion"); above 0.1 a warning is
+        given. ``plant.uncertain(numbered(measured, modes))`` passes the covariance of the poles to
+        the plant. ``Shapes(shape_deviations(measured, dofs), measured.modes)`` as a further
+        argument passes that of the shapes.
 
     Raises
     ------
@@ -320,9 +320,9 @@ def shape_deviations(
 ) -> FloatArray:
     r"""Return the principal standard deviations of shapes from `structural_modes`.
 
-    The error n of a mode's shape and participation gives its place shape (the mean of both where
-    a place was driven and measured, expanded over a model's modes where they are given) the error
-    :math:`A n`, and its real part, of circular noise, the covariance
+    The error n of a mode's identified shape and participation gives its shape at the places the
+    error :math:`A n`. A takes the mean where a place was both driven and measured, and expands over
+    a model's modes where they are given. For circular noise the real part has the covariance
     :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are kept and
     scaled so that the sum of all variances is preserved.
 
@@ -331,8 +331,8 @@ def shape_deviations(
     measured, dofs, over
         As for `structural_modes`.
     count : int
-        Number of directions of each mode; independent sensor noise needs as many as places to be
-        represented exactly.
+        Number of directions kept for each mode; independent sensor noise needs one for each place
+        to be represented exactly.
 
     Returns
     -------

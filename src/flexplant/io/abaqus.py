@@ -46,10 +46,10 @@ def read_abaqus(
 ) -> FEMatrices:
     r"""Return the matrices that Abaqus wrote with `*MATRIX OUTPUT`.
 
-    FORMAT=MATRIX INPUT (the default) and FORMAT=LABELS (lines `node, dof, node, dof, value`, one
-    triangle or both) or FORMAT=COORDINATE (lines `row column value`, counted from 1). Degrees of
-    freedom held by a boundary condition, which Abaqus marks with 1e36 on the diagonal of K, are
-    dropped.
+    Three formats are read: FORMAT=MATRIX INPUT (the default), FORMAT=LABELS (lines `node, dof,
+    node, dof, value`, one triangle or both) and FORMAT=COORDINATE (lines `row column value`,
+    counted from 1). Degrees of freedom held by a boundary condition, which Abaqus marks with 1e36
+    on the diagonal of K, are dropped.
 
     Parameters
     ----------
@@ -58,12 +58,13 @@ def read_abaqus(
     inp : str or Path, optional
         The input file, for the coordinates in its `*NODE` blocks.
     dofs : DofSet, optional
-        The rows, for FORMAT=COORDINATE, which does not name them.
+        DOFs of the rows, for FORMAT=COORDINATE, which does not name them.
 
     Returns
     -------
     FEMatrices
-        Without `inp` not `located`; with the printed `digits`.
+        Matrices with the printed number of `digits`. They are not `located` where `inp` is not
+        given.
 
     Raises
     ------

@@ -36,10 +36,10 @@ def read_ansys(
     are dropped and named in `constrained`. It does not hold coordinates, nor which nodes have a
     local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
 
-    Refused are lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are not a displacement or
-    rotation, and a file without M. A damping matrix in the file is not read, as `notes` state: give
-    damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about the
-    new x, then about the new y.
+    A lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are not a displacement or rotation,
+    and a file without M are refused. A damping matrix in the file is not read, as `notes` state:
+    give damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about
+    the new x, then about the new y.
 
     Parameters
     ----------
@@ -47,7 +47,8 @@ def read_ansys(
         The .full file. Needs ansys-mapdl-reader: ``pip install 'flexplant[ansys]'``.
     nodes : path, or mapping {node: (x, y, z)}, optional
         A .rst or .cdb file, whose local coordinate systems are turned to global directions; or a
-        text table `node, x, y, z`. Without it the result is not `located`, enough for held models.
+        text table `node, x, y, z`. Without it the result is not `located`, which is sufficient for
+        held structures.
     rotations : mapping {node: (3, 3) array}, optional
         Direction cosines of local coordinate systems, where `nodes` does not give them: row i
         holds the global components of local axis i.
@@ -55,7 +56,7 @@ def read_ansys(
     Returns
     -------
     FEMatrices
-        In the units of the model: `.converted("mm", "t")` turns them to SI.
+        Matrices in the units of the model; `.converted("mm", "t")` turns them to SI.
 
     Raises
     ------

@@ -162,10 +162,10 @@ def read_modes(
 ) -> Modes:
     r"""Return the modes that a finite-element program computed, from any known file format.
 
-    It serves models that are too large to be solved here: shapes at all nodes become Modes, which
-    become a plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH);
-    ANSYS .rst; Exodus .exo, .e (frequencies in Hz in the place of time); universal files .uff, .unv
-    of normal modes.
+    Use it for models that are too large to be solved here: the shapes at all nodes become `Modes`,
+    from which plants and reduced models are made. The suffix determines the format: Nastran .op2,
+    and .pch of DISPLACEMENT(PUNCH); ANSYS .rst; Exodus .exo, .e (frequencies in Hz in the place of
+    time); universal files .uff, .unv of normal modes.
 
     Residual attachment vectors are not in such files, and cannot be made without M and K: the
     static motion of truncated modes is missing, as `notes` state. Nastran and ANSYS can write

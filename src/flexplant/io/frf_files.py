@@ -28,11 +28,11 @@ _UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
 def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None = None) -> None:
     """Write frequency response functions as a CSV file.
 
-    A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N], y1 <- u1 imag
-    [m/N], ...` (and `... coherence`, `... variance` where known), then one line a frequency, with
-    all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and `# overlap: 0.5`
-    follow the first. The correlation between outputs and a window with parameters are not written:
-    `.save` keeps them.
+    The file has a line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
+    y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where known), and then one line
+    for each frequency, with all digits. Where known, lines `# resolution: 0.5` [Hz], `# window:
+    hann` and `# overlap: 0.5` follow the first. The correlation between outputs and a window with
+    parameters are not written: `.save` keeps them.
 
     Parameters
     ----------
@@ -40,8 +40,9 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
         The file, written atomically.
     frf : Frf
     units : mapping {channel: unit}, optional
-        Such as {"y1": "rad", "u1": "N m"}. Where not given, those of the Frf; else N for inputs,
-        and m, m/s or m/s^2 for outputs by the quantity of the Frf; none when that is not known.
+        Units of channels, such as {"y1": "rad", "u1": "N m"}. By default those of the Frf are
+        written; where it has no units, N for inputs and, by the quantity of the Frf, m, m/s or
+        m/s^2 for outputs.
 
     Raises
     ------

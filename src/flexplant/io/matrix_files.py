@@ -55,8 +55,8 @@ def read_matrix_market(
 ) -> FEMatrices:
     """Return the matrices of Matrix Market files.
 
-    A triangle is completed, rows of held DOFs are dropped, printed digits are counted, and `notes`
-    state it. Numbering in the file is from 1.
+    A triangle is completed, rows of held DOFs are dropped and printed digits are counted; `notes`
+    say what was done. Rows and columns are counted from 1 in the file.
 
     Parameters
     ----------
@@ -255,8 +255,8 @@ def read_harwell_boeing(
 ) -> FEMatrices:
     """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
 
-    Assembled real or integer matrices, symmetric (RSA, of which the file holds the lower triangle)
-    or not (RUA).
+    The matrices are assembled and real (or integer): symmetric (RSA, of which the file holds the
+    lower triangle) or not (RUA).
 
     Parameters
     ----------

@@ -128,8 +128,8 @@ def read_model(
 ) -> FEModel:
     """Return the model of a file in any known format.
 
-    As `read_matrices(...).converted(*units).model(massless=...)`: an error gives the first reason
-    why a model is refused, and `check(read_matrices(...))` reports all problems.
+    This is `read_matrices(...).converted(*units).model(massless=...)`. An error gives the first
+    reason why a model is refused; `check(read_matrices(...))` reports all problems.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def read_model(
     massless : "refuse" or "condense"
         Treatment of DOFs and motions without mass; condensing them is exact.
     free : bool
-        Whether to free the rigid-body motions that are held only by lost digits of a text.
+        Whether to free rigid-body motions that are held only because the text has too few digits.
     name : str, optional
         Name for display; by default that of the file.
     scalar_direction, rotations : optional

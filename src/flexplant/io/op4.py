@@ -413,16 +413,17 @@ def read_op4(
     path : str or Path
         An .op4 file, binary (32 or 64 bit integers, either byte order) or text.
     stiffness, mass, damping : str, optional
-        Names of the matrices; when not given, the one of the usual names (KAA, KAAX, KGG, KXX,
-        KFF, KLL; MAA, ...; BAA, ...) that is there. `damping=None`: none. A null matrix of 1 x 1
-        stands for one that is not there (EXTSEOUT writes it).
+        Names of the matrices. By default the usual names (KAA, KAAX, KGG, KXX, KFF, KLL; MAA, ...;
+        BAA, ...) are searched, one of which must exist. `damping=None`: no damping is read. A zero
+        matrix of 1 x 1, as EXTSEOUT writes it, counts as missing.
     dofs : DofSet, optional
-        The rows of the matrices.
+        DOFs of the rows of the matrices.
 
     Returns
     -------
     FEMatrices
-        With the `digits` of K as printed in a text file, 7 in single precision (type 1).
+        Matrices with the number of `digits` of K as printed in a text file, or 7 in single
+        precision (type 1).
 
     Raises
     ------

@@ -56,17 +56,17 @@ def read_dmig(
         The bulk data, for the coordinates of the nodes (GRID, CORD2R, CORD2C, CORD2S); nodes that
         move in local directions (field CD) are turned into the basic system.
     stiffness, mass, damping : str, optional
-        Names of the matrices; when not given, the one of the usual names (KAAX, KAA, KGG, K2GG;
-        MAAX, ...; BAAX, ...) that is there. `damping=None`: none. Structural damping (K4AAX) is not
-        viscous and is not read.
+        Names of the matrices. By default the usual names (KAAX, KAA, KGG, K2GG; MAAX, ...; BAAX,
+        ...) are searched, one of which must exist. `damping=None`: no damping is read. Structural
+        damping (K4AAX) is not viscous and is not read.
     scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
         Direction of scalar points (component 0); without it they are refused.
 
     Returns
     -------
     FEMatrices
-        Without `bdf` not `located`; with the printed `digits` (ten in a usual punch file: soft
-        modes may be lost).
+        Matrices with the printed number of `digits` (ten in a usual punch file, so that soft modes
+        may be lost). They are not `located` where `bdf` is not given.
 
     Raises
     ------

@@ -50,9 +50,10 @@ def read_frf_uff(
 ) -> Frf:
     """Return the frequency response functions of a universal file.
 
-    Dataset 58, text or binary: every record gives one pair; a direction -3 is z with the sign
-    turned. In a file without these, of dataset 2414: responses of all nodes of a model to its load
-    sets, "load 1", as large as these are.
+    They are read from dataset 58, text or binary, where every record gives the response of one
+    output to one input. A direction of -3 means z with the opposite sign. A file without dataset 58
+    may hold dataset 2414: the responses of all nodes of a model to its load sets, named "load 1"
+    and so on, per whole load set.
 
     Nodes that move in a coordinate system of dataset 18 or 2420 (the displacement system of
     dataset 15 or 2411) are turned to global directions. System 0 is the global one, and so is
@@ -76,8 +77,8 @@ def read_frf_uff(
     Returns
     -------
     Frf
-        Outputs "41:z", inputs "u 41:z" by node and direction, sorted; the name of the entity in
-        the place of a missing direction.
+        Responses with outputs "41:z" and inputs "u 41:z", sorted by node and direction. Where a
+        direction is missing, the name of the entity takes its place.
 
     Raises
     ------
@@ -191,10 +192,11 @@ def _in_global_directions(frf: Frf, path: str | Path) -> Frf:
 def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> MeasuredModes:
     """Return poles and mode shapes of a universal file (datasets 55 and 2414).
 
-    Normal or complex modes; of both, those of dataset 55, which test software writes.
+    Normal and complex modes are read. Where a file holds both datasets, those of dataset 55 are
+    taken, which test software writes.
 
-    The numbers of the modes in the file count what was measured; which modes of a model they are
-    is found by `numbered`.
+    The file numbers the modes in the order of the measurement; `numbered` finds which modes of a
+    model they are.
 
     Parameters
     ----------
@@ -278,12 +280,12 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     path : str or Path
         A .uff, .unv or .uf file. Needs pyuff: pip install 'flexplant[uff]'.
     directions : sequence of str
-        Which DOFs each node gets.
+        Directions of the DOFs of each node.
 
     Returns
     -------
     DofSet
-        In metres, by dataset 164 where there is one.
+        DOFs with coordinates in metres, converted by dataset 164 where the file has it.
 
     Raises
     ------

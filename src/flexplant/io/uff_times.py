@@ -62,7 +62,7 @@ def read_uff_records(path: Path) -> RecordedChannels:
 def read_spectra(path: str | Path, *, scale: float | None = None) -> dict[str, Spectrum]:
     """Return the power spectral densities of a universal file, in SI, by channel.
 
-    Dataset 58, function type 9; cross spectra are passed over.
+    They are read from dataset 58, function type 9; cross spectra are not read.
 
     Parameters
     ----------

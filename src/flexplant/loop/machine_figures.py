@@ -99,7 +99,7 @@ def loop_interval(
         unit = "Hz" if figure == BANDWIDTH else loop.units.get(figure, "")
     given = "" if callable(figure) or figure in FIGURES else known.densities
     own = None
-    if isinstance(figure, str) and loop.is_stable:  # a figure of its own is verified
+    if isinstance(figure, str) and loop.is_stable:  # a figure of the loop is verified
         own = _figure(loop, figure) if figure in FIGURES else loop.rms(figure)
     found = interval(known, partial(loops.values, figure), level, unit, given, own)
     if figure != RADIUS or found.low is None or found.high is None:

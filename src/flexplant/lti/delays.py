@@ -153,7 +153,7 @@ class Delayed(Value):
         Its error is ``|1 - P(jw) e^(jw delay)|``: `pade_error` gives it at a frequency.
         """
         if np.any(self.slope):
-            raise ModelError(f"{self!r} is no state space. Add a filter to the derivative.")
+            raise ModelError(f"{self!r} has no state space: add a filter to its derivative.")
         if not self.delay:
             found: StateSpace = self.system
             return found

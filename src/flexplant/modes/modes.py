@@ -131,7 +131,7 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
 def sampled_moves(dofs: DofSet) -> IntArray:
     """Return positions of a random sample of the translations, which favours no direction.
 
-    Of a structure that only turns, such as a train of gears, the rotations.
+    Where the structure only turns, such as a train of gears, its rotations are used.
     """
     moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
     moves = moves or list(range(len(dofs.directions)))

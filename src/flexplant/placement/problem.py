@@ -249,7 +249,7 @@ class Placement(Value):
 
     @property
     def _without(self) -> str:
-        """What is said of the plant's own sensors and actuators that were no candidates."""
+        """Text on the sensors and actuators of the plant that were not candidates."""
         if not self.left_out:
             return ""
         return f", without the plant's own {some_names(self.left_out)}: not among the candidates"

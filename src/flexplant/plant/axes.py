@@ -212,7 +212,7 @@ def _drift(plant: Partition, held: Sequence[str], drifting: FloatArray) -> str:
 
 
 def _spanned(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return bases of what rows (p, r) span, whatever their units, and of what they do not."""
+    """Return bases of the span of rows (p, r), whatever their units, and of its complement."""
     sizes, basis = np.linalg.svd(rows / divisor(np.linalg.norm(rows, axis=1, keepdims=True)))[1:]
     rank = int(np.sum(sizes > TYPED * sizes.max(initial=0.0)))
     return np.asarray(basis[:rank]), np.asarray(basis[rank:])

@@ -227,8 +227,8 @@ class PositionMap(Value):
     decoupling : (..., 2) array
         Errors of the decoupling at each place of the grid, first of the sensors, then of the
         actuators. The transformations of the plant at its present position (`decouple`) are applied
-        at that place; the error is the largest gain of the difference from the identity, 0 if there
-        is none. Each axis is weighted by the motion of the sensors that it causes. NaN where the
+        at that place; the error is the largest gain of the difference from the identity, 0 where
+        they agree. Each axis is weighted by the motion of the sensors that it causes. NaN where the
         actuators cannot move the axes independently.
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).

@@ -46,7 +46,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     Parameters
     ----------
     found : ErrorBudget
-        From `ClosedLoop.budget`.
+        Budget from `ClosedLoop.budget`.
     most : int
         Number of sources that are drawn separately, the largest first; the others form one area.
     ax : Axes, optional
@@ -111,7 +111,8 @@ def spectra(
     found : ClosedLoop, Response, Spectrum, or mapping {label: one of these}
         Loops, runs or spectra of one signal.
     channel : str, optional
-        Which signal of loops and runs; a Spectrum, from `loop.psd(channel)`, is of one already.
+        Signal of loops and runs. A Spectrum, from `loop.psd(channel)`, belongs to one signal
+        already.
     unit : str, optional
         SI unit of the signal; by default that of the channel.
     colors : mapping {label: color}, optional
@@ -121,7 +122,7 @@ def spectra(
     Returns
     -------
     Axes
-        The roots of the one-sided densities.
+        Axes with the square roots of the one-sided densities.
 
     Raises
     ------
@@ -185,15 +186,15 @@ def exposures(
     Parameters
     ----------
     run : Response
-        From `simulate`.
+        Run from `simulate`.
     channel : str, optional
         Channel of the error; by default the first error of a POI.
     window : float [s]
         Exposure time of one point.
     start : float [s]
-        Time after which everything is exposed, without `exposures`.
+        Time after which the whole run counts as exposed, where `exposures` is not given.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPointProfile.exposures`.
+        Beginning and end of each exposure, such as `SetPointProfile.exposures`.
     ax : Axes, optional
 
     Raises
@@ -254,7 +255,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     Parameters
     ----------
     found : ErrorMap
-        From `flexplant.simulation.exposure`; points that span an area.
+        Map from `flexplant.simulation.exposure`, whose points span an area.
     what : str
         "ma" or "msd".
     ax : Axes, optional

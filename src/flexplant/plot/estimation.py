@@ -117,7 +117,7 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     Parameters
     ----------
     report : LagReport
-        From `observer.report()`.
+        Report from `observer.report()`.
     channel : str, optional
         A POI's motion; by default the first.
     ax : Axes, optional
@@ -125,7 +125,8 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     Returns
     -------
     Axes
-        The curve starts at one sample; predictor, smoother and static relation are level lines.
+        Axes with the curve from one sample on; predictor, smoother and static relation are
+        horizontal lines.
 
     Raises
     ------
@@ -179,11 +180,11 @@ def estimate(
     Parameters
     ----------
     result : Estimate
-        From `observer.estimate(records)`.
+        Result of `observer.estimate(records)`.
     channel : str, optional
         `die:hat` or `y1:innovation`; by default the first estimate.
     truth : (N,) array, optional
-        The motion, where it is known: then the error of the estimate is drawn.
+        True motion, where it is known; the error of the estimate is then drawn.
     deviations : float
         Half the width of the band.
     ax : Axes, optional
@@ -274,9 +275,9 @@ def consistency(
     Parameters
     ----------
     estimate : Estimate
-        Of `observer.estimate(records)`.
+        Result of `observer.estimate(records)`.
     found : ConsistencyReport, optional
-        The verdict of `flexplant.estimation.consistency`, as the title.
+        Result of `flexplant.estimation.consistency`, whose verdict becomes the title.
     level : float
         Confidence level of the bounds.
     ax : three Axes, optional

@@ -303,7 +303,7 @@ def moving_shapes(modes: Modes) -> str:
 
 
 def moving_frame(modes: Modes, height: int = 520) -> str:
-    """Return a frame of some height [px] with a page of its own, in which the modes move."""
+    """Return a frame of a given height [px] with a separate page, in which the modes move."""
     shapes = moving_shapes(modes)
     style, script = _resource("report.css"), _resource("shapes.js")
     page = f"<style>{style}</style><main>{shapes}</main><script>{script}</script>"

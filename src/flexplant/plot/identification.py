@@ -97,8 +97,8 @@ def identified(
     Returns
     -------
     Axes
-        Displacement per input; a dotted line at every pole, the standard deviation of the
-        measurement in grey where known.
+        Axes with displacement per input. A dotted line marks every pole, and the standard deviation
+        of the measurement is grey where it is known.
 
     Examples
     --------

@@ -59,7 +59,7 @@ def nyquist(
 ) -> Axes:
     """Draw loop gains L in the complex plane, with -1 and the circle with ``|S| > modulus``.
 
-    Each of more than four has a separate panel.
+    More than four curves get one panel each.
 
     ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
     the mirror image is not drawn. Where a measured gain steps over a resonance the curve follows
@@ -277,7 +277,7 @@ def sensitivity(
 ) -> Axes:
     """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
-    Each of more than four has a separate panel.
+    More than four curves get one panel each.
 
     Parameters
     ----------
@@ -373,12 +373,12 @@ def sensitivities(
     colors : mapping {label: color}, optional
         Colours of some lines.
     ax : three Axes, optional
-        Where to draw S, T and KS.
+        Axes of S, T and KS.
 
     Returns
     -------
     Axes
-        Of S; `.figure.axes` are all.
+        Axes of S; `.figure.axes` are all.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a notebook shows of a value in addition to its words: a picture, or modes that move."""
+"""Pictures that a notebook shows with a value, and modes that move."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ PICTURES: dict[type, Callable[[Any], Any]] = {
 def picture_of(value: Any) -> str:
     """Return the picture of a value as HTML; empty for a kind that has none.
 
-    Modes turn and move in a frame of their own. A value that its plot refuses (a loop that follows
-    nothing has no |S|) has no picture.
+    Modes turn and move in a separate frame. A value that its plot refuses has no picture: a loop
+    without references, for instance, has no |S|.
     """
     if isinstance(value, Modes | ReducedModel):
         return moving_frame(value if isinstance(value, Modes) else value.modes())

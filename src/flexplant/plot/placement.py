@@ -49,7 +49,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Parameters
     ----------
     found : SensorMap
-        From `flexplant.placement.sensor_map`.
+        Map from `flexplant.placement.sensor_map`.
     ports : Ports, optional
         Existing sensors and actuators, and POIs, if their places are points.
     ax : Axes, optional
@@ -57,8 +57,8 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Returns
     -------
     Axes
-        Filled contours of the square root of the score's ratio: the error with the sensor over
-        the error without it; excluded zones hatched.
+        Axes with filled contours of the error with the sensor relative to the error without it (the
+        square root of the ratio of scores). Excluded zones are hatched.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     found : ParetoCurve
-        From `flexplant.placement.pareto_curve`.
+        Curve from `flexplant.placement.pareto_curve`.
     ax : Axes, optional
 
     Returns
@@ -307,15 +307,16 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     Parameters
     ----------
     found : PositionMap
-        From `StandardPlant.map`; of one or two positions.
+        Map from `StandardPlant.map`, over one or two positions.
     kind : {"m", "rad"}
-        The unit of the positions.
+        Unit of the positions.
 
     Returns
     -------
     list of Axes
-        One panel each for the decoupling error, the participation of each mode in the loop (the
-        least for two positions), and each figure, with its smallest and largest value marked.
+        A panel for the decoupling error, one for the participation of the modes in the loop (over
+        two positions, the lowest of all modes), and one for each figure. The smallest and largest
+        values are marked.
 
     Raises
     ------
@@ -334,8 +335,8 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     instance(found, PositionMap, "found", "Pass what plant.map returned.")
     if len(found.grid) > 2:
         raise ModelError(
-            f"a picture has two axes, the map {len(found.grid)} positions: map fewer, "
-            "points={'z': [0.0]} holds one where it is."
+            f"the map has {len(found.grid)} positions, a picture shows two at most: hold the "
+            "others, for example points={'z': [0.0]}."
         )
     draw = _curve_panels if len(found.grid) == 1 else _image_panels
     return draw(found, kind)

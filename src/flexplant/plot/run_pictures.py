@@ -54,7 +54,7 @@ def response(
     Parameters
     ----------
     run : Response
-        From `simulate`.
+        Run from `simulate`.
     channels : sequence of str, optional
         Channels; by default the errors (or else the first channel).
     unit : str, optional
@@ -66,7 +66,7 @@ def response(
     span : (start, end) [s], optional
         Part of the run to draw; all of it by default. The prefix is chosen for that span.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPointProfile.exposures`: they are shaded.
+        Beginning and end of each exposure, such as `SetPointProfile.exposures`; they are shaded.
     ax : Axes, optional
         Axes for channels of one unit.
 
@@ -195,10 +195,10 @@ def step(
     Parameters
     ----------
     systems : StateSpace, ClosedLoop, or mapping {label: one of these} or list of them
-        What to draw; several share their axes. Systems of python-control and SciPy too.
+        Systems to draw, also of python-control and SciPy; several share their axes.
     outputs, inputs : str or sequence of str, optional
-        Channels of the first one; all when not given, of a loop with references these and the
-        motions of their POIs. Others are drawn by the same names.
+        Channels of the first system; all by default. Of a loop with references, the references and
+        the motions of their POIs are the default. Other systems use the same names.
     duration : float [s], optional
         Duration; by default until the slowest pole has decayed to 1 % or for 20 of its periods.
     ax : Axes, optional

@@ -64,7 +64,7 @@ def mode_shape(
     modes : Modes
         Modes of a full or reduced model, or of an update (`fit.modes()`).
     number : int
-        From 1, rigid-body modes included.
+        Number of the mode, counted from 1 with rigid-body modes.
     scale : float
         Largest drawn displacement relative to the largest dimension of the structure.
     phase : float [rad]
@@ -282,7 +282,7 @@ def _flat_axes(xyz: FloatArray) -> FloatArray:
 def _surface(points: FloatArray) -> IntArray:
     """Return triangles of points (n, 2), or the outer faces of the tetrahedra between (n, 3).
 
-    There are none where most nodes lie on no face: those of a frame.
+    A frame, most nodes of which lie on no face, has no faces.
     """
     from scipy.spatial import Delaunay, cKDTree
 
@@ -351,7 +351,7 @@ def layout(
     dofs : DofSet
         DOFs of the full model.
     ports : Ports, optional
-        Their places.
+        Ports whose places are drawn.
     desired : iterable of str
         Labels of the desired DOFs.
     marked : mapping {text: place}, optional

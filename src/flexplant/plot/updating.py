@@ -357,14 +357,14 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     ----------
     fit : UpdateResult
     measured : (m,) complex array [rad/s]
-        The measured eigenvalues, in the same order.
+        Measured eigenvalues, in the same order.
     ax : Axes, optional
 
     Returns
     -------
     Axes
-        Distance of the real and the imaginary part to the measured one [rad/s] over iterations, on
-        a log scale.
+        Logarithmic axes with the distances of real and imaginary parts from the measured ones
+        [rad/s] over iterations.
 
     Examples
     --------
@@ -407,7 +407,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     Returns
     -------
     Axes
-        The sum of squares of all differences between model and measurement, each divided by its
+        Axes with the sum of squared differences between model and measurement, each divided by its
         standard deviation where that is known.
 
     Examples
@@ -435,7 +435,7 @@ def parameters(
     truth : dict, optional
         True values, drawn as wide lines.
     axs : list of Axes, optional
-        Where to draw, one for each parameter.
+        Axes, one for each parameter.
 
     Examples
     --------

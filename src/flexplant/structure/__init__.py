@@ -3,10 +3,11 @@ r"""Structure of a machine: finite-element matrices with labelled degrees of fre
 An `FEModel` holds M, D and K with the DOFs of their rows; ``"41:z"`` is the motion of node 41 in z.
 It is read from files (`fx.read_model`), or meshed here:
 
-- `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), both with fields of thickness
-  and modulus; `beam`, `chain`, `solid_block`: meshes.
+- `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `solid_block` and
+  `chain` make meshes; thickness and modulus may vary over a plate.
 - `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
-- `ModalDamping` (of measured poles too), `Rayleigh`; a complex K is read as modal damping.
+- `ModalDamping` (one ratio, one for each mode, or measured ones) and `Rayleigh` give damping; a
+  complex K is read as modal damping.
 - `check`: report on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
 - `interpolated`: shapes between the nodes of matrices without elements, so that a POI may be
   anywhere.

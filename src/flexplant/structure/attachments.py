@@ -36,10 +36,10 @@ class PointMass(Value):
     Parameters
     ----------
     at : str, (3,) array [m] or mapping
-        At a point, the mass rides on every translation that the model has there; at a DOF label
-        (or a mapping) on that motion alone.
+        Place of the mass. At a point it acts on every translation that the model has there; at a
+        DOF label (or a mapping) it acts on this motion only.
     mass : float [kg]
-        The mass; of a label that is a rotation, the inertia [kg m^2].
+        Mass; at a label of a rotation, moment of inertia [kg m^2].
     inertia : float or (3,) array [kg m^2]
         Moments of inertia about the centre of the mass along x, y, z. They act on the rotations
         that the model has at the point, or that follow from its shapes.
@@ -96,9 +96,9 @@ class Spring(Value):
     at : str, (3,) array [m] or mapping
         One end.
     stiffness : float [N/m or N m/rad]
-        Negative where magnets attract, as in reluctance actuators: the force grows with the
-        displacement. Modes and plants take a negative stiffness that moves the structure as a
-        rigid body; one that bends it is refused when the modes are solved.
+        Stiffness of the spring. It is negative where magnets attract, as in reluctance actuators:
+        the force grows with the displacement. Modes and plants take a negative stiffness that moves
+        the structure as a rigid body; one that bends it is refused when the modes are solved.
     direction : str
         Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
     to : place, optional

@@ -62,7 +62,8 @@ class ModalDamping(Damping):
     Parameters
     ----------
     ratio : float or (k,) array [-]
-        Damping ratio in [0, 1). An array counts rigid-body modes too; their entries are not used.
+        Damping ratio in [0, 1). An array has one entry for each mode, rigid-body modes included,
+        whose entries are not used.
     others : float [-], optional
         Damping ratio of all modes beyond the array; without it there must be one entry for each
         mode.
@@ -207,7 +208,7 @@ class Rayleigh(Damping):
     def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:
         """Return the Rayleigh damping that is nearest to ratios at frequencies.
 
-        Through two of them exactly; through more by least squares of the ratios, alpha and beta not
+        Two ratios are matched exactly. More are fitted by least squares, with alpha and beta not
         negative.
 
         Parameters
@@ -215,7 +216,7 @@ class Rayleigh(Damping):
         freq : (k,) array [Hz]
             Frequencies, at least two different ones.
         zeta : (k,) array [-]
-            The damping ratio at each.
+            Damping ratio at each frequency.
 
         Raises
         ------

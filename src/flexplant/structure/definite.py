@@ -469,8 +469,8 @@ _EVERY_DIGIT = 0.6
 def digits_of(given: Any) -> int | None:
     """Return the decimal digits that entries hold, None for double precision."""
     # rounding in single precision changes an entry by half a unit in the last place, 2^-24, hence 7
-    # digits. Entries in double precision that were read from a text with few digits are recognised:
-    # their shortest text has no more digits
+    # digits. Entries in double precision that were read from a text with few digits are recognised,
+    # since their shortest text has as few digits
     if not hasattr(given, "dtype"):
         real_array(given, "K")
         given = np.asarray(given)

@@ -112,7 +112,7 @@ def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int]) -> A
         worst = np.min(found) if np.any(found <= -1) else np.max(found)
         raise ModelError(
             f"poisson_ratio must be above -1 and below 0.5, got {worst:g}. Give that of "
-            "the material, 0.25 to 0.35 for metals; incompressible ones need other elements."
+            "the material, 0.25 to 0.35 for metals; incompressible materials need other elements."
         )
     return found
 

@@ -36,13 +36,14 @@ class FEMatrices(Value):
     Parameters
     ----------
     K : (n, n) array or sparse matrix
-        Stiffness, both triangles. Its real part is kept where it is complex, ``K (1 + i eta)``: the
-        loss factor eta is read as a modal damping ratio of eta / 2, which a note says and `model`
-        warns of. At resonance the two have the same response; elsewhere they differ by at most eta.
+        Stiffness, both triangles. Of a complex matrix ``K (1 + i eta)`` the real part is kept, and
+        the loss factor eta becomes a modal damping ratio of eta / 2; a note says so, and `model`
+        warns. The two dampings give the same response at resonance, and differ by at most a
+        fraction eta elsewhere.
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping; M may be singular.
     dofs : DofSet, optional
-        Meaning of the rows. None: not known yet; `with_dofs` adds it.
+        DOFs of the rows. None: not known yet; `with_dofs` adds them.
     digits : int, optional
         Significant decimal digits of the entries of K: as printed in a text, 7 when K is given in
         single precision. None: double precision.
@@ -209,8 +210,8 @@ class FEMatrices(Value):
     def trimmed(self) -> FEMatrices:
         """Return the same without rows that a solver left for held DOFs; their names stay listed.
 
-        These are empty in every matrix, or hold no mass and nothing but a diagonal of K: such a
-        DOF stays at rest, so that dropping it changes nothing.
+        Such a row is empty in every matrix, or has no mass and only a diagonal entry in K. Its DOF
+        stays at rest, so that dropping it changes nothing.
         """
         held = held_rows(self.K, self.M, self.D)
         if not held.any() or held.all():
@@ -264,8 +265,8 @@ class FEMatrices(Value):
     def rotated(self, rotations: Any) -> FEMatrices:
         """Return the matrices in global directions, from nodes with local coordinate systems.
 
-        With the direction cosines C of a node, ``q_local = C q_global``, and its three
-        displacements and three rotations turned alike: ``K_global = C^T K_local C``.
+        The direction cosines C of a node give ``q_local = C q_global``, for its three displacements
+        and its three rotations alike, and hence ``K_global = C^T K_local C``.
 
         Parameters
         ----------
@@ -278,8 +279,9 @@ class FEMatrices(Value):
         LabelError
             When a node does not exist.
         ModelError
-            When cosines are not orthogonal, or a node has only some of its three directions: the
-            others, held in its local system, have no global ones.
+            When cosines are not orthogonal, or a node has only some of its three directions. The
+            other ones are then held along local axes, and no DOFs in global directions describe
+            this.
 
         Examples
         --------
@@ -338,8 +340,8 @@ class FEMatrices(Value):
             Treatment of DOFs without mass. "condense" removes them statically,
             ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
         free : bool
-            Whether to free the rigid-body motions that are held only by lost digits (text, single
-            precision), as `freed` does.
+            Whether to free rigid-body motions that are held only because K lost digits (text,
+            single precision), as `freed` does.
         name : str, optional
 
         Raises
@@ -412,9 +414,9 @@ class FEMatrices(Value):
     def freed(self) -> FEMatrices:
         """Return the same with those rigid-body motions free that only lost digits of K hold.
 
-        ``K' = P^T K P`` with ``P = I - R R^T M``: elastic modes, M-orthogonal to the rigid-body
-        motions R, stay as they are. Use it for text files and single precision; K becomes a full
-        matrix.
+        ``K' = P^T K P`` with ``P = I - R R^T M``: the elastic modes are M-orthogonal to the
+        rigid-body motions R and do not change. Use it for text files and single precision; K
+        becomes a full matrix.
 
         Raises
         ------

@@ -46,9 +46,9 @@ class FEModel(Placed, Value):
         Mass: symmetric, positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
         Stiffness: symmetric, positive semi-definite; singular for a free structure, with negative
-        eigenvalues only where they belong to rigid-body motion (magnets). K needs double precision:
-        digits lost in single precision lead to an error or a warning, and
-        ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees what only its rounding holds.
+        eigenvalues only where they belong to rigid-body motion (magnets). K needs double precision.
+        A K in single precision leads to an error or a warning where its rounding holds rigid-body
+        motions; ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees these.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
     dofs : DofSet, optional
@@ -56,8 +56,9 @@ class FEModel(Placed, Value):
         "1:x" to "n:x", at a place that is not known.
     name : str, optional
     held_inertia : (n, 6) array, optional
-        Loads ``M_fs r_s`` by which held DOFs s act through their mass coupling when the ground
-        accelerates, for its six rigid-body motions about the origin; computed by `fixed`.
+        Loads ``M_fs r_s`` of the held DOFs s on the free ones f, through the mass matrix, when the
+        ground accelerates in one of its six rigid-body motions about the origin. `fixed` computes
+        them.
     joint_motions : (n, m) array, optional
         M-orthonormal motions of the components of a joined machine as rigid bodies that its rigid
         joints allow (a slide, a hinge), in place of those that follow from the coordinates.
@@ -219,9 +220,9 @@ class FEModel(Placed, Value):
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return how much of each of the six rigid-body motions DOFs held by `fixed` prevent (6,).
 
-        Springs to ground prevent none: the DOFs can make every motion, at some cost. Next to held
-        DOFs the largest force of a motion is as large as those of its parts, which cancel
-        elsewhere: ``max |K r|_i / max (|K| |r|)_i``, forces over the root of K_ii.
+        Springs to ground prevent no motion, since the DOFs can still make it. The measure is ``max
+        |K r|_i / max (|K| |r|)_i``, with forces relative to the root of K_ii: the terms of K r
+        cancel everywhere except next to held DOFs.
         """
         if self.held_inertia is None:
             return np.zeros(6)

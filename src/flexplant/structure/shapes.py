@@ -175,7 +175,7 @@ class BeamShape(GridShape):
     length : float [m]
         Length of the beam.
     elements : int
-        Their number.
+        Number of elements.
     softness : float or (elements,) array, optional [m^2]
         Bending stiffness over shear stiffness. None: the beam does not shear.
 

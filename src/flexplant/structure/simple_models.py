@@ -46,15 +46,15 @@ def chain(
     Parameters
     ----------
     masses : (n,) array [kg]
-        The masses; their DOFs are "1:x", "2:x", ...
+        Masses; their DOFs are "1:x", "2:x", ...
     stiffnesses : (n - 1,) array [N/m]
-        Between neighbours.
+        Stiffnesses of the springs between neighbours.
     dampings : (n - 1,) array [N s/m], optional
-        Between neighbours; without them the model has no D.
+        Dampers between neighbours; without them the model has no D.
     ground : float or (n,) array [N/m]
-        From each mass to the ground.
+        Stiffnesses from each mass to the ground.
     spacing : float [m]
-        Between neighbours; only the coordinates depend on it.
+        Distance of neighbours; only the coordinates depend on it.
     name : str, optional
 
     Returns
@@ -65,7 +65,7 @@ def chain(
     Raises
     ------
     ModelError, ShapeError
-        When numbers are negative or do not fit one another.
+        When a number is negative, or the lengths of the arrays do not match.
 
     Examples
     --------
@@ -141,7 +141,7 @@ def beam(
     length : float [m]
         Length of the beam.
     elements : int
-        Their number.
+        Number of elements.
     density, youngs_modulus : float, (elements,) array or function of x [kg/m^3], [Pa]
         Density and Young's modulus of the material.
     area, inertia : float, (elements,) array or function of x [m^2], [m^4]

@@ -32,7 +32,7 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
     Returns
     -------
     dict {label: (n,) array}
-        A motion moves the DOF that names it by one unit, and no other DOF that names one.
+        Each motion moves its own key's DOF by one unit, and the DOFs of the other keys not at all.
 
     Raises
     ------

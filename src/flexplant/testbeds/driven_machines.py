@@ -38,7 +38,9 @@ def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -112,7 +114,9 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -169,7 +173,9 @@ def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -221,7 +227,9 @@ def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -271,7 +279,9 @@ def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -322,7 +332,9 @@ def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -385,7 +397,9 @@ def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------
@@ -435,7 +449,9 @@ def maglev_block(*, rate: float = 10e3, delay: float = 1.0) -> StandardPlant:
     Parameters
     ----------
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
+        Delay from measurement to actuation.
 
     Returns
     -------

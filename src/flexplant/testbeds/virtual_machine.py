@@ -46,7 +46,7 @@ class WaferStage(Value):
     Parameters
     ----------
     truth : FEModel
-        What it really is: for tests and for judging an answer; no design may read it.
+        Model of the machine as it is, for tests and for judging results; a design must not read it.
     rate : float [Hz]
         Sampling rate of its controller.
     delay : float [samples]
@@ -56,7 +56,7 @@ class WaferStage(Value):
     drawing : mapping
         Size, thickness and material of its plate (or block) as drawn; by default the paper's.
     magnets : tuple of GroundSpring
-        Those that a block floats on, as drawn; none: it is free.
+        Magnets on which a block floats, as drawn; empty where it is free.
 
     Examples
     --------
@@ -108,8 +108,8 @@ class WaferStage(Value):
         Parameters
         ----------
         modes : sequence of int
-            Numbers from 1, rigid-body modes included, as in the paper; elastic ones by frequency,
-            those left out that damping keeps from swinging.
+            Numbers of the modes, counted from 1 with rigid-body modes, as in the paper. Elastic
+            modes are sorted by frequency; overdamped ones are not counted.
         deviation : float
             Standard deviation of their errors, relative to their size; 0: ideal, no covariance.
         rng : int or Generator, optional
@@ -175,7 +175,7 @@ class WaferStage(Value):
         ports : Ports
             Its channels, with the noise that acts.
         *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
-            What runs on it.
+            Observers and controllers that run on the machine.
         duration : float [s]
         reference : SetPointProfile, array or mapping, optional
         rng : int or Generator, optional
@@ -183,7 +183,7 @@ class WaferStage(Value):
         runs : int, optional
             Repetitions with independent noise.
         moving : mapping {position: path}, optional
-            How it moves, for ports that do.
+            Paths of the positions of moving ports.
         """
         schedule = blocks[0] if blocks and isinstance(blocks[0], ScheduledLoop) else None
         own = self.loop(ports, *blocks) if schedule is None else self.scheduled(ports, schedule)
@@ -230,7 +230,8 @@ class WaferStage(Value):
         period : float [s]
             Period of the multisine; its inverse is the frequency resolution.
         periods, discard : int
-            Periods that are averaged, and those before, for the transient to die out.
+            Number of averaged periods, and number of periods before these, in which the transient
+            decays.
         amplitude : float [N]
             Rms excitation of each actuator.
         rng : int or Generator, optional
@@ -239,9 +240,9 @@ class WaferStage(Value):
         Returns
         -------
         Frf
-            Responses of the plant with its zero-order hold, without the delay; zero frequency left
-            out. With two periods or more, what changes between them gives coherence, variance and
-            correlation.
+            Responses of the plant with its zero-order hold and without the delay, from the first
+            frequency above zero. With two periods or more, the differences between periods give
+            coherence, variance and correlation.
         """
         instance(ports, Ports, "ports", "Pass Ports(u=[...], y=[...]).")
         if not ports.u or not ports.y:

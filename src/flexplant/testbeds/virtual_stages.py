@@ -56,13 +56,15 @@ def wafer_stage(
     Parameters
     ----------
     elements : (int, int), optional
-        In its place the drawing's own plate on such a mesh, without scatter, second mass or steps,
-        and a delay of 1: a machine of its models' family. (8, 8) is the paper's with 243 DOFs.
+        Number of elements along x and y of a mesh of the drawn plate, which then takes the place of
+        the polynomials: a machine of the same formulation as the models, without scatter, second
+        mass and sensor steps, and with a delay of 1 sample by default. (8, 8) is the paper's with
+        243 DOFs.
     size : (float, float) [m]
         Sides of the plate along x and y; by default the paper's.
     thickness : float [m]
     damping : float
-        Modal damping ratio of the bare plate's elastic modes; of a machine their mean.
+        Mean modal damping ratio of the elastic modes of the plate without added masses.
     added_mass : float [kg]
         The hidden mass.
     rate : float [Hz]
@@ -71,12 +73,12 @@ def wafer_stage(
         Delay from a measurement to the reaction of the actuators, including fractions; 1.3
         by default.
     individual : int
-        Which machine: its scatter and its second mass.
+        Number of the machine, from which its scatter and its second mass are drawn.
 
     Returns
     -------
     WaferStage
-        It answers with poles, FRFs and closed-loop runs; its matrices are for tests only.
+        Machine that gives poles, FRFs and closed-loop runs; its matrices are for tests only.
 
     Raises
     ------
@@ -180,18 +182,18 @@ def magnet_stage(
     """Return a virtual machine that floats on magnets, with a mass that no drawing shows.
 
     A block of linear elasticity in polynomials, solved to convergence: no mesh of bricks has its
-    frequencies. Magnets at its corners attract, ``K - sum_s |k_s| r_s' r_s``, so that six motions
-    of the rigid body grow until a loop holds them; theirs are up to 10 % off the drawn ones. A
-    mass is added on the bottom at (3/4, 1/4) of its sides, and another of up to 0.1 kg
-    somewhere; stiffness is scattered over the block by 0.3 %, damping over its modes by 30 %,
-    sensors have steps of 0.05 nm, and the delay is not a whole number of samples.
+    frequencies. Magnets at its corners attract, ``K - sum_s |k_s| r_s' r_s``, so that the six
+    rigid-body motions grow until a loop holds them. The stiffnesses of the magnets differ from the
+    drawn ones by up to 10 %. A mass is added on the bottom at (3/4, 1/4) of its sides, and another
+    of up to 0.1 kg somewhere; stiffness is scattered over the block by 0.3 %, damping over its
+    modes by 30 %, sensors have steps of 0.05 nm, and the delay is not a whole number of samples.
 
     Parameters
     ----------
     size : (float, float, float) [m]
         Sides of the block along x, y and z, where it is thin.
     damping, added_mass, rate, delay, individual
-        As for `wafer_stage`; the magnets are those of the individual, too.
+        As for `wafer_stage`; `individual` determines the magnets too.
 
     Returns
     -------
@@ -256,7 +258,7 @@ def three_masses(*, rate: float | None = 2e3, delay: int = 1) -> StandardPlant:
     rate : float [Hz], optional
         Sampling rate; None gives the continuous plant.
     delay : int [samples]
-        From measurement to actuation.
+        Delay from measurement to actuation.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Bench: a plant, its model and its fleet on the bench, what all tabs share; the designs of one."""
+"""Bench: the plant, its model and its fleet, shared by all tabs; a tab's designs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST = 400
 
 
 class DesignHistory:
-    """Designs one after the other."""
+    """The successive designs of a tab, for undo and redo."""
 
     def __init__(self, first: LoopDesign) -> None:
         self._designs = [first]
@@ -33,11 +33,11 @@ class DesignHistory:
 
     @property
     def now(self) -> LoopDesign:
-        """The design as it is."""
+        """The present design."""
         return self._designs[self._at]
 
     def add(self, design: LoopDesign, key: Hashable = None) -> None:
-        """Take a design; of changes with one key, not None, only the last is kept."""
+        """Add a design; of changes with the same key (not None) only the last is kept."""
         if key is not None and key == self._key and self._at == len(self._designs) - 1 and self._at:
             self._designs[self._at] = design
             return
@@ -46,12 +46,12 @@ class DesignHistory:
         self._key = key
 
     def back(self) -> LoopDesign:
-        """Return the design before, which is now the design; the first stays."""
+        """Go back to the previous design and return it; the first design stays."""
         self._at, self._key = max(0, self._at - 1), None
         return self.now
 
     def forward(self) -> LoopDesign:
-        """Return the design after; the last stays."""
+        """Go forward to the next design and return it; the last design stays."""
         self._at, self._key = min(len(self._designs) - 1, self._at + 1), None
         return self.now
 
@@ -65,7 +65,7 @@ _OVER, _BESIDE, _BEYOND = 3.0, 1.25, 3.0
 
 
 class Bench:
-    """What all tabs share: machines in the axes of a design, the first of them nominal."""
+    """Machines in the axes of a design, shared by all tabs; the first is the nominal one."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class Bench:
         source: str = "",
     ) -> None:
         self.source = source
-        #: what was shown last in any tab
+        #: design that was shown last in any tab
         self.design = design
         self.start = design
         self.limits = limits or LoopLimits()
@@ -118,7 +118,7 @@ class Bench:
         return Question(self.machines[0], self.model, self.channel, self.move)
 
     def question_of(self, index: int) -> Question:
-        """Return the same of another machine."""
+        """Return the same question for another machine."""
         machine = self.machines[index]
         model = self.model if machine.is_measured or self.model is not self.machines[0] else machine
         return replace(self.question, machine=machine, model=model)

@@ -1,4 +1,4 @@
-"""What takes longer than a slider may wait: all axes, truncated modes, error, time; tuning."""
+"""Results that take longer than a slider may wait: all axes, truncated modes, errors; tuning."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _LINES = 1 << 14
 
 @dataclass(eq=False)
 class Consequences:
-    """What was found; `missing` says what could not be, and why."""
+    """The results; `missing` names those that could not be computed, with the reason."""
 
     report: LoopReport | None = None
     radius: str = ""
@@ -57,7 +57,7 @@ class Consequences:
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is computed: a design on a machine, with a model where there is one."""
+    """A design on a machine whose consequences are computed, with a model where there is one."""
 
     machine: BenchMachine
     model: BenchMachine | None
@@ -72,7 +72,7 @@ class Question:
         return given.machine if isinstance(given, AnyPlant) else None
 
     def answer(self, design: LoopDesign, loop: AxisLoop) -> Consequences:
-        """Return everything that takes longer than a slider may wait."""
+        """Return all results that take longer than a slider may wait."""
         found = Consequences()
         with warnings.catch_warnings(action="ignore"):  # the page shows their text
             steps = (self._all_axes, self._on_the_plant, self._in_time)
@@ -178,12 +178,12 @@ def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArr
     return np.asarray(np.arange(steps) / rate), np.asarray(error[:steps])
 
 
-#: how often the process says how far it is [s]
+#: period of the progress reports of the process [s]
 _PERIOD = 0.3
 
 
 class Tuning:
-    """A search for laws that began with the peak and the axes of a page."""
+    """A search for control laws, started with the limit of |S| and the axes of a page."""
 
     def __init__(self, plant: Any, design: LoopDesign, peak: float, notches: int) -> None:
         self._design = design
@@ -205,18 +205,18 @@ class Tuning:
 
     @property
     def is_running(self) -> bool:
-        """Whether it still searches."""
+        """Whether the search still runs."""
         return self._process.poll() is None
 
     def stop(self) -> None:
-        """End the search; nothing of it is kept."""
+        """End the search without a result."""
         if self.is_running:
             self._process.kill()
         self._process.communicate()
         self._folder.cleanup()
 
     def result(self) -> LoopDesign:
-        """Return the design that was found; raise the message of the search where it found none."""
+        """Return the design that was found, or raise the error of the search."""
         _, said = self._process.communicate()
         found = Path(self._folder.name) / "found.npz"
         try:
@@ -232,7 +232,7 @@ class Tuning:
 
 
 def search(folder: Path, peak: float, notches: int) -> None:
-    """Search in the process: files in, a file out."""
+    """Search in the child process: it reads files and writes one."""
     plant, design = load(folder / "plant.npz"), load(folder / "design.npz")
     bars, over = bars_of_thread(), threading.Event()
 

@@ -1,4 +1,4 @@
-"""The elements of an axis as cards: numbers with sliders and what is typed for them, switches."""
+"""The elements of an axis as cards: numbers with sliders and text fields, and switches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)\s*
 
 
 class Field(NamedTuple):
-    """A number of an element: its unit, the range of its slider, how it is read and set."""
+    """A number of an element: its unit, the range of its slider, and its getter and setter."""
 
     label: str
     unit: str
@@ -129,7 +129,7 @@ def fields_of(element: SingleElement, top: float) -> tuple[Field, ...]:
 
 
 def name_of(element: SingleElement) -> str:
-    """Return what the page calls an element."""
+    """Return the name of an element on the page."""
     if isinstance(element, Pid):
         return "PID" if element.d or element.pole else "PI" if element.i else "gain"
     if isinstance(element, LowPass):
@@ -138,7 +138,7 @@ def name_of(element: SingleElement) -> str:
 
 
 def new_elements(crossover: float, top: float) -> Mapping[str, Callable[[], SingleElement]]:
-    """Return what can be added, at the places where one begins: around a crossover [Hz]."""
+    """Return the elements that can be added, with first values around a crossover [Hz]."""
 
     def below(freq: float) -> float:
         return float(f"{min(freq, 0.9 * top):.3g}")
@@ -231,7 +231,7 @@ class Number:
         self.row = pn.Row(name, self.slider, self.text, sizing_mode="stretch_width", margin=0)
 
     def show(self, value: float) -> None:
-        """Show a number that was changed elsewhere; one beyond the slider widens it."""
+        """Show a number that was changed elsewhere; the range of the slider grows to contain it."""
         self._own = True
         try:
             self._sign = -1.0 if value < 0.0 else 1.0
@@ -276,7 +276,7 @@ class Number:
 
 
 class ElementCards:
-    """The cards of an axis; rebuilt when elements come, go or move, else only their numbers."""
+    """The cards of an axis: rebuilt when elements are added, removed or moved, else updated."""
 
     def __init__(self, top: float, change: Change, refuse: Callable[[str], None]) -> None:
         import panel as pn

@@ -1,4 +1,4 @@
-"""AxisLoop: a plant on the bench in the axes of a design, and the loop of one axis on it."""
+"""AxisLoop: the loop of one axis of a design on one of the plants."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _STEP = 0.5
 
 @dataclass(frozen=True, eq=False)
 class BenchMachine:
-    """One plant in its axes; `given` is the plant as it came."""
+    """One plant in the axes of the design; `given` is the plant before this transformation."""
 
     name: str
     given: Any
@@ -47,12 +47,12 @@ class BenchMachine:
 
     @property
     def is_measured(self) -> bool:
-        """Whether it is known by lines alone."""
+        """Whether the plant is known by measured lines only."""
         return isinstance(self.axes.plant, Frf)
 
     @cached_property
     def respond(self) -> Responder:
-        """The response (n, n, k) of the axes at frequencies [Hz], between lines as they show it."""
+        """The response (n, n, k) of the axes at frequencies [Hz], between measured lines too."""
         if not self.is_measured:
             return responder(self.axes.plant)
         lines, data = self.axes.plant.freq, self.axes.plant.data
@@ -60,15 +60,15 @@ class BenchMachine:
 
     @cached_property
     def freq(self) -> FloatArray:
-        """Where it is drawn [Hz]: its lines, or through the resonances of a model."""
+        """Frequencies of the curves [Hz]: measured lines, or a grid through resonances."""
         if self.is_measured:
             return np.asarray(self.axes.plant.freq)
         grid = resonance_grid(self.axes.plant.poles(), self.axes.plant.dt)
-        return np.asarray(grid[grid > 1e-5 * grid[-1]])  # what a picture shows
+        return np.asarray(grid[grid > 1e-5 * grid[-1]])  # names of the curves
 
     @cached_property
     def G(self) -> ComplexArray:
-        """The response there (n, n, n_freq)."""
+        """The response (n, n, n_freq) at these frequencies."""
         return self.axes.plant.data if self.is_measured else self.respond(self.freq)
 
     @cached_property
@@ -94,13 +94,13 @@ class BenchMachine:
 
 #: slope at the lowest lines above which an axis is a free body
 _FREE = 1.0
-#: no loop is closed, none is unstable
+#: without a closed loop nothing is unstable
 _NONE = NyquistCount(0)
 
 
 @dataclass(frozen=True, eq=False)
 class OthersClosed:
-    """An axis as its own law sees it: with the loops of the others closed."""
+    """The plant of one axis with the loops of all other axes closed."""
 
     G: ComplexArray
     respond: Callable[[FloatArray], ComplexArray]
@@ -121,7 +121,7 @@ class AxisLoop:
 
     @cached_property
     def C(self) -> ComplexArray:
-        """The law."""
+        """The response of the control law."""
         return self.law.at(self.freq)
 
     @cached_property
@@ -131,12 +131,12 @@ class AxisLoop:
 
     @cached_property
     def modulus_margin(self) -> float:
-        """The least distance to -1 on what is followed of the loop; that of `margins` at least."""
+        """The least distance of the loop gain from -1, over the curve and `margins`."""
         return float(np.abs(1.0 - self.parts.gain(self.parts.followed, "y")).min())
 
     @cached_property
     def bandwidth(self) -> float:
-        """The frequency [Hz] at which |S| first crosses 1; NaN where none is, or of no use."""
+        """The frequency [Hz] at which |S| first crosses 1; NaN where it never does or S is unstable."""
         with suppress(AssumptionError):
             return float("nan") if self.count.unstable else broken_bandwidth(self.parts)
         return float("nan")
@@ -171,17 +171,17 @@ class AxisLoop:
 
     @property
     def KS(self) -> ComplexArray:
-        """From noise of the sensor to the command."""
+        """Response from sensor noise to the command."""
         return self.C * self.S
 
     @property
     def PS(self) -> ComplexArray:
-        """From a force in the axis to its motion."""
+        """Response from a force in the axis to its motion."""
         return self.others.G * self.S
 
     @property
     def is_stable(self) -> bool | None:
-        """Whether all closed loops are stable together; None where lines do not say."""
+        """Whether all closed loops together are stable; None where measured lines leave it open."""
         return None if self.count.unstable is None else not self.count.unstable
 
 
@@ -189,13 +189,13 @@ _Kept: TypeAlias = tuple[BenchMachine, tuple[ShapedAxis, ...], OthersClosed]
 
 
 class Evaluator:
-    """Evaluates axes of designs on machines; what does not change with a slider is kept."""
+    """Evaluates axes of designs on machines; results that no slider changes are kept."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[int, str], _Kept] = {}
 
     def loop(self, machine: BenchMachine, design: LoopDesign, name: str) -> AxisLoop:
-        """Return the loop of one axis, the others as they are switched."""
+        """Return the loop of one axis, with the loops of the others on or off as in the design."""
         law, others = design.laws[name], self._with_others(machine, design, name)
         parts = self._broken(machine, design, name, others)
         rigid = 0
@@ -203,7 +203,7 @@ class Evaluator:
             free = low_slope(machine.freq, others.G[None, None]) > _FREE
             rigid = int(free and design.rigid > 0)
         count = broken_count(parts, rigid, design.unstable + (others.count.unstable or 0))
-        if others.count.unstable is None:  # the count of this axis rests on that of the others
+        if others.count.unstable is None:  # the count of this axis needs that of the others
             count = NyquistCount(None, f"the other axes: {others.count.reason}")
         elif others.count.narrowest > count.narrowest:
             count = count._replace(narrowest=others.count.narrowest, near=others.count.near)

@@ -1,4 +1,4 @@
-"""workbench: serves the page to this machine alone, on a plant, or on a file that holds one."""
+"""The server of the page, for this computer only; plants and designs from files."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from .page import Page
 from .verdict import LoopLimits
 
 HOST = "127.0.0.1"
-#: of a session whose tab was closed, and how often that is checked [ms]
+#: lifetime of a session after its tab is closed, and period of the check [ms]
 _LIFETIME, _CHECKED = 4000, 1000
-#: how long a start or an end may take [s]
+#: largest duration of a start or an end [s]
 _TIMEOUT = 30.0
 
 
 def free_port() -> int:
-    """Return a port that nothing uses."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -90,7 +90,7 @@ class Served:
         return len(self._server.get_sessions())
 
     def wait(self) -> None:
-        """Return when the server ended, or at Ctrl-C."""
+        """Wait until the server ends or Ctrl-C is pressed."""
         try:
             while not self._over.wait(0.2):
                 pass
@@ -112,14 +112,14 @@ class Served:
 
 
 class WorkbenchServer(Bench):
-    """The page that `open_page` returns: it serves itself, and shows itself in a notebook.
+    """Server of the page, from `open_page`; in a notebook it displays the page.
 
     Parameters
     ----------
     machines : mapping {name: plant}
-        The first is shaped.
+        Plants; the loop is shaped on the first.
     design : LoopDesign
-        To begin with; `design` is what was shaped last in any tab.
+        First design. Later, `design` is the one that was changed last in any tab.
     model, channel, move, limits, source : as for `open_page`
 
     Examples
@@ -145,23 +145,23 @@ class WorkbenchServer(Bench):
         import panel as pn
 
         if in_notebook():
-            pn.extension()  # once for a notebook
+            pn.extension()  # a notebook shows it once
         return self.panel()._repr_mimebundle_(include, exclude)
 
     @property
     def url(self) -> str:
-        """Where the page is, while it is served."""
+        """Address of the page while it is served."""
         return "" if self._server is None else f"http://127.0.0.1:{self._server.port}/"
 
     def serve(self, port: int = 0, *, open_browser: bool = False, block: bool = False) -> Self:
-        """Serve the page on this machine, and on it alone.
+        """Serve the page on this computer only.
 
         Parameters
         ----------
         port : int
-            0 takes a free one.
+            Port of the server; 0 takes a free one.
         open_browser : bool
-            Whether to open it.
+            Whether to open the page in the browser.
         block : bool
             Whether to wait until Ctrl-C ends the server.
         """
@@ -177,7 +177,7 @@ class WorkbenchServer(Bench):
         return self
 
     def wait(self) -> None:
-        """Return when Ctrl-C, or `close` in another thread, ended the server."""
+        """Wait until Ctrl-C, or `close` in another thread, ends the server."""
         if self._server is not None:
             try:
                 self._server.wait()
@@ -214,33 +214,37 @@ def open_page(
 ) -> WorkbenchServer:
     """Open a page in the browser on which loops are shaped by hand, axis by axis.
 
-    The page is served on this machine only. In a notebook the object that is returned shows the
-    page in its cell; `WorkbenchServer.design` is what was shaped last.
+    The page is served on this computer only. In a notebook the returned object displays the page;
+    its attribute `design` is the present design.
 
     Parameters
     ----------
     plant : Frf, StandardPlant, StateSpace, or a list or mapping of them
-        Measured or modelled. Of several, a fleet, the first is shaped, the others are judged.
+        Measured or modelled plant. With several (a fleet) the loop is shaped on the first and
+        judged on all.
     design : LoopDesign, optional
-        To go on with; else each axis begins with PID and low-pass well below its resonances.
+        Design to continue. By default each axis begins with a PID controller and a low-pass filter
+        well below its resonances.
     model : StandardPlant or StateSpace, optional
-        Model of a measured plant: drawn with it, for its error and the truncated modes.
+        Model of a measured plant. It is drawn with the measurement, and gives the error and the
+        effect of truncated modes.
     before, after, rate, delay, hold, rigid, unstable, references
         As for `design_loops`; by default those of the plant or model: the axes that it drives.
     channel : str, optional
         Channel of z whose rms is predicted; by default the first error of the plant.
     move : SetPointProfile, optional
-        The set-point whose error is drawn; by default a unit step.
+        Set-point profile whose error is drawn; by default a unit step.
     limits : LoopLimits, optional
-        What the page draws as forbidden, and judges.
+        Limits that the page draws and checks.
     source : str
-        The line of Python that makes the plant, for the scripts that are copied.
+        Line of Python that makes the plant, for the script that the page writes.
     port : int
         Port of the server; 0 takes a free one.
     open_browser : bool
-        False returns the object without serving: call `serve`.
+        Whether to serve the page and open it. False returns the object only; call its `serve`
+        later.
     block : bool, optional
-        Whether to wait until Ctrl-C; unless given, where Python runs a script.
+        Whether to wait until Ctrl-C. By default only where Python runs a script.
 
     Returns
     -------
@@ -285,8 +289,8 @@ def open_file(
     Parameters
     ----------
     path : str or Path
-        An Frf in a universal, CSV, MATLAB or NumPy file; what `.save` of a plant, a response or a
-        LoopDesign wrote.
+        Universal, CSV, MATLAB or NumPy file with an Frf; or a file that `.save` of a plant, a
+        response or a LoopDesign wrote.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Wanted quantity of the outputs of a measurement; see `flexplant.io.read_frf_uff`.
     scale : float, optional
@@ -295,7 +299,7 @@ def open_file(
     Raises
     ------
     FlexplantError
-        When it holds none of these.
+        When the file holds none of these.
     ModelError
         When `quantity` or `scale` is given for something else than a measurement.
     FileNotFoundError

@@ -1,4 +1,4 @@
-"""Page: what one tab shows and does; each tab has its own design, history and pictures."""
+"""Page: one tab of the workbench, with its design, history and pictures."""
 
 from __future__ import annotations
 
@@ -34,19 +34,20 @@ from .verdict import (
 )
 from .views import KEPT, Gestures, Views
 
-#: of a burst of moves only the last is drawn; what takes longer waits until a hand rests [ms]
+#: delay before drawing, so that only the last of a burst of changes is drawn; delay before long
+#: computations, until the sliders rest; period of looking for their results [ms]
 _SOON, _LATER, _POLL = 3, 350, 300
 
 
 class Page:
-    """A tab. Everything it does is a change of a LoopDesign."""
+    """A tab. Every action changes its LoopDesign."""
 
     def __init__(self, bench: Bench) -> None:
         import panel as pn
 
         self.bench = bench
         self.limits = bench.limits
-        self.history = DesignHistory(bench.design)  # a page loaded again goes on
+        self.history = DesignHistory(bench.design)  # a page that is loaded again continues
         self.axis = next(iter(bench.start.axes))
         self.index = 0
         self.kept: list[tuple[str, LoopDesign, Consequences | None]] = []
@@ -192,11 +193,11 @@ class Page:
 
     @property
     def design(self) -> LoopDesign:
-        """The design as it is."""
+        """The present design."""
         return self.history.now
 
     def take(self, design: LoopDesign, key: Hashable = None, *, cards: bool = True) -> None:
-        """Take a changed design, if its laws exist; else say what is wrong."""
+        """Accept a changed design if its control laws exist; show the reason otherwise."""
         try:
             design.laws  # noqa: B018 - an element above half the rate is refused here
         except FlexplantError as problem:
@@ -208,18 +209,18 @@ class Page:
         self.soon()
 
     def refuse(self, text: str) -> None:
-        """Say what is wrong; the last good design stands."""
+        """Show an error; the last valid design stays."""
         self.message.object = refusal(text)
         self.message.visible = True
 
     def change_axis(self, axis: ShapedAxis, key: Hashable, cards: bool) -> None:
-        """Take a changed axis; changes of one key are one step, `cards` shows it everywhere."""
+        """Accept a changed axis; changes with one key are one step, `cards` rebuilds the cards."""
         design = self.design.with_axis(self.axis, axis)
         self.take(design, None if key is None else (self.axis, key), cards=cards)
         self.cards.axis = self.design.axes[self.axis]
 
     def change(self, key: Hashable = None, **changes: Any) -> None:
-        """Change fields of the axis that is shaped."""
+        """Change fields of the present axis."""
         self.change_axis(self.design.axes[self.axis].replace(**changes), key, True)
 
     def _set_gain(self, value: float) -> None:
@@ -350,7 +351,7 @@ class Page:
         self._waiting[name] = doc.add_timeout_callback(run, wait)
 
     def soon(self) -> None:
-        """Draw once when a burst of changes is over."""
+        """Draw once after a burst of changes."""
         self._later("draw", _SOON, self.draw)
 
     def draw(self) -> None:
@@ -369,7 +370,7 @@ class Page:
         self._serial += 1
         with hold():
             self.message.visible = False
-            # a handle that is dragged is where the hand is
+            # a handle that is dragged stays where the mouse is
             self.views.update(loop, design.axes[self.axis], handles=self.gestures.at is None)
             if not self._fitted:
                 self.views.fit(loop)
@@ -412,7 +413,7 @@ class Page:
             good = all(one.is_stable and one.modulus_margin >= least for one in self.fleet)
             rows.append(("fleet", self.fleet_text, good))
         if answer is not None:
-            said = self._said(answer)  # of the design before, while that of now is computed
+            said = self._said(answer)  # from the previous design at first
             rows += said if fresh else [(f"{name} ...", text, None) for name, text, _ in said]
         self.further.object = verdict_rows(rows)
 
@@ -433,7 +434,7 @@ class Page:
         rows += [(f"{name} of machines", text, None) for name, text in answer.on_machines]
         return [*rows, *(("not computed", text, None) for text in answer.missing)]
 
-    # -- what takes longer ----------------------------------------------------------------------
+    # -- long computations ----------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Begin with what takes longer when the page is on the screen."""
@@ -454,7 +455,7 @@ class Page:
         def work() -> None:
             try:
                 answer = question.answer(design, loop)
-            except Exception as problem:  # it must appear, and the next must not wait for it
+            except Exception as problem:  # it must appear, and the next step must not wait for it
                 answer = Consequences(missing=[f"no answer: {problem}"])
             # when a page or its server closes meanwhile, bokeh takes the callbacks apart
             with suppress(AttributeError):
@@ -481,7 +482,7 @@ class Page:
             self._later("consequences", _LATER, self._consequences)
 
     def tune(self, notches: int) -> None:
-        """Begin a search from the peak and the axes of the page."""
+        """Begin a search for laws with the limit of |S| and the axes of the page."""
         if self.tuning is not None:
             return
         plant = self.machine.given
@@ -523,7 +524,7 @@ class Page:
             self.side.show_tuning("stopped; the design is as it was", False)
 
     def hand_over(self, data: bytes) -> None:
-        """Take a file that was handed over: a design, or elements of a law."""
+        """Read an uploaded file: a design, or elements of a law."""
         try:
             given = given_file(data)
             if isinstance(given, LoopDesign):
@@ -547,7 +548,7 @@ class Page:
         self.take(now.replace(axes=given.axes))
 
     def start_anew(self) -> None:
-        """Take a new law of the axis: around the crossover that is typed, else a first one."""
+        """Start the law of the axis anew, around the crossover that was typed, if any."""
         at, freq = (
             (self.machine, list(self.design.axes).index(self.axis), self.design),
             self._wanted(),
@@ -555,7 +556,7 @@ class Page:
         self.change_axis(first_axis(*at) if freq is None else crossing_axis(*at, freq), None, True)
 
     def close(self) -> None:
-        """End what the tab has started."""
+        """End all work that the tab has started."""
         self._closed = True
         if self.tuning is not None:
             self.tuning.stop()

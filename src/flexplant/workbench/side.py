@@ -23,7 +23,7 @@ from ..synthesis.laws.law import LawElement
 from .controls import digits, parsed
 from .verdict import CARD, COMPACT, SMALL, heading, remark
 
-#: a file that a browser hands over, at most [bytes]
+#: largest size of an uploaded file [bytes]
 _LARGEST = 64_000_000
 
 
@@ -74,8 +74,8 @@ def _written(name: str, write: Callable[[Path], Any]) -> bytes:
 
 
 def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
-    """Return the design of a file that was handed over, or the elements that it gives a law."""
-    # files are ours alone (`.save`): arrays and JSON, never a pickle
+    """Return the design of an uploaded file, or the elements of a law in it."""
+    # only files of `.save` are read: arrays and JSON, never a pickle
     if len(data) > _LARGEST:
         raise ModelError(f"the file has {len(data) / 1e6:.0f} MB: a design has less than 64.")
     with tempfile.TemporaryDirectory() as folder:
@@ -99,7 +99,7 @@ def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
     )
 
 
-#: limits of the page: field of LoopLimits, label, unit; those in dB are typed so
+#: limits on the page: field of LoopLimits, label, unit; those in dB are typed in dB
 _LIMITS = (
     ("peak", "peak of |S|", "dB"), ("gain_margin", "gain margin", "dB"),
     ("phase_margin", "phase margin", "deg"), ("bandwidth", "bandwidth", "Hz"),
@@ -108,7 +108,7 @@ _LIMITS = (
 
 
 class SideCards:
-    """The cards next to the law; `page` is the tab that they belong to."""
+    """The cards next to the law; `page` is their tab."""
 
     def __init__(self, page: Any) -> None:
         self.page = page
@@ -204,7 +204,7 @@ class SideCards:
         return self._card("automatic", row, self.tuned, collapsed=False)
 
     def show_tuning(self, said: str, running: bool) -> None:
-        """Show how far a search is."""
+        """Show the progress of a search."""
         self.tuned.object = remark(said)
         self.start.disabled, self.stop.disabled = running, not running
 
@@ -221,7 +221,7 @@ class SideCards:
             ("report", "loops.html", self._report),
         )
         sampled = page.design.rate > 0.0
-        if not sampled:  # a computer runs sampled laws
+        if not sampled:  # only sampled laws run on a computer
             kinds = tuple(kind for kind in kinds if kind[0] not in ("C99", "sections"))
         buttons = [
             pn.widgets.FileDownload(

@@ -1,4 +1,4 @@
-"""What a loop shall keep, what it reaches, in words and in HTML."""
+"""Limits of a loop and whether they are met, in words and in HTML."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .evaluation import AxisLoop
 
 
 class Judged(NamedTuple):
-    """One limit: what is required, what was reached, whether it is met (None: not known)."""
+    """One limit: the required and the reached value, and whether it is met (None: not known)."""
 
     name: str
     required: str
@@ -26,20 +26,20 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopLimits(Value):
-    """Limits on each loop: None leaves one out.
+    """Limits on each loop; None means no limit.
 
     Parameters
     ----------
     peak : float
         Largest |S|; 2 is a modulus margin of 0.5, 6 dB.
     gain_margin : float, optional
-        Least factor on the gain.
+        Smallest factor on the gain that makes the loop unstable.
     phase_margin : float, optional [deg]
-        The least.
+        Smallest phase margin.
     bandwidth : float, optional [Hz]
-        The least at which |S| crosses 0 dB.
+        Lowest frequency at which |S| may cross 0 dB.
     suppressed, below : float, optional
-        |S| shall stay under `suppressed` up to the frequency `below` [Hz].
+        Largest |S| up to the frequency `below` [Hz].
     rms : float, optional
         Largest predicted rms of the error, in its unit.
 
@@ -59,13 +59,13 @@ class LoopLimits(Value):
     rms: float | None = field(default=None, metadata=checked(positive))
 
     def judged(self, loop: AxisLoop, rms: float | None = None) -> Iterator[Judged]:
-        """Yield each limit with what a loop reaches.
+        """Yield each limit with the value that a loop reaches.
 
         Parameters
         ----------
         loop : AxisLoop
         rms : float, optional
-            The predicted rms, where it is known.
+            Predicted rms, where it is known.
         """
         stable, margins = loop.is_stable, loop.margins
 
@@ -109,7 +109,7 @@ def decibels(gain: float) -> str:
 
 
 def stability_verdict(loop: AxisLoop) -> tuple[str, str]:
-    """Return whether a loop is stable, and how that was counted, with what lines leave open."""
+    """Return whether a loop is stable, how this was counted, and what measured lines leave open."""
     count, measured = loop.count, loop.machine.is_measured
     if count.unstable is None:
         return "stability not judged", count.reason
@@ -156,7 +156,7 @@ def of_fleet(loops: Sequence[AxisLoop]) -> tuple[str, int]:
     if not unstable and not unknown:
         text += f", least margin {margins[worst]:.2f} on {loops[worst].machine.name}"
     elif unstable:
-        # the farthest beyond: most unstable poles, then the closest to the critical point
+        # the worst: the most unstable poles, then the least distance from the critical point
         names = ", ".join(loop.machine.name for loop in unstable[:3])
         text += f"; unstable: {names}{' ...' if len(unstable) > 3 else ''}"
         if any(stable):
@@ -168,7 +168,7 @@ def of_fleet(loops: Sequence[AxisLoop]) -> tuple[str, int]:
     return text, worst
 
 
-#: of all widgets: small, so that a law is seen as a whole
+#: style of all widgets: small, so that a whole law fits on the screen
 COMPACT = """
 :host { --pane-gap: 4px; font-size: 12px; }
 .bk-input { height: 26px; font-size: 12px; padding: 0 6px; border-radius: 4px; }
@@ -200,7 +200,7 @@ def heading(text: str) -> str:
 
 
 def refusal(text: str) -> str:
-    """Return a message of what is wrong."""
+    """Return an error message."""
     return ERROR.format(escape(text))
 
 
@@ -214,7 +214,7 @@ def _state(stable: bool | None) -> str:
 
 
 def headline(loop: AxisLoop) -> str:
-    """Return the verdict of the axis that is shaped, with its figures."""
+    """Return the verdict on the present axis, with its figures."""
     cells = "".join(
         f'<td style="padding:0 14px 0 0;vertical-align:top"><div style="font-size:11px;'
         f'color:#5B6670">{escape(name)}</div><div style="font-size:14px;font-weight:600" '
@@ -250,7 +250,7 @@ def limit_verdicts(limits: Sequence[Judged]) -> str:
 
 
 def verdict_rows(rows: Sequence[tuple[str, str, bool | None]]) -> str:
-    """Return further verdicts: a name, what was found, whether that is good."""
+    """Return further verdicts: name, finding, and whether it is good."""
     found = "".join(
         f'<tr><td style="padding:0 10px 1px 0;color:#5B6670;white-space:nowrap;vertical-align:top">'
         f'{escape(name)}</td><td style="color:{"#1D2730" if good is None else _state(good)}">'

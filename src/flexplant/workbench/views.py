@@ -1,4 +1,4 @@
-"""Views: the pictures of the page, as Bokeh figures; what the mouse does in them."""
+"""Views: the pictures of the page as Bokeh figures, and the actions of the mouse in them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .evaluation import AxisLoop
 from .verdict import LoopLimits
 
 #: colours that differ in brightness too: the loop, its second curve, the worst machine,
-#: what is forbidden, the model with a measurement
+#: forbidden areas, and the model of a measured plant
 BLUE, ORANGE, RED, GREEN, GREY = "#0B6FB8", "#D98200", "#C23B22", "#2A8C55", "#9AA3AD"
 #: earlier designs, the latest first
 KEPT = ("#8C6BB1", "#B4935A", "#6AA39B", "#B77E96")
-#: points of a pale curve: peaks stay
+#: number of points of a pale curve; its peaks are kept
 _PALE = 360
 #: range of a gain below its largest value that is worth drawing [dB]
 _DEPTH = 120.0
-#: of a Nyquist picture, around the critical point
+#: range of a Nyquist picture around the critical point
 _NYQUIST = (-2.6, 1.2), (-1.9, 1.9)
 #: a curve beyond this is drawn on its edge, so that no line crosses the picture
 _EDGE = 60.0
@@ -233,7 +233,7 @@ class Views:
         fig.ygrid.grid_line_color = None
 
     def draw_limits(self, limits: LoopLimits) -> None:
-        """Draw what is forbidden: around -1, above the peak of |S|, above it at low frequency."""
+        """Draw forbidden areas: around -1, above the limit of |S|, and at low frequency."""
         from bokeh.models import BoxAnnotation
 
         turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 121)) / limits.peak
@@ -264,13 +264,13 @@ class Views:
             source.data = data
 
     def update(self, loop: AxisLoop, axis: ShapedAxis, *, handles: bool = True) -> None:
-        """Show a loop; nothing else changes, no range either."""
+        """Show a loop; the ranges of the axes do not change."""
         f, L = loop.freq, loop.L
         self._curves("main", loop)
         self._put("S T", x=f, y=magnitude_db(loop.T))
         if loop.deviation is not None:
             wide = DEVIATIONS * np.abs(loop.C) * loop.deviation
-            # down by 60 dB
+            # 60 dB below the largest value
             high, low = np.abs(L) + wide, np.maximum(np.abs(L) - wide, 1e-3 * np.abs(L))
             self._put("band", x=f, low=magnitude_db(low), high=magnitude_db(high))
         i = loop.machine.axes.names.index(loop.name)
@@ -341,7 +341,7 @@ class Views:
     def show_coupling(
         self, freq: FloatArray, others: Mapping[str, FloatArray], loop: AxisLoop
     ) -> None:
-        """Show how the axis moves the others, and how their loops change it."""
+        """Show how the axis moves the others, and how their loops change its response."""
         for k, values in enumerate(list(others.values())[:5]):
             self._put(f"coupling {k}", x=freq, y=magnitude_db(values))
         i = loop.machine.axes.names.index(loop.name)
@@ -351,7 +351,7 @@ class Views:
         self.figures["coupling"].title.text = f"to {names}; dashed: by their loops [dB]"
 
     def show_time(self, name: str, time: Any, error: Any, label: str = "") -> None:
-        """Show the error over time [s]; of the main curve all is seen."""
+        """Show the error over time [s]; the range contains the main curve."""
         x, y = 1e3 * np.asarray(time), np.asarray(error)
         self._put(f"time {name}", x=x, y=y)
         if name != "main":
@@ -374,7 +374,7 @@ class Views:
         self._put("budget", y=names, right=values, label=[f"{value:.3g}" for value in values])
 
     def fit(self, loop: AxisLoop) -> None:
-        """Choose all ranges for a loop: at the start, and anew by a button."""
+        """Set all ranges for a loop, at the start and by a button."""
         f = loop.freq
         first = next(iter(loop.margins.crossovers), f[0])
         low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * first)
@@ -425,21 +425,21 @@ def _visible_part(loop: AxisLoop) -> tuple[Any, Any]:
     return L.real[::step], L.imag[::step]
 
 
-#: how near a handle or a curve is that the mouse means, relative to the picture
+#: distance from the mouse within which a handle or curve is picked, relative to the picture
 _NEAR = 0.06
 
 
 class Gestures:
-    """What is dragged and clicked in the pictures of a page."""
+    """Dragging and clicking in the pictures of a page."""
 
     def __init__(self, page: Any) -> None:
         self.page = page
-        #: the element that is dragged
+        #: element that is dragged
         self.at: int | None = None
         self._height = 0.0
 
     def connect(self) -> None:
-        """Follow the mouse."""
+        """Connect the events of the mouse."""
         from bokeh.events import Pan, PanEnd, PanStart, Tap
 
         figure = self.page.views.figures["magnitude"]
@@ -457,7 +457,7 @@ class Gestures:
         return np.hypot(np.log(np.asarray(xs) / x) / wide, (np.asarray(ys) - y) / tall)
 
     def grasp(self, event: Any) -> None:
-        """Take the handle that is near, if one is."""
+        """Begin to drag the handle next to the mouse, if there is one."""
         handles = self.page.views.sources["handles"].data
         self.at = None
         if event.x is None or event.x <= 0.0 or not len(handles["x"]):
@@ -469,27 +469,27 @@ class Gestures:
             self._height = event.y
 
     def drag(self, event: Any) -> None:
-        """Move the element that is held: sideways its frequency, upwards the depth of a notch."""
+        """Move the dragged element: its frequency sideways, the depth of a notch up and down."""
         if self.at is None or event.x is None or not 0.0 < event.x < self.page.bench.top:
             return
         axis = self.page.design.axes[self.page.axis]
         element: Any = axis.elements[self.at].replace(freq=float(f"{event.x:.4g}"))
         if isinstance(element, Notch):  # up and down: its depth
             depth = element.depth * 10.0 ** ((event.y - self._height) / 20.0)
-            # as its slider
+            # as with its slider
             element = element.replace(depth=float(f"{min(max(depth, 1e-3), 10.0):.3g}"))
         self._height = event.y
         self.page.change_axis(with_element(axis, self.at, element), ("drag", self.at), True)
 
     def drop(self, event: Any) -> None:
-        """Leave the element where it is."""
+        """End the dragging of an element."""
         if self.at is not None:
             self.drag(event)
         self.at = None
         self.page.soon()
 
     def tap(self, name: str, event: Any) -> None:
-        """Take the machine of a fleet whose curve is clicked."""
+        """Show the machine of a fleet whose curve is clicked."""
         if len(self.page.bench.machines) < 2 or event.x is None or event.x <= 0.0:
             return
         fig = self.page.views.figures[name]
