@@ -39,7 +39,7 @@ class Controller(Value):
     Parameters
     ----------
     system : StateSpace
-        From measurements, references or estimates to actuators; it includes the sign of the
+        System from measurements, references or estimates to actuators; it includes the sign of the
         feedback.
     method : str
         Method of the design.

@@ -32,7 +32,8 @@ def design_h2(
     """Return the controller ``u = K y`` of least H2 norm from w to z: the rms of z for white w.
 
     With X and Y of the Riccati equations of control and of estimation, F and L their gains and
-    ``R = D12' D12`` (sampled: ``+ B2' X B2``), the least norm is, with L0 = 0 where continuous::
+    ``R = D12' D12`` (sampled: ``+ B2' X B2``), the square of the least norm is (L0 = 0 for a
+    continuous plant)::
 
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
@@ -50,9 +51,9 @@ def design_h2(
     Returns
     -------
     Controller
-        `gamma` is the H2 norm of the closed loop, `lower` the least one by the formula (none where
-        noise or effort had to be added), `certificate` what was checked, `left_out` the check
-        with the truncated modes.
+        Controller whose `gamma` is the H2 norm of the closed loop. `lower` is the least norm by the
+        formula (None where noise or effort had to be added), `certificate` holds the checks,
+        `left_out` the check with the truncated modes.
 
     Raises
     ------

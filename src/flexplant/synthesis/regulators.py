@@ -32,7 +32,8 @@ def lqr(
     Returns
     -------
     RiccatiSolution
-        `gain` is F (m, n), `poles` those of A - B F, `P` the cost x' P x from a state x.
+        Solution with the gain F (m, n) as `gain`, the poles of A - B F as `poles`, and `P`, so that
+        x' P x is the cost from a state x.
 
     Raises
     ------
@@ -76,7 +77,7 @@ def lqi(
     Returns
     -------
     RiccatiSolution
-        `gain` is F (m, n + p).
+        Solution with the gain F (m, n + p) as `gain`.
 
     Raises
     ------
@@ -255,9 +256,9 @@ def lqg(
 
 
 def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
-    """Return the state feedback F (m, n) that puts the poles of A - B F where they are asked for.
+    """Return the state feedback F (m, n) that places the poles of A - B F.
 
-    Several inputs are used to make the eigenvectors as independent as they can be.
+    With several inputs the eigenvectors are made as independent as possible.
 
     Parameters
     ----------

@@ -136,7 +136,7 @@ class AxisLoop:
 
     @cached_property
     def bandwidth(self) -> float:
-        """The frequency [Hz] at which |S| first crosses 1; NaN where it never does or S is unstable."""
+        """Frequency [Hz] at which |S| first crosses 1; NaN where it never does or S is unstable."""
         with suppress(AssumptionError):
             return float("nan") if self.count.unstable else broken_bandwidth(self.parts)
         return float("nan")

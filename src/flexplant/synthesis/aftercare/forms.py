@@ -287,7 +287,7 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     Parameters
     ----------
     controller : StateSpace or Controller
-        Sampled.
+        Sampled controller.
 
     Returns
     -------
@@ -404,14 +404,15 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     Parameters
     ----------
     controller : StateSpace or Controller
-        From y to u, continuous or sampled.
+        Controller from y to u, continuous or sampled.
     recovery : float [s], optional
         Time constant of the slowest poles of A - L C.
 
     Returns
     -------
     StateSpace
-        [y; u] -> u: a block of `close_loop`, which feeds it what the actuators apply.
+        System [y; u] -> u, a block of `close_loop`, which connects the applied commands to its
+        input u.
 
     Raises
     ------

@@ -94,11 +94,11 @@ def reduce_controller(
         Plant of the design, continuous or sampled like the controller. For a weighted plant gamma
         is kept.
     controller : StateSpace or Controller
-        From y to u; its integrators and unstable poles stay as they are.
+        Controller from y to u; its integrators and unstable poles are kept.
     order : int, optional
         Number of states of the result; by default the smallest that keeps the loop.
     loss : float
-        Relative loss of the modulus margin, or growth of gamma, that is allowed.
+        Allowed relative loss of the modulus margin, or growth of gamma.
 
     Returns
     -------
@@ -321,13 +321,13 @@ def discretise_controller(
     Parameters
     ----------
     plant : StandardPlant
-        Sampled: ``plant.discretized(rate, delay=)`` of a plant that is not weighted.
+        Sampled plant without weights, ``plant.discretized(rate, delay=)``.
     controller : StateSpace or Controller
-        Continuous, from y to u.
+        Continuous controller, from y to u.
     prewarp : float [Hz], optional
-        A frequency that keeps its response: a notch, the crossover.
+        Frequency at which the response is kept, such as that of a notch or of the crossover.
     loss : float
-        Relative loss of the modulus margin that is allowed.
+        Allowed relative loss of the modulus margin.
 
     Returns
     -------

@@ -62,13 +62,14 @@ def design_ncf(
     Parameters
     ----------
     plant : StandardPlant or StateSpace
-        Its u -> y; a StateSpace is taken as it is.
+        Plant, of which u -> y is used; a StateSpace is used whole.
     before, after : StateSpace or array, optional
         Shaping at u and at y, with the plant's sampling time: filters that give the loop its slope,
         and transformations to decoupled axes (`decouple`: accelerations and to_motions).
     bandwidth : float [Hz], optional
-        Recipe: each channel of the square ``after G before`` is multiplied further by
-        ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with gain 1 at the bandwidth.
+        Bandwidth of every channel. ``after G before`` must be square; each of its channels is
+        multiplied by ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with k for a gain of 1 at the
+        bandwidth.
     back_off : float
         Relative distance from gamma_min, at which K_s is singular.
 
@@ -218,9 +219,9 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     Parameters
     ----------
     plant : StandardPlant or StateSpace
-        Its u -> y.
+        Plant, of which u -> y is used.
     controller : Controller or StateSpace
-        From y to u, channels in the plant's order.
+        Controller from y to u, its channels in the plant's order.
 
     Returns
     -------

@@ -70,11 +70,12 @@ def design_stage(
     problem is solved by ``design_hinf(uncertain=)``. The result is the design of largest bandwidth
     that satisfies three conditions. The modulus margin at u is at least `margin`, also with
     truncated modes if they are known. It is at least 7/8 of `margin` if the frequency of any one
-    mode is off by its uncertainty. The same holds on each of 20 machines, and so on a further one
-    with a probability of 20/21 (95 %). They are the machines that agree with the measurement
+    mode is off by its uncertainty. The same holds on each of 20 machines drawn at random, and hence
+    on a further one with a probability of 20/21 (95 %). The machines agree with the measurement
     (`StandardPlant.machines`) where the plant comes from a calibrated fit and no frequencies are
-    stated. Otherwise all frequencies change at once by what is stated, shapes with them, and
-    dampings by 30 % unless stated; the certificate has the margin on the machines of a fit as well.
+    stated. Otherwise all their frequencies change at once by what is stated, their shapes with
+    them, and their dampings by 30 % unless stated. The certificate has the margin on the machines
+    of a fit as well.
 
     Parameters
     ----------
@@ -98,10 +99,10 @@ def design_stage(
     Returns
     -------
     Controller
-        From the sensors and the reference to the actuators: ``close_loop(plant, controller)``.
-        `tried` lists the bandwidths of the weights with their modulus margins, 0 where the loop
-        does not tolerate the errors of its modes; `certificate` has the margin of the final design,
-        and the least modulus margin of the machines drawn.
+        Controller from the sensors and the reference to the actuators: ``close_loop(plant,
+        controller)``. `tried` lists the bandwidths of the weights with their modulus margins, 0
+        where the loop does not tolerate the errors of its modes; `certificate` has the margin of
+        the final design, and the least modulus margin of the machines drawn.
 
     Raises
     ------

@@ -61,7 +61,7 @@ def design_lmi(
         Usually weighted; at most max_states states. For a sampled plant, damping and bandwidth of a
         PoleRegion are not convex: the poles are kept in a polygon and a disc inside the region.
     minimize : H2, Hinf or PeakGain
-        Without `below`.
+        Objective that is minimised, without `below`.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
         Constraints.
     back_off : float

@@ -94,8 +94,8 @@ class MarginTable(Value):
     disks : tuple of tuples of DiskMargin
         For each loop the disks S-T, S and T.
     together : tuple of DiskMargin
-        The same three where all loops change at once, each by its own complex factor: bounds of
-        the structured singular value. One loop has the same disks here.
+        The same three disks where all loops change at once, each by a separate complex factor:
+        bounds of the structured singular value. One loop has the same disks here.
     """
 
     loops: tuple[LoopMargins, ...]

@@ -108,11 +108,11 @@ def design_mu(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M, blocks)`, continuous
-        or sampled.
+        Uncertain plant from `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M,
+        blocks)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
-        Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
-        None leaves a channel out, as does not naming it.
+        Weights of performance, as for `StandardPlant.weighted` (also those of `stage_weights`).
+        Channels that are not named, or have the weight None, are left out.
     method : as for `design_hinf`, optional
     iterations : int
         Largest number of steps.

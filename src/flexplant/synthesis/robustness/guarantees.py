@@ -129,9 +129,10 @@ def robust_stability(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M, blocks)`.
+        Uncertain plant from `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M,
+        blocks)`.
     *blocks : StateSpace, or values with a `system`
-        The controller, as for `close_loop`.
+        Controller, as for `close_loop`.
     quick : bool
         If all Deltas are frequencies, first compute a simpler bound: one channel for each mode, to
         first order, on a grid through the resonances (a fraction of a second for ten modes). If it

@@ -226,8 +226,8 @@ def uncertain_loop(
     loop = _nominal_loop(uncertain.plant, blocks)
     if loop.obstacle is not None:
         raise AssumptionError(
-            f"the loop is {loop.obstacle.reason} without any uncertainty: there is nothing to be "
-            "robust about. Design a controller that stabilises the nominal plant first."
+            f"the loop is {loop.obstacle.reason} without any uncertainty. Design a controller that "
+            "stabilises the nominal plant first."
         )
     # stability: what the loop does not see has no part
     plant = open_plant(uncertain, w=w, z=z, loop=None if z else loop)

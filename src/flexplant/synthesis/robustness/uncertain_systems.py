@@ -64,16 +64,16 @@ def uncertain_system(
               z <---|  M  |<--- w
               y <---|     |<--- u
 
-    The answer is what `robust_stability`, `worst_case_gain`, `robust_performance` and `design_mu`
-    take; ``.lft(values)`` closes some Deltas, ``.machines.drawn(count)`` draws systems. Without u
-    and y it is a loop that is closed already: ``robust_stability(uncertain)``.
+    The result is an input of `robust_stability`, `worst_case_gain`, `robust_performance` and
+    `design_mu`; ``.lft(values)`` closes some Deltas, ``.machines.drawn(count)`` draws systems.
+    Without u and y it is a loop that is closed already: ``robust_stability(uncertain)``.
 
     Parameters
     ----------
     M : StateSpace or control.StateSpace
         System with named channels, continuous or sampled, which includes the weights of the Deltas.
     blocks : sequence of RepeatedScalar and FullBlock
-        In the order of the channels; those without a name are called `delta1`, `delta2`, ...
+        Blocks in the order of the channels; those without a name are called `delta1`, `delta2`, ...
     u, y : sequences of str
         Inputs that the controller drives and outputs that it reads.
 

@@ -253,10 +253,10 @@ class Judge(Protocol):
 
 
 class LoopObjective(Protocol):
-    """What `design_structured` minimises; `Hinf`, `H2` and `PeakGain` are such values.
+    """Objective of `design_structured`: `Hinf`, `H2`, `PeakGain` or a `MeasuredObjective`.
 
-    A number of the loop from some w to some z, in multiples of `below` where that is given. One of
-    your own derives from `MeasuredObjective`.
+    It is a number of the loop from some w to some z, in multiples of `below` where that is given.
+    Your own objective derives from `MeasuredObjective`.
     """
 
     @property

@@ -84,8 +84,8 @@ def design_structured(
         Structure of the controller, and start of the search.
     objective : Hinf, H2, PeakGain, MeasuredObjective, or sequence of these
         Objective to be minimised; of several objectives, each with `below`, the largest ratio to
-        it. One of your own is a kind of `synthesis.MeasuredObjective`. H2 of a continuous plant is
-        finite for controllers without feedthrough where D12 and D21 are:
+        it. Your own objective derives from `synthesis.MeasuredObjective`. The H2 norm of a
+        continuous plant with D12 and D21 is finite only without a feedthrough of the controller:
         ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
@@ -104,12 +104,13 @@ def design_structured(
     Returns
     -------
     Controller
-        `structure` is the one given with the numbers found: a further design can begin there.
-        `gamma` is the largest verified norm (over `below`), `tried` the result of each start. The
-        certificate holds the norm of each plant and objective (for plants by position the worst
-        one, also between positions), and two figures of the local minimum: `slope`, the norm of the
-        smallest convex combination of the gradients of log gamma, and `decrease left`, the relative
-        decrease of gamma by a step of length `radius`, to first order.
+        Controller. Its `structure` is the given one with the parameters found, from which a further
+        design can begin. `gamma` is the largest verified norm (over `below`), `tried` the result of
+        each start. The certificate holds the norm of each plant and objective (for plants by
+        position the worst one, also between positions), and two figures of the local minimum:
+        `slope`, the norm of the smallest convex combination of the gradients of log gamma, and
+        `decrease left`, the relative decrease of gamma by a step of length `radius`, to first
+        order.
 
     Raises
     ------

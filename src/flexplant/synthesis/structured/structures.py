@@ -81,7 +81,7 @@ class ControllerFamily:
 
 
 class ControllerStructure(Protocol):
-    """What `design_structured` takes: a value that makes itself ready for a plant."""
+    """Structure of a controller for `design_structured`, which it makes ready for a plant."""
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
@@ -126,7 +126,7 @@ class FixedOrder(Value):
             )
         if self.pattern is not None:
             if self.order:
-                raise ModelError("a pattern is that of a static gain: leave order out, or it.")
+                raise ModelError("pattern= is for a static gain (order 0): leave out order=, or pattern=.")
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> _Entries:
