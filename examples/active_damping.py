@@ -5,8 +5,8 @@ and a sensor at its tip damp it, a drive at its foot moves it. Velocity feedback
 feedback (PPF) and integral resonant control (IRC) are tuned by `damp_modes` for the damping ratio
 of the first mode, and compared with an H-infinity controller between the same coil and sensor. The
 plant has two of the four modes; every loop is judged on all of them. H-infinity leaves a smaller
-motion than any damper, with a law that knows the two modes of the plant, and a warning says that
-it brings |S| of the machine's other modes up to where a small error of these matters.
+motion than any damper, because it uses the two modes of the plant. A warning says that |S| is large
+at the machine's other modes, so that small errors of these modes matter.
 
 Then the mast moves: the drive has the static force of the set-point and an integral law of 1 Hz,
 which is stable with the damper and unstable without it. A set-point leaves a vibration, which

@@ -8,7 +8,7 @@ points, (2) finds the worst gain from set-point to error, and the machine that h
 that machine, (4) compares both with the virtual machine, which is computed with another theory than
 all models here, (5) shows mu of an H-infinity controller that ignores the modes above, (6) reduces
 that controller, weighted by its loop, and writes it in C. The script stops when one of its claims
-is no longer true.
+is not true.
 """
 
 # %% Names and numbers

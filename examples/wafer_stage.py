@@ -1,7 +1,7 @@
 """A wafer stage that differs from its drawing: what a model and a measurement gain.
 
-``python examples/wafer_stage.py`` reduces a meshed plate, updates it and tries estimates, tolerant
-controllers and a further sensor on a virtual machine of another theory; untrue claims stop it.
+``python examples/wafer_stage.py`` reduces and updates a meshed plate. It tests estimates, loops
+and a further sensor on a virtual machine of another formulation, and stops if a claim is not true.
 """
 
 # %% Names and numbers

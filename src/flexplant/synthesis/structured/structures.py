@@ -126,7 +126,7 @@ class FixedOrder(Value):
             )
         if self.pattern is not None:
             if self.order:
-                raise ModelError("pattern= is for a static gain (order 0): leave out order=, or pattern=.")
+                raise ModelError("pattern= is for a static gain (order 0): omit one of the two.")
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> _Entries:
