@@ -1,5 +1,6 @@
 """DofSet: labels, places, tables."""
 
+import ast
 import pickle
 import time
 
@@ -80,6 +81,18 @@ def test_unknown_labels_name_close_ones():
         DOFS.indices(["7:z", "8:z"])
     assert "8:z" not in DOFS
     assert DOFS.indices("3:z").tolist() == [2]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_point_next_to_a_rigid_body_gets_weights_of_its_motions(seed):
+    """The mapping in the message gives the motion t + w x r of the body at the point."""
+    node, point, t, w = np.random.default_rng(seed).normal(size=(4, 3))
+    body = DofSet([5] * 6, DIRECTIONS, [node] * 6)
+    for axis, wanted in zip("xyz", t + np.cross(w, point - node), strict=True):
+        with pytest.raises(LabelError, match="rigidly with node 5: at=") as refusal:
+            body.row(point, axis)
+        place = ast.literal_eval(str(refusal.value).rpartition("at=")[2].rstrip("."))
+        assert body.row(place) @ [*t, *w] == pytest.approx(wanted, rel=1e-4)
 
 
 def test_rows_of_places():

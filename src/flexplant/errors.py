@@ -116,9 +116,9 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def some_names(names: Sequence[str], most: int = 6) -> str:
-    """Return some names in a row, and how many more there are."""
-    more = f", ... ({len(names)} in all)" if len(names) > most else ""
+def some_names(names: Sequence[str], most: int = 6, *, total: bool = True) -> str:
+    """Return the first names in a row, and the number of all where it is not said otherwise."""
+    more = f", ...{f' ({len(names)} in all)' if total else ''}" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 

@@ -354,8 +354,22 @@ class DofSet(Value):
                 f"direction {direction!r} ({label!r}), and this model has no shape functions to "
                 f"interpolate with. Use at={label!r}, a mapping {{label: weight}}, or interpolate "
                 "the shapes between nodes: flexplant.interpolated(model)."
+                f"{self._attached(label, point, direction)}"
             )
         return row
+
+    def _attached(self, label: str, point: FloatArray, direction: str) -> str:
+        """Return how a point is given that moves rigidly with the node of a label, if it can be."""
+        k, node = DIRECTIONS.index(direction), label.partition(":")[0]
+        offset = point - self.xyz[self.index(label)]
+        turned = np.cross(np.eye(3), offset)[:, k].tolist() if k < 3 else [0.0, 0.0, 0.0]
+        small = SAME * float(np.linalg.norm(offset))
+        sizes = {f"{node}:r{axis}": by for axis, by in zip("xyz", turned, strict=True)}
+        weights = {name: by for name, by in sizes.items() if abs(by) > small}
+        if not weights or not all(name in self for name in weights):
+            return ""
+        shown = ", ".join(f"{name!r}: {by:.6g}" for name, by in ({label: 1.0} | weights).items())
+        return f" Where it moves rigidly with node {node}: at={{{shown}}}."
 
     def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
         """Return the rows (p, n) of the motion at many points (p, 3) [m]; see `row`."""

@@ -53,9 +53,7 @@ def test_value_survives_file_and_pickle(tmp_path):
 
 def test_repr_is_one_line_without_arrays():
     text = repr(MeasuredModes([-1 + 100j * k for k in range(1, 10)], modes=range(4, 13)))
-    assert text.startswith(
-        "<MeasuredModes: 9 poles, modes 4, 5, 6, 7, 8, 9, ... (9 in all) at 15.9"
-    )
+    assert text.startswith("<MeasuredModes: 9 poles, modes 4, 5, 6, 7, 8, 9, ... at 15.9")
     assert "\n" not in text
     assert "array" not in text
 

@@ -163,11 +163,12 @@ class MeasuredModes(Value):
         return int(self.poles.size)
 
     def __repr__(self) -> str:
-        known = "" if self.modes is None else ", modes " + some_names([*map(str, self.modes)])
+        numbers = some_names([*map(str, self.modes or ())], total=False)
+        known = f", modes {numbers}" if numbers else ""
         spread = "" if self.covariance is None else ", with covariance"
         return (
             f"<MeasuredModes: {counted(len(self), 'pole')}{known} at "
-            f"{some_names([f'{f:.1f}' for f in self.freq])} Hz{spread}>"
+            f"{some_names([f'{f:.1f}' for f in self.freq], total=False)} Hz{spread}>"
         )
 
     @property

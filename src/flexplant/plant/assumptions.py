@@ -42,6 +42,11 @@ class _Pole(NamedTuple):
     right: ComplexArray
 
 
+def _swings(pole: _Pole) -> bool:
+    """Return whether a pole is that of an undamped mode."""
+    return bool(pole.value.imag) and abs(pole.value.real) <= SAME * abs(pole.value)
+
+
 def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
     """Return which modes that do not decay w and u reach, and y and z see (Hautus)."""
     bare = plant.machine.continuous
@@ -54,13 +59,20 @@ def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
     found = []
     for case in _cases(bare, poles, plant):
         groups = sampled if case.held else apart
-        texts = [text for group in groups for text in _lacks(bare, group, case, rate)]
+        lacks = [(group[0], _lacks(bare, group, case, rate)) for group in groups]
+        texts = [text for _, said in lacks for text in said]
         texts = list(dict.fromkeys([*texts, *_weights_without(plant, case.key)]))
         listed = f"(channels: {', '.join(case.names) or 'none'})"
         if texts:
             more = len(texts) - SHOWN
             text = "; ".join(texts[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
-            found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
+            remedy = case.remedy
+            if any(said and _swings(pole) for pole, said in lacks):
+                remedy += (
+                    " Or give undamped modes damping: solve_modes(model, damping=...), or "
+                    "model.with_damping(...) before an update."
+                )
+            found.append(Assumption(case.key, False, f"{text} {listed}.", remedy))
             continue
         text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
         found.append(Assumption(case.key, True, text if words else "every mode decays."))
@@ -77,9 +89,8 @@ def _undamped_kinds(plant: PartitionedSystem, poles: list[_Pole]) -> list[str]:
     own = plant.realisation
     freq: list[float] = []
     for pole in poles:
-        size = abs(pole.value) / (2 * np.pi)
-        if own.n_modes and pole.value.imag and abs(pole.value.real) <= SAME * size:
-            freq += [size] * pole.left.shape[1]
+        if own.n_modes and _swings(pole):
+            freq += [abs(pole.value) / (2 * np.pi)] * pole.left.shape[1]
     if freq:
         span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
         words.append(f"{counted(len(freq), 'undamped mode')} at {span} Hz")

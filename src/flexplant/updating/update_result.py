@@ -446,8 +446,9 @@ class UpdateResult(Value):
         """
         if not hasattr(self.model, "calibrated"):
             raise ModelError(
-                "a full model has too many modes for a calibration. Use "
-                "fit.modes(count=...).calibrated(measured)."
+                "calibrated needs a reduced model, as intervals of results do: update "
+                "fx.reduce(modes, fx.DesiredDofs(labels)), with the damping in its modes. Without "
+                "intervals: fit.modes(count=...).calibrated(measured)."
             )
         found = self.model.calibrated(measured)
         return found.replace(machines=self.machines(measured)) if self.unknowns else found
