@@ -532,3 +532,18 @@ def test_a_sentence_stands_where_something_is_missing():
     alone = fx.design_kalman(plant.replace(evaluation=None))
     assert alone.interval("die:z").low is None
     assert "evaluation=" in alone.interval("die:z").sentence
+
+
+def test_damping_that_couples_modes_leaves_a_sentence_in_place_of_an_interval(case):
+    """Dampers beyond modal damping: nothing that is printed raises."""
+    between = {"7:z": 1.0, "5:z": -0.5, "9:z": -0.5}  # no rigid-body motion
+    damped = case.changed.with_damping(fx.structure.Rayleigh(0.0, 1e-6))
+    damped = damped.with_parts(fx.Damper(between, 300.0))
+    evaluation = fx.solve_modes(damped, count=26)
+    model = case.fit.calibrated(case.measured)
+    coupled = fx.assemble_plant(model, ports(), evaluation=evaluation).discretized(5e3, delay=1)
+    observer = fx.design_kalman(coupled)
+    assert "damping couples those of the evaluation model" in repr(observer)
+    assert observer.interval("die:z").low is None
+    with pytest.raises(ModelError, match="damping couples"):
+        coupled.machines.drawn(2)

@@ -300,7 +300,10 @@ def _frf(
     quantity: str | None,
     axis: int | None,
 ) -> Frf:
-    require_known("array", (freq, data), content, repr(str(path)))
+    try:
+        require_known("array", (freq, data), content, repr(str(path)))
+    except LabelError as error:
+        raise LabelError(f"{error} Name them: freq='...', data='...'.") from None
     grid, responses = np.ravel(content[freq]), np.asarray(content[data])
     for name, array in ((freq, grid), (data, responses)):
         if array.dtype.kind not in "iufc":

@@ -135,15 +135,22 @@ class _Change(NamedTuple):
     stiffness: FloatArray
 
 
+def obstacle(whole: ModalRealisation) -> str:
+    """Return why machines cannot be drawn in the modes of a model, empty where they can."""
+    if whole.form == MODAL and whole.coupling is None and not np.any(whole.inputs[:, ::2]):
+        return ""
+    return (
+        "machines are drawn in real modes, and damping couples those of the evaluation model: "
+        "pass Modes with ModalDamping as evaluation="
+    )
+
+
 class MachineFamily:
     """The machines of an update, in the modes of one evaluation model; see `Machines`."""
 
     def __init__(self, whole: ModalRealisation, machines: Machines) -> None:
-        if whole.form != MODAL or whole.coupling is not None or np.any(whole.inputs[:, ::2]):
-            raise ModelError(
-                "machines are drawn in real modes, and damping couples those of the evaluation "
-                "model. Pass Modes with ModalDamping as evaluation=."
-            )
+        if reason := obstacle(whole):
+            raise ModelError(f"{reason}.")
         self.whole, self.machines = whole, machines
         self.space = ModeSpace(whole)
         self.omega, self.zeta = self.space.omega, self.space.zeta

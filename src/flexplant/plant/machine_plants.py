@@ -16,7 +16,7 @@ from ..tolerances import INTERVAL
 from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit, with_unit
-from .machine_draws import DrawnModes, MachineFamily, StatedFamily
+from .machine_draws import DrawnModes, MachineFamily, StatedFamily, obstacle
 from .partitioned import MeasuredResponse
 from .ports import Ports
 from .remade import MachineParts
@@ -103,7 +103,9 @@ class PlantMachines:
     @property
     def missing(self) -> str:
         """Data that are missing for an interval, in words; empty when none are missing."""
-        return "" if self.fit is None else self.fit.missing
+        if self.fit is None:
+            return ""
+        return self.fit.missing or obstacle(self._base.assembled.realisation)
 
     @cached_property
     def plants(self) -> list[Any]:

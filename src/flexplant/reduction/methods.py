@@ -274,7 +274,7 @@ class DesiredDofs(ReductionMethod):
             modes = modes.select(range(len(labels)))
         k = modes.n_modes + modes.n_vectors
         require_real(
-            modes, "(5) has no diagonal form: add dampers later, or keep D by reduction.Serep(dofs)"
+            modes, "(5) is not diagonal: add dampers later, or reduce(model, reduction.Serep(dofs))"
         )
         if len(labels) != k:
             advice = f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"

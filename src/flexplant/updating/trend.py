@@ -202,8 +202,8 @@ class Trend(Value):
         if self.half_measured_pairs:
             mode, other = self.half_measured_pairs[0]
             return (
-                f"mode {other} was not measured, and mode {mode} so near to it may be a mixture of "
-                "both: measure both, or number them with a smaller least_mac="
+                f"mode {other} was not measured, and mode {mode}, which is close to it, may be a "
+                "mixture of both: measure both, or number them with a smaller least_mac="
             )
         if self.unshaped_pairs:
             pairs = ", ".join(f"{a} and {b}" for a, b in self.unshaped_pairs)
