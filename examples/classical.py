@@ -100,7 +100,8 @@ if __name__ == "__main__":
     masses = two_masses()
     print(fx.synthesis.robust_stability(masses, lqg_of(masses)))
     pd = delayed_pd()
-    print(pd, pd.margins, f"T below {pd.norm('T')[0]:.2f}", sep="\n  ")
+    kept = [f"{name} {most:.3g} at {at:.3g} Hz" for name, (most, at) in pd.margins.items()]
+    print(pd, "margins: " + ", ".join(kept), f"T below {pd.norm('T')[0]:.2f}", sep="\n  ")
     for name, found in tuned().items():
         print(f"{name}: {found}")
     print(*motor(), sep="\n")
