@@ -109,8 +109,8 @@ def claims(found: dict[str, Any]) -> dict[str, bool]:
     sizes, real = (full.system.n_states, small.system.n_states), peak(found["machine"])
     drawn = max(found["gains"])
     return {
-        f"every machine whose modes are off by what is not known of them, and with any modes "
-        f"beyond the model below their weight, is stable: mu <= {robust.upper:.3g}": (
+        f"every machine with frequencies within their uncertainty, and with any higher modes below "
+        f"their weight, is stable: mu <= {robust.upper:.3g}": (
             robust.is_robust and found["machine"].is_stable
         ),
         f"the gain from set-point to error is at most {worst.upper:.3f} on every one of them, and "

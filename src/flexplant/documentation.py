@@ -75,14 +75,8 @@ def _run(story: Path) -> None:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "examples"
         shutil.copytree(_EXAMPLES, copy, ignore=shutil.ignore_patterns("out", "*.png", "__*"))
-        if story.stem.startswith("test_"):
-            command = [
-                "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-p", "no:warnings",
-            ]  # fmt: skip
-        else:
-            command = []
         answer = subprocess.run(
-            [sys.executable, *command, str(copy / story.name), *_ARGUMENTS.get(story.stem, ())],
+            [sys.executable, str(copy / story.name), *_ARGUMENTS.get(story.stem, ())],
             capture_output=True,
             text=True,
             env=os.environ | {"MPLBACKEND": "Agg"},
