@@ -204,7 +204,7 @@ def table(result: dict[str, Any]) -> str:
     each = result["tables"]["one for each"]
     said, there = each["margin expected"], each["modulus margin"]
     lines.append(
-        f"one for each: modulus margin at least {said.min():.3f} predicted, {there.min():.3f} on the "
+        f"one for each: modulus margin at least {said.min():.3f} predicted, {there.min():.3f} on "
         f"machines, at most {max(0.0, 100 * np.max(1 - there / said)):.1f} % below the prediction"
     )
     lines.append("error rms: of die:error from 0.3 to 0.6 s; MA: largest mean of it over 5 ms")
