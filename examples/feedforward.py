@@ -9,11 +9,11 @@ move, and the mean over 5 ms after it::
 
     feedforward      best servo         tolerant
                    largest   after   largest   after
-    none              5410    1870      1170     149
-    acceleration        72      16        33     8.3
-    jerk               6.5     1.6       5.4     1.9
-    snap               3.4     0.1       4.5     0.5
-    inverse            3.0     0.2       3.3     0.2
+    none              5850    3090      1170     148
+    acceleration        87      26        33     8.3
+    jerk               9.8     2.8       5.4     1.9
+    snap               4.2     0.4       4.4     0.5
+    inverse            2.9     0.2       3.3     0.2
 """
 
 # %% Names and numbers
