@@ -82,13 +82,6 @@ class Certificate(Value, Mapping[str, float]):
     def __post_init__(self) -> None:
         self._set(checks=tuple({check.what: check for check in self.checks}.values()))
 
-    @classmethod
-    def of(cls, figures: Mapping[str, Any], *, route: str = "") -> Certificate:
-        """Return the certificate of figures without limits; one that is a certificate stays."""
-        if isinstance(figures, Certificate):
-            return figures
-        return cls(tuple(Verified(str(what), float(one), route) for what, one in figures.items()))
-
     @property
     def holds(self) -> bool:
         """Whether all limits are kept."""
@@ -106,23 +99,18 @@ class Certificate(Value, Mapping[str, float]):
         """Return the number of checks."""
         return len(self.checks)
 
-    def __or__(self, other: Mapping[str, float]) -> Certificate:
+    def __or__(self, other: Certificate) -> Certificate:
         """Return the checks of both; those of the other replace checks of the same thing."""
-        return Certificate((*self.checks, *Certificate.of(other).checks))
+        return self.extended(*other.checks)
 
-    def __ror__(self, other: Mapping[str, float]) -> Certificate:
-        """Return the checks of both, for a mapping of figures on the left."""
-        return Certificate.of(other) | self
+    def extended(self, *checks: Verified) -> Certificate:
+        """Return the certificate with further checks; they replace checks of the same thing."""
+        return Certificate((*self.checks, *checks))
 
     def __repr__(self) -> str:
         """Return a table of the checks."""
         lines = aligned(["checked", "figure", "limit", "route"], (c.row for c in self.checks))
         return "\n".join(["<Certificate", *(f"  {line}" for line in lines)]) + ">"
-
-
-def as_certificate(value: Any, name: str) -> Certificate:
-    """Return a certificate, from one or from a mapping of figures."""
-    return Certificate.of(value or {})
 
 
 def stability_name(sampled: Any) -> str:

@@ -268,7 +268,10 @@ def test_machines_are_plants_of_their_matrices(case, plant):
     omega, V = own(modes)
     zeta = -0.5 * np.trace(modes.pairs, axis1=1, axis2=2)[2:] / omega[2:]
     by_hand = case.whole.replace(
-        omega=omega, zeta=np.append([0.0, 0.0], zeta), phi=case.whole.phi @ V, certificate={}
+        omega=omega,
+        zeta=np.append([0.0, 0.0], zeta),
+        phi=case.whole.phi @ V,
+        certificate=fx.loop.Certificate(),
     )
     plain = fx.assemble_plant(by_hand, ports()).discretized(5e3, delay=1)
     freq = np.array([3.0, 57.0, 411.0, 1300.0])

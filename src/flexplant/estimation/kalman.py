@@ -88,8 +88,9 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
     if found is None:
-        observer, none = _observer(plant, None), {} if whole is None else {LEFT_OUT: 0.0}
-        return observer.replace(certificate=observer.certificate | none)
+        observer = _observer(plant, None)
+        checks = () if whole is None else (_left_out_check(0),)
+        return observer.replace(certificate=observer.certificate.extended(*checks))
     if machines is None:
         return _judged(plant, found)
     noises = [found, *unsure_noise(found, plant, machines)]
@@ -123,10 +124,15 @@ def _judged(plant: AnyPlant, found: LeftOut) -> KalmanEstimator:
     """Return the filter of a plant and of truncated modes, with its errors on the larger plant."""
     observer = _observer(plant, found)
     complete = error_variances(plant.around(found.whole.machine), observer.system)
-    certificate = observer.certificate | {LEFT_OUT: float(found.modes.size)}
+    certificate = observer.certificate.extended(_left_out_check(found.modes.size))
     if complete.difference > certificate["difference"]:
-        certificate |= Certificate((_difference_check(complete.difference, CLOSE),))
+        certificate = certificate.extended(_difference_check(complete.difference, CLOSE))
     return observer.replace(certificate=certificate, variances=complete.values)
+
+
+def _left_out_check(count: int) -> Verified:
+    """Return the number of truncated modes whose noise the filter includes."""
+    return Verified(LEFT_OUT, float(count), "the evaluation model")
 
 
 def redesigned(

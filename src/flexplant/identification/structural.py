@@ -104,7 +104,7 @@ def structural_modes(
     A, G, fast = at.smooth(outside)
     body = at.rigid(A, dofs, rows) if free else np.zeros((len(labels), 0))
     residual = at.residual(G, fast)
-    certificate = Certificate.of({"imaginary": imaginary}, route="imaginary parts of the shapes")
+    certificate = Certificate((Verified("imaginary", imaginary, "parts of the shapes"),))
     columns = [body, shapes.real, np.hstack([outside.shapes.real, residual])]
     place = dofs
     if over is not None:
@@ -112,7 +112,7 @@ def structural_modes(
         left = np.linalg.norm(columns[1] - E[rows] @ columns[1], axis=0)
         worst = float(np.max(left / np.linalg.norm(columns[1], axis=0)))
         check = Verified("expansion", worst, "least squares of the shapes", MISSED_SHAPE)
-        certificate |= Certificate((check,))
+        certificate = certificate.extended(check)
         columns = [E @ one for one in columns]
     else:
         place = dofs.select(labels)

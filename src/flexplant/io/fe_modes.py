@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
-from ..certificates import Certificate
+from ..certificates import Certificate, Verified
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
@@ -238,8 +238,8 @@ def read_modes(
     if matrices is None:
         return modes
     instance(matrices, FEMatrices | FEModel, "matrices", "read_matrices(...) reads them.")
-    found = {"mass": _with_mass(modes, matrices, str(path))}
-    return modes.replace(certificate=Certificate.of(found, route="phi^T M phi - I"))
+    mass = Verified("mass", _with_mass(modes, matrices, str(path)), "phi^T M phi - I")
+    return modes.replace(certificate=Certificate((mass,)))
 
 
 def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, divisor, real_array
-from ..certificates import Certificate
+from ..certificates import Certificate, Verified
 from ..errors import (
     AssumptionError,
     CertificateError,
@@ -195,9 +195,12 @@ def error_budget(
         names.append(RESIDUE)
         variances = np.append(variances, float(np.mean(part**2)))
         cumulative = np.vstack([cumulative, stairs])
-    certificate = Certificate.of(
-        {"by both Lyapunov equations": between, "by the integral of the spectrum": integral},
-        route="the variance computed again, relative difference",
+    route = "the variance computed again, relative difference"
+    certificate = Certificate(
+        (
+            Verified("by both Lyapunov equations", between, route),
+            Verified("by the integral of the spectrum", integral, route, TYPED),
+        )
     )
     unit = monitored.units.get(channel, "")
     return ErrorBudget(

@@ -283,18 +283,20 @@ class ModeTolerances(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """Text of the mode whose tolerance is smallest relative to its uncertainty."""
-        found: dict[str, float] = {}
+        """Checks of the mode whose tolerance is smallest relative to its uncertainty."""
+        checks: list[Verified] = []
         if self.modes.size:
             known = np.ones_like(self.least) if self.known is None else self.known
             with np.errstate(divide="ignore"):
                 worst = int(np.argmin(self.least / known))
             name = f"mode {self.modes[worst]}"
             if np.isfinite(self.least[worst]):  # else no change of a single mode matters
-                found[f"{name} holds to"] = float(self.least[worst])
+                route = "the loop closed around changed machines"
+                checks.append(Verified(f"{name} holds to", float(self.least[worst]), route))
                 if self.known is not None:
-                    found[f"{name} known to"] = float(self.known[worst])
-        return Certificate.of(found, route="the loop closed around changed machines")
+                    route = "what is known of the machine"
+                    checks.append(Verified(f"{name} known to", float(self.known[worst]), route))
+        return Certificate(tuple(checks))
 
     def warn_of_critical(self) -> None:
         """Warn of modes with a tolerance below twice their uncertainty."""

@@ -18,7 +18,7 @@ from ..arrays import (
     real_array,
     real_or_complex,
 )
-from ..certificates import Certificate, as_certificate
+from ..certificates import Certificate
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..labels import DofSet, Place
 from ..store import Value, checked
@@ -333,7 +333,6 @@ class Modes(Placed, Value):
             vectors=real_array(self.vectors if m else np.zeros((n, 0)), "vectors", (n, m)),
             residual=real_array(self.residual, "residual", (k if np.size(self.residual) else 0,)),
             rounding=real_array(self.rounding, "rounding", (k if np.size(self.rounding) else 0,)),
-            certificate=as_certificate(self.certificate, "certificate"),
             notes=tuple(str(note) for note in self.notes),
         )
 
@@ -534,8 +533,8 @@ class Modes(Placed, Value):
         omega[elastic] *= np.exp(known)
         rank = np.argsort(omega, kind="stable")
         return self.replace(
-            omega=omega[rank], zeta=self.zeta[rank], phi=self.phi[:, rank], certificate={},
-            residual=(), rounding=(),
+            omega=omega[rank], zeta=self.zeta[rank], phi=self.phi[:, rank],
+            certificate=Certificate(), residual=(), rounding=(),
         )  # fmt: skip
 
     @property

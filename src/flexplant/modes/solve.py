@@ -155,16 +155,16 @@ def solve_modes(
         factored = stiffness_factor(model, factor) if at and is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
     orthonormality, residual, rounding = check_modes(model, omega, phi)
-    certificate |= Certificate(
-        (Verified("orthonormality", orthonormality, "phi^T M phi - I", _ORTHONORMAL),)
+    certificate = certificate.extended(
+        Verified("orthonormality", orthonormality, "phi^T M phi - I", _ORTHONORMAL)
     )
     if model.rigid_body.shape[1]:
         held = float(rounding_of(model.K, model.rigid_body).max())
-        rigid = {
-            "rigid_residual": rigid_residual(model),
-            "rigid_rounding": float(np.sqrt(held) / (2 * np.pi)),
-        }
-        certificate |= Certificate.of(rigid, route="K times the rigid-body motions")
+        route = "K times the rigid-body motions"
+        certificate = certificate.extended(
+            Verified("rigid_residual", rigid_residual(model), route),
+            Verified("rigid_rounding", float(np.sqrt(held) / (2 * np.pi)), route),
+        )
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _coupled_modes(model, phi, kept, top, names, factor)
     inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
@@ -455,7 +455,7 @@ def damped_modes(
                     model.dofs,
                     n_rigid=r,
                     residual=_RESIDUAL[0] * part[: keep.size],
-                    certificate=Certificate.of({"basis": float(V.shape[1])}),
+                    certificate=Certificate((Verified("basis", float(V.shape[1])),)),
                 ),
                 top,
             )

@@ -13,7 +13,6 @@ from ..arrays import FloatArray
 from ..certificates import (
     Certificate,
     Verified,
-    as_certificate,
     one_line,
     stability,
     stability_check,
@@ -27,7 +26,7 @@ from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..store import Value, checked
+from ..store import Value
 from ..tolerances import NEGLIGIBLE
 from .preparation import Prepared
 
@@ -49,10 +48,10 @@ class Controller(Value):
         Lower bound on the norm that any controller reaches; see the method for its conditions.
     certificate : Certificate
         Numbers that verify the design by a second computation.
-    reached : mapping {str: float}
+    reached : Certificate
         For a weighted design: the norm from each group of w to each group of z; the weights require
         at most 1, and the largest is close to gamma. For `design_lmi`: the norm of each objective,
-        in its unit.
+        in its unit, with its bound.
     left_out : SpillOver, optional
         Stability and margins on the plant with the truncated modes, where these are known.
     tolerances : ModeTolerances, optional
@@ -62,7 +61,7 @@ class Controller(Value):
         Remarks, such as what the certificate does not cover.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
         For `design_structured`: the given structure, with the parameters found.
-    tried : mapping {str: float}
+    tried : Certificate
         Attempts in their order, with the gamma that each reached; infinite where it failed.
 
     Examples
@@ -77,19 +76,17 @@ class Controller(Value):
     method: str
     gamma: float | None = None
     lower: float | None = None
-    certificate: Certificate = field(default_factory=Certificate, metadata=checked(as_certificate))
-    reached: Mapping[str, float] | None = None
+    certificate: Certificate = field(default_factory=Certificate)
+    reached: Certificate = field(default_factory=Certificate)
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
     structure: Value | None = None
-    tried: Mapping[str, float] | None = None
+    tried: Certificate = field(default_factory=Certificate)
     tolerances: ModeTolerances | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set(
-            reached=dict(self.reached or {}), notes=tuple(self.notes), tried=dict(self.tried or {})
-        )
+        self._set(notes=tuple(self.notes))
 
     def to_control(self) -> Any:
         """Return the controller as a `control.StateSpace` with the same names."""
@@ -144,6 +141,10 @@ _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 _SIGN = "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
 
 
+#: the route of norms that are checked without Hamiltonian matrices
+SWEEP = "a refined sweep over frequency"
+
+
 def required_stability(loop: StateSpace, cause: str = _SIGN) -> float:
     """Return the spectral abscissa or radius of a closed loop that has to be stable."""
     least = stability(loop.poles(), loop.dt)
@@ -180,26 +181,27 @@ def certified_norm(loop: StateSpace, claim: float, respond: Responder | None = N
     return Certificate(
         (
             Verified("norm", norm, "Hamiltonian eigenvalues of the closed loop", near * claim),
-            Verified("swept norm", swept, "a refined sweep over frequency", near * norm),
+            Verified("swept norm", swept, SWEEP, near * norm),
             stability_check(least, loop.dt),
             Verified("claim", claim, "the method"),
         )
     )
 
 
-def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
+def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> Certificate:
     """Return the largest gain of a loop from each group of w to each group of z, by a sweep."""
     # groups by the names that `assemble_plant` gives; one group on each side says nothing new
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
     if len(sides[0]) * len(sides[1]) < 2:
-        return {}
+        return Certificate()
     gain = respond(_loop_grid(loop))
-    return {
-        f"{to} from {source}": float(largest_gains(gain[rows][:, columns]).max())
+    norms = (
+        (f"{to} from {source}", float(largest_gains(gain[rows][:, columns]).max()))
         for to, rows in sides[0].items()
         for source, columns in sides[1].items()
-    }
+    )
+    return Certificate(tuple(Verified(what, one, SWEEP, 1.0) for what, one in norms))
 
 
 def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
@@ -270,7 +272,7 @@ def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) ->
     left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
     verified = answer.certificate
     for found in (left_out, tolerances):
-        verified |= {} if found is None else found.certificate
+        verified = verified if found is None else verified | found.certificate
     said = [plant.unjudged] if left_out is None and plant.unjudged else []
     measured = None if loop is None else loop.on_measurement
     said.append(NOT_MEASURED if measured is None else measured.summary)

@@ -253,15 +253,15 @@ class LoopFacts(NamedTuple):
 
     def named(self, when: str) -> tuple[Verified, ...]:
         """Return the figures under names of when they hold, without limits."""
-        found = self.certificate.items()
-        return tuple(Verified(f"{what} {when}", figure) for what, figure in found)
+        checks = self.certificate.checks
+        return tuple(Verified(f"{one.what} {when}", one.figure, one.route) for one in checks)
 
     @property
     def certificate(self) -> Certificate:
         """What the controller keeps."""
         margin = Verified("modulus margin", self.margin, "a sweep of |1 + L| at u")
         found = Certificate((stability_check(self.stability, self.sampled), margin))
-        return found if np.isnan(self.gamma) else found | {"gamma": self.gamma}
+        return found if np.isnan(self.gamma) else found.extended(Verified("gamma", self.gamma))
 
 
 def loop_facts(plant: AnyPlant, controller: StateSpace) -> LoopFacts:

@@ -203,7 +203,7 @@ class HinfDesign(Design):
             certificate=Certificate((*certificate.checks, *found.checks)),
             reached=reached_norms(plant, loop, respond),
             notes=found.notes,
-            tried={f"{name}()": gamma},
+            tried=Certificate((Verified(f"{name}()", gamma),)),
         )
 
 
@@ -250,8 +250,13 @@ class TolerantDesign(Design):
         checks = *answer.certificate.checks, Verified(TOLERATED, share, "real mu over a grid")
         return answer.replace(
             certificate=Certificate(checks),
-            reached={},  # of the weights, without the channels of modes
-            tried={"before the scales were evened out": first, "after": answer.gamma},
+            reached=Certificate(),  # of the weights, without the channels of modes
+            tried=Certificate(
+                (
+                    Verified("before the scales were evened out", first),
+                    Verified("after", answer.gamma or np.inf),
+                )
+            ),
             notes=(
                 *answer.notes,
                 f"gamma is with a channel for each of {counted(len(channels), 'mode')}",

@@ -170,8 +170,8 @@ class PositionDesign(Design):
             gamma=max(norms),
             lower=max(bounds),
             certificate=certificate,
-            reached={},
-            tried=tried,
+            reached=Certificate(),
+            tried=Certificate(tuple(Verified(name, one) for name, one in tried.items())),
             notes=(f"one controller for {counted(len(norms), 'position')}; worst at {worst:g}",),
         )
         return answer

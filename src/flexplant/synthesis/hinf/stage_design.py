@@ -213,12 +213,17 @@ class _StageTask(Design):
         if self.fitted and self.stated:
             least = self._least(self._loop(best.solution.K), self.fitted, 0.0)
             checks.append(Verified(f"least modulus margin of {_DRAWS} machines of the fit", least))
+        route = "a sweep of |1 + L| at u"
+        tries = (
+            Verified(f"{freq:.4g} Hz", margin, route, self.margin, at_least=True)
+            for freq, margin in self.tried.items()
+        )
         return answer.replace(
             system=solution.K,
             method="H-infinity of a stage",
             certificate=Certificate((*answer.certificate.checks, *checks)),
-            tried={f"{f:.4g} Hz": margin for f, margin in self.tried.items()},
-            reached={},
+            tried=Certificate(tuple(tries)),
+            reached=Certificate(),
         )
 
     @cached_property

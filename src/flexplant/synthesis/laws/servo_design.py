@@ -152,13 +152,19 @@ def design_servo(
         except SolverError as none:
             advice = str(none)
         else:
-            certificate |= {"largest bandwidth at 6 dB [Hz]": reach}
+            certificate = certificate.extended(
+                Verified("largest bandwidth at 6 dB [Hz]", reach, "a search over bandwidths")
+            )
             advice = f"The largest bandwidth that holds 6 dB there is {reach:.3g} Hz."
     at = _in_words(law)
     if not closed.is_stable:
         _refuse(closed, at, observer is not None, advice)
     elif closed.is_stable and any(name.endswith(":ref") for name in closed.plant.w):
-        certificate |= {"|S| of the references below 1 up to [Hz]": suppressed_up_to(closed)}
+        certificate = certificate.extended(
+            Verified(
+                "|S| of the references below 1 up to [Hz]", suppressed_up_to(closed), "a sweep of S"
+            )
+        )
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
             f"with the modes that the plant truncates the servo's loop at {at} is "

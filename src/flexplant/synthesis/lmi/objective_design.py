@@ -158,7 +158,7 @@ class _ObjectiveDesign(Design):
                 (
                     Verified("LMI optimum", claim, "Clarabel"),
                     Verified("LMI bound", bound, "Clarabel"),
-                    *(Verified(what, one, "the closed loop") for what, one in reached.items()),
+                    *reached.checks,
                 )
             ),
             reached=reached,
@@ -247,12 +247,12 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
 
 def _verified_values(
     plant: AnyPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
-) -> dict[str, float]:
+) -> Certificate:
     """Return what every objective reaches, computed from the closed loop."""
     closed = lft(plant.system, K)
     if not closed.is_stable:
         raise CertificateError("the closed loop is not stable.")
-    reached = {}
+    reached: list[Verified] = []
     for spec in (minimize, *subject_to):
         if isinstance(spec, PoleRegion):
             outside = spec.outside(closed)
@@ -265,8 +265,8 @@ def _verified_values(
         value = spec.measured(closed.select(z, w))
         if spec.below is not None and not value <= spec.below * (1.0 + NEGLIGIBLE):
             raise CertificateError(f"{spec!r} is {value:.6g} in the closed loop.")
-        reached[repr(spec)] = value
-    return reached
+        reached.append(Verified(repr(spec), value, "the closed loop", spec.below))
+    return Certificate(tuple(reached))
 
 
 #: part of an H2 norm, found with noise or effort added, that no controller reaches either

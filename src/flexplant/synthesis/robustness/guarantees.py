@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from ...arrays import ComplexArray, FloatArray, whole
-from ...certificates import Certificate, as_certificate, stability
+from ...certificates import Certificate, Verified, stability
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
 from ...lti.frequency import frequency_response
@@ -21,7 +21,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
-from ...store import Value, checked
+from ...store import Value
 from ...tolerances import NEGLIGIBLE
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, crossing_multiple, destabilising, smallest_with_block
@@ -80,7 +80,7 @@ class RobustStability(Value):
     machine: AnyPlant | None
     frequencies: FloatArray
     bounds: FloatArray
-    certificate: Certificate = field(metadata=checked(as_certificate))
+    certificate: Certificate
     left_out: SpillOver | None = None
 
     @property
@@ -187,9 +187,11 @@ def robust_stability(
     values, machine, lower = _worst_machine(loop, worst)
     names = [name for name, _ in loop.channels.deltas]
     # for systems of many states, samples between the frequencies replace the Hamiltonians
-    further = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
+    proven = float(found.intervals * found.by_hamiltonian)
+    others = [Verified("intervals by Hamiltonians", proven, "eigenvalues of Hamiltonian matrices")]
     if loop.dt:
-        further["distance of channels"] = loop.channels.distance
+        route = "sampled channels against sampled machines"
+        others.append(Verified("distance of channels", loop.channels.distance, route))
     return RobustStability(
         upper,
         min(lower, upper),
@@ -198,7 +200,7 @@ def robust_stability(
         machine,
         loop.freq(found.frequencies),
         np.sqrt(np.maximum(found.bounds, 0.0)),
-        *_tried_on(uncertain, loop.loop, names, upper, count, chance, further),
+        *_tried_on(uncertain, loop.loop, names, upper, count, chance, others),
     )
 
 
@@ -261,9 +263,10 @@ def _quick(
     # the grid goes through the places of the modes at Deltas of a size, not beyond
     size = 1.0 / max(upper, 1.0 / _REACH)
     upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
-    none, further = np.zeros(0), {"modes, each by one channel": float(len(channels))}
+    others = [Verified("modes, each by one channel", float(len(channels)), "a grid over frequency")]
+    none = np.zeros(0)
     names = [delta.name for delta in uncertain.deltas]
-    tried = _tried_on(uncertain, loop, names, upper, count, rng, further)
+    tried = _tried_on(uncertain, loop, names, upper, count, rng, others)
     return RobustStability(upper, 0.0, float("nan"), {}, None, none, none, *tried)
 
 
@@ -274,26 +277,28 @@ def _tried_on(
     upper: float,
     count: int,
     rng: np.random.Generator,
-    further: Mapping[str, float],
+    others: Sequence[Verified],
 ) -> tuple[Certificate, SpillOver | None]:
     """Return how stable machines at corners are, each closed exactly, and the truncated modes."""
-    size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
+    size, worst, checks = min(1.0, 0.999 / upper), -np.inf, [*others]
     for _ in range(count):
         ends = (size * rng.choice([-1.0, 1.0], len(names))).tolist()
         values = dict(zip(names, ends, strict=True)) | uncertain.drawn_blocks(rng, size)
         loop = nominal.around(uncertain.lft(values))
         worst = max(worst, stability(loop.poles(), loop.plant.dt))
-    if not worst < (1.0 if nominal.plant.dt else 0.0):
+    edge = 1.0 if nominal.plant.dt else 0.0
+    if not worst < edge:
         raise CertificateError(
             f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
             f"{upper:.4g} was found: the loop is too badly conditioned. Report it."
         )
     if count:
         kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
-        found[f"{kind} of {counted(count, 'machine')}"] = worst
+        route = "machines at corners, each closed exactly"
+        checks.insert(0, Verified(f"{kind} of {counted(count, 'machine')}", worst, route, edge))
     left_out = nominal.left_out
-    tried = Certificate.of(found | dict(further), route="machines at corners, each closed exactly")
-    return tried if left_out is None else tried | left_out.certificate, left_out
+    certificate = Certificate(tuple(checks))
+    return certificate if left_out is None else certificate | left_out.certificate, left_out
 
 
 @dataclass(frozen=True, eq=False, repr=False)

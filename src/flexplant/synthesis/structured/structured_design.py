@@ -227,14 +227,14 @@ class _Structured(Design):
             certificate |= self.moving.certified(lambda plant: on(plant)["norm"], norms)
         elif len(plants) > 1:
             each_norm = (Verified(f"norm of plant {i}", one) for i, one in enumerate(norms, 1))
-            certificate |= Certificate(tuple(each_norm))
+            certificate = certificate.extended(*each_norm)
         notes = search.notes
         if decrease > CLOSE:
             notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
         final, loop = search.family.structure(found.x), lft(plants[worst].system, K)
-        reached = (
-            reached_norms(plants[worst], loop, responder(loop)) if kind == "H-infinity" else {}
-        )
+        reached = Certificate()
+        if kind == "H-infinity":
+            reached = reached_norms(plants[worst], loop, responder(loop))
         return Controller(
             K,
             f"{kind} of structure {(self.structure if final is None else final)!r}",
@@ -386,7 +386,7 @@ class _StructureSearch:
         #: the parameters of the last value, and the number and place of each judge there
         self._latest: tuple[FloatArray, list[tuple[float, Any]]] = np.zeros(0), []
         #: the norm that each start reached
-        self.tried: dict[str, float] = {}
+        self.tried = Certificate()
 
     def _spent(self, share: float = 1.0) -> Callable[[], bool]:
         return lambda: self.evaluations >= share * self.limit
@@ -458,7 +458,9 @@ class _StructureSearch:
             bar.advance()
         lowest = min(range(len(stable)), key=lambda i: stable[i].value)
         stable[lowest] = self._continued(stable[lowest])
-        self.tried = {end.name: _end_norm(end) for end in (*ends, *stable)}
+        self.tried = Certificate(
+            tuple(Verified(end.name, _end_norm(end)) for end in (*ends, *stable))
+        )
         best = min(stable, key=lambda end: end.value)
         same = sum(end.value <= best.value + CLOSE for end in stable)
         self.notes = (f"{same} of {len(ends)} starts end within 1 % of the best",)
