@@ -425,7 +425,7 @@ def test_square_roots_give_the_filter_that_covariances_give():
     root = riccati_root(found.model.A, found.model.C2, found.model.G, found.model.H)
     scale = np.abs(found.predictor_gain).max(axis=1, keepdims=True) + 1e-300
     np.testing.assert_allclose(root.K / scale, found.predictor_gain / scale, atol=1e-7)
-    assert root.change < 1e-9 and root.steps < 10
+    assert root.change < 1e-9 and root.steps < 20  # from sensors of 8000 times the noise
     # with correlated noise of process and sensors: the gain of least error
     A, C, G, H = np.array([[0.9]]), np.eye(1), np.array([[1.0, 0.0]]), np.array([[0.5, 0.1]])
     gains = np.linspace(-2.0, 2.0, 40_001)
@@ -446,9 +446,11 @@ def test_what_was_tried_before_the_square_roots_is_listed(monkeypatch):
     monkeypatch.setattr(kalman, "_design_by_covariance", fails)
     again = design_kalman(plant)
     np.testing.assert_allclose(again.variances, found.variances, rtol=1e-6)
-    routes = [one.route for one in again.certificate.checks]
-    assert any(route.endswith("; by the covariance: few digits") for route in routes)
-    assert "covariance: few" not in str([one.route for one in found.certificate.checks])
+    assert found.tried == ("Riccati equation of the covariance",)
+    assert again.tried == (
+        "Riccati equation of the covariance: few digits",
+        "Newton's steps in square roots",
+    )
 
 
 @pytest.mark.slow

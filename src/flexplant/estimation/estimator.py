@@ -53,11 +53,17 @@ class KalmanEstimator(PoiFilter):
         are known.
     left_out : LeftOut, optional
         Truncated modes, as noise and static compliance.
+    tried : tuple of str
+        Methods of the gain in the order in which they were tried, the last one gave it: first the
+        Riccati equation of the covariance and, where this has too few digits, Newton's steps in
+        square roots. A method that failed stands with its reason.
 
     Examples
     --------
     >>> import flexplant as fx
     >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> observer.tried
+    ('Riccati equation of the covariance',)
     >>> observer.sensors, observer.system.outputs
     (('y1', 'y2'), ('die:hat',))
     >>> hat, state = observer.step(np.zeros(2), np.zeros(1))
@@ -70,6 +76,7 @@ class KalmanEstimator(PoiFilter):
     certificate: Certificate
     variances: FloatArray
     left_out: LeftOut | None = None
+    tried: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         count = self.certificate.get(LEFT_OUT)

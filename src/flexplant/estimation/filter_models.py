@@ -127,7 +127,11 @@ class FilterModel(Value):
 def weigh(part: FloatArray, spread: FloatArray) -> FloatArray:
     """Return ``part S^-1`` of a covariance S, its channels of unit size inside."""
     size = np.sqrt(spread.diagonal())
-    return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
+    try:
+        weighed = np.linalg.solve(spread / size / size[:, None], (part / size).T)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(FEW_DIGITS) from error
+    return np.asarray(weighed.T / size)
 
 
 def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:

@@ -153,8 +153,9 @@ def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     own = plant if found is None else found.plant
     system = _filter_system(own, model, design.K, design.L_z)
     return KalmanEstimator(
-        system, plant, design.gain, design.covariance, design.certificate, design.variances, found
-    )
+        system, plant, design.gain, design.covariance, design.certificate, design.variances, found,
+        design.tried,
+    )  # fmt: skip
 
 
 def _filter_system(
@@ -177,6 +178,10 @@ def _filter_system(
     )
 
 
+#: the two methods, in words
+_BY_COVARIANCE, _IN_ROOTS = "Riccati equation of the covariance", "Newton's steps in square roots"
+
+
 class FilterDesign(NamedTuple):
     """Gains L, K and L_z, covariance after the measurement, POI variances, and checks."""
 
@@ -188,20 +193,16 @@ class FilterDesign(NamedTuple):
     radius: float
     residual: float
     difference: float
+    #: the methods in the order in which they were tried, each with the reason why it failed
+    tried: tuple[str, ...]
     allowed: float = TYPED
-    #: what was tried before, and why it failed
-    tried: str = ""
 
     @property
     def certificate(self) -> Certificate:
         """Checks of the filter."""
         checks = (
             stability_check(self.radius, sampled=True),
-            Verified(
-                "residual",
-                self.residual,
-                f"the Riccati equation, in states of unit variance{self.tried}",
-            ),
+            Verified("residual", self.residual, "the Riccati equation, in states of unit variance"),
         )
         return Certificate((*checks, _difference_check(self.difference, self.allowed)))
 
@@ -212,7 +213,7 @@ def _difference_check(difference: float, limit: float = TYPED) -> Verified:
 
 
 def auto_filter_design(model: FilterModel) -> FilterDesign:
-    """Return the gains by the covariance, else in square roots; the certificate says why."""
+    """Return the gains by the covariance or, if it fails, in square roots; `tried` says which."""
     own = np.sum(model.H[:, ~np.any(model.G, axis=0)] ** 2, axis=1)
     # R is nearly all noise that moves the states too, the sensors' own part lost in it
     if np.any(own < RESIDUAL * np.sum(model.H**2, axis=1)):
@@ -221,7 +222,8 @@ def auto_filter_design(model: FilterModel) -> FilterDesign:
         return _design_by_covariance(model)
     except (SolverError, CertificateError, ModelError) as error:  # R singular by rounding, say
         try:
-            return _design_in_roots(model)._replace(tried=f"; by the covariance: {error}")
+            found = _design_in_roots(model)
+            return found._replace(tried=(f"{_BY_COVARIANCE}: {error}", *found.tried))
         except SolverError:
             raise error from None
 
@@ -237,7 +239,10 @@ def _design_by_covariance(model: FilterModel) -> FilterDesign:
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     radius, difference = checked_error(model, gain, K, covariance)
-    return FilterDesign(gain, K, L_z, covariance, variances, radius, solution.residual, difference)
+    return FilterDesign(
+        gain, K, L_z, covariance, variances, radius, solution.residual, difference,
+        (_BY_COVARIANCE,),
+    )  # fmt: skip
 
 
 def _design_in_roots(model: FilterModel) -> FilterDesign:
@@ -259,8 +264,9 @@ def _design_in_roots(model: FilterModel) -> FilterDesign:
     difference = _agreement(variances, truth, CLOSE)
     L_z = poi_rows + found.weighed(model.N)
     return FilterDesign(
-        gain, found.K, L_z, covariance, variances, radius, found.change, difference, CLOSE
-    )
+        gain, found.K, L_z, covariance, variances, radius, found.change, difference,
+        (_IN_ROOTS,), CLOSE,
+    )  # fmt: skip
 
 
 def checked_error(
