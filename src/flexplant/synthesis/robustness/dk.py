@@ -11,15 +11,7 @@ import numpy as np
 
 from ...arrays import FloatArray, whole
 from ...certificates import Certificate, Verified
-from ...errors import (
-    AssumptionError,
-    CertificateError,
-    FlexplantError,
-    ModelError,
-    SolverError,
-    attempted,
-    counted,
-)
+from ...errors import CertificateError, FlexplantError, ModelError, SolverError, counted
 from ...lti.discretisation import tustin
 from ...lti.filters import zpk
 from ...lti.frequency_sweep import largest_gains, resonance_grid
@@ -78,6 +70,14 @@ class _DkStep(NamedTuple):
     freq: float = np.nan
 
 
+class _Iterated(NamedTuple):
+    """The step of the smallest mu, mu of each step, and the reason if a step failed after it."""
+
+    best: _DkStep
+    checks: list[Verified]
+    notes: tuple[str, ...]
+
+
 @one_thread()
 def design_mu(
     uncertain: UncertainPlant[Any],
@@ -102,8 +102,8 @@ def design_mu(
     If all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
     plant, with the scaling G of real mu and a constant D that is balanced in closed loop. The bound
     is then computed on a grid through the modes, to first order in their changes. Machines at
-    corners of the uncertainty are closed exactly. If this gives no controller, the general
-    iteration follows.
+    corners of the uncertainty are closed exactly. This needs a weighted disturbance that moves the
+    modes; without one, the general iteration is made.
 
     Parameters
     ----------
@@ -144,15 +144,17 @@ def design_mu(
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
     given = w, z, method, most, states, progress
-    if uncertain.is_of_frequencies:
-        # the general way serves where no disturbance moves the modes, or one channel shows no mu
-        with attempted("mode by mode", _NoStepError):
-            return designed(_ModeIteration(*given), uncertain, uncertain.plant)
-    return designed(_DkIteration(*given), uncertain, uncertain.plant)
+    by_modes = uncertain.is_of_frequencies and _moves_modes(uncertain, w, z)
+    iteration = _ModeIteration if by_modes else _DkIteration
+    return designed(iteration(*given), uncertain, uncertain.plant)
 
 
-class _NoStepError(SolverError):
-    """No step of an iteration gave a controller."""
+def _moves_modes(uncertain: UncertainPlant[Any], w: Any, z: Any) -> bool:
+    """Return whether a weighted disturbance moves a mode of uncertain frequency: D begins there."""
+    weighted = _performance_plant(uncertain.plant, w, z)
+    g, names = weighted.system, uncertain.plant.assembled.realisation.names
+    own = [g.states.index(names[2 * mode - k]) for mode in uncertain.frequencies for k in (1, 2)]
+    return bool(np.any(g.B[own][:, g.input_index(weighted.w)]))
 
 
 @dataclass(frozen=True)
@@ -169,28 +171,29 @@ class _DkIteration(Design):
     def prepare(self, plant: UncertainPlant[Any]) -> UncertainPlant[Any]:
         return plant  # each step prepares a separate problem
 
-    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
+    def solve(self, problem: UncertainPlant[Any]) -> _Iterated:
         found = self._iterated(problem, sized=True)
-        if any(isinstance(one, RepeatedScalar) and one.real for one in found[0].after.blocks):
+        if any(isinstance(one, RepeatedScalar) and one.real for one in found.best.after.blocks):
             # real Deltas count as complex in the norm, which then says little of the size of D
-            with attempted("the D-K iteration from D = 1"):
+            try:
                 other = self._iterated(problem, sized=False)
-                found = min(found, other, key=lambda one: one[0].mu)
+            except FlexplantError as error:
+                note = f"the iteration from D = 1 gave no controller: {error}"
+                return found._replace(notes=(*found.notes, note))
+            found = min(found, other, key=lambda one: one.best.mu)
         return found
 
-    def _iterated(
-        self, problem: UncertainPlant[Any], *, sized: bool
-    ) -> tuple[_DkStep, list[Verified]]:
+    def _iterated(self, problem: UncertainPlant[Any], *, sized: bool) -> _Iterated:
         given = self.w, self.z, self.method, self.most, self.order
         steps = _filter_steps(problem, *given, sized=sized)
         return _best_step(steps, self.most + 1, _SETTLED, self.progress)
 
     def restore(self, plant: UncertainPlant[Any], problem: Any, found: Any) -> StateSpace:
-        K: StateSpace = found[0].controller
+        K: StateSpace = found.best.controller
         return K
 
     def certify(self, solution: Solution) -> Controller:
-        best, found = solution.found
+        best, found, notes = solution.found
         mu, freq = performance_bound(best.after, ABOVE)  # steps are compared less closely
         checks = Verified("mu", mu, STEPS_OF_MU), Verified("at Hz", freq, STEPS_OF_MU), *found
         return Controller(
@@ -198,28 +201,22 @@ class _DkIteration(Design):
             f"D-K iteration, {counted(len(found), 'step')}",
             gamma=mu,
             certificate=Certificate(checks),
+            notes=notes,
         )
 
 
 class _ModeIteration(_DkIteration):
     """The same with one channel a mode and constant scales."""
 
-    def solve(self, problem: UncertainPlant[Any]) -> tuple[_DkStep, list[Verified]]:
+    def solve(self, problem: UncertainPlant[Any]) -> _Iterated:
         # step k solves the H-infinity problem of Deltas and weights divided by the mu of the step
         # before: at a fixed point the norm is 1 and mu what it was divided by
         weighted = _performance_plant(problem.plant, self.w, self.z)
-        try:
-            stated = mode_channels(weighted, problem)
-        except AssumptionError as error:  # no disturbance moves them: no D to begin
-            raise _NoStepError(str(error)) from error
-        steps = _mode_steps(weighted, stated, self.method, self.most)
-        best, found = _best_step(steps, self.most, _SETTLED_BY_MODES, self.progress)
-        if not np.isfinite(best.mu):
-            raise _NoStepError("the bound of one channel a mode shows no controller.")
-        return best, found
+        steps = _mode_steps(weighted, mode_channels(weighted, problem), self.method, self.most)
+        return _best_step(steps, self.most, _SETTLED_BY_MODES, self.progress)
 
     def certify(self, solution: Solution) -> Controller:
-        best, found = solution.found
+        best, found, notes = solution.found
         ratio = _corner_ratio(solution.plant, best, self.w, self.z)
         route = "machines at corners, each closed exactly"
         corners = Verified("largest gain of machines over mu", ratio, route)
@@ -229,15 +226,17 @@ class _ModeIteration(_DkIteration):
             f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
             gamma=best.mu,
             certificate=Certificate(checks),
+            notes=notes,
         )
 
 
 def _best_step(
     steps: Iterator[_DkStep], most: int, settled: float, progress: bool | None
-) -> tuple[_DkStep, list[Verified]]:
-    """Return the step of the smallest mu, and mu of each; they end where mu falls no further."""
+) -> _Iterated:
+    """Return the best step; the steps end where mu falls no further, or where one fails."""
     best: _DkStep | None = None
     found: list[Verified] = []
+    notes: tuple[str, ...] = ()
     with Progress(most, "steps of D-K", progress=progress, even=False) as bar:
         try:
             for step in steps:
@@ -248,12 +247,13 @@ def _best_step(
                     best = step
                 if step.mu > (1.0 - settled) * known:
                     break
-        except FlexplantError:  # D of a loop near its optimum may be too badly conditioned
+        except FlexplantError as error:  # D of a loop near its optimum may be badly conditioned
             if best is None:
                 raise
+            notes = (f"the iteration ended after {counted(len(found), 'step')}: {error}",)
     if best is None:
-        raise _NoStepError("no step of the D-K iteration gave a controller. Report it.")
-    return best, found
+        raise SolverError("no step of the D-K iteration gave a controller. Report it.")
+    return _Iterated(best, found, notes)
 
 
 def _filter_steps(
@@ -281,10 +281,10 @@ def _filter_steps(
             K = _scaled_controller(plant, scales, method, nominal=not number)
             loop = uncertain_loop(uncertain, [K], w=w, z=z)
             mu, freq = performance_bound(loop)
-        except FlexplantError:  # without uncertainty u may cancel w in z at no cost
-            if number > 1:
+        except FlexplantError:
+            if number:
                 raise
-            continue
+            continue  # a candidate only: without uncertainty u may cancel w in z at no cost
         step = _DkStep(number, mu, K, loop, freq)
         yield step
         if best is None or mu < best.mu:
