@@ -7,23 +7,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ...arrays import below_half_rate, positive, whole
 from ...certificates import Certificate, Verified
 from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted, short
-from ...lti.equations import mean_speed, state_scale
+from ...lti.equations import OnAxisError, mean_speed, state_scale
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...tolerances import NEGLIGIBLE, TINY
-from ..controller import Controller
+from ...tolerances import CLOSE, NEGLIGIBLE, TINY
+from ..controller import Controller, SolvedController
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
-from ..hinf.hinf_riccati import Riccati
+from ..hinf.hinf_riccati import Riccati, h2_controller
+from ..hinf.singular import Regularised
 from ..pipeline import Design, Solution, designed, posed
-from ..preparation import require_reach
+from ..preparation import Prepared, beyond_rounding, require_reach
 from ..structured.judges import require_finite_h2
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
@@ -122,9 +124,13 @@ class _ObjectiveDesign(Design):
     back_off: float
 
     def prepare(self, plant: AnyPlant) -> ObjectivePrograms:
-        require_reach(super().prepare(plant))
+        scaled = super().prepare(plant)
+        require_reach(scaled)
         require_reachable(plant, self.subject_to)
-        return ObjectivePrograms(plant, _balanced_plant(plant), self.minimize, self.subject_to)
+        unit = _size_reached(plant, scaled, self.minimize)
+        return ObjectivePrograms(
+            plant, _balanced_plant(plant), self.minimize, self.subject_to, unit
+        )
 
     def solve(self, problem: ObjectivePrograms) -> tuple[StateSpace, float, float]:
         # the controller, the optimum of the LMIs, and the bound that it was found for
@@ -194,6 +200,28 @@ def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most:
             f"design_lmi takes plants of 1 to {most} states, got {n}: time grows as n^6. Reduce "
             "the order first, or raise max_states."
         )
+
+
+def _size_reached(plant: AnyPlant, problem: Prepared, objective: Any) -> float:
+    """Return what the controller of least quadratic cost reaches, with some noise and effort."""
+    regular = Regularised(problem, CLOSE, modes=True)
+    try:
+        least = h2_controller(regular.problem)
+    except (la.LinAlgError, OnAxisError) as error:
+        raise SolverError(
+            "no controller of least quadratic cost stabilises in rounding: "
+            + beyond_rounding(problem)
+        ) from error
+    found = SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
+    w, z = objective.chosen(plant)
+    loop = lft(plant.system, problem.restored(*regular.restored(found)))
+    size = float(objective.measured(loop.select(z, w))) if loop.is_stable else np.inf
+    if not np.isfinite(size):
+        raise SolverError(
+            "the controller of least quadratic cost does not stabilise in rounding: "
+            + beyond_rounding(problem)
+        )
+    return size or 1.0  # w may reach nothing in z
 
 
 def _balanced_plant(plant: AnyPlant) -> Plant:
