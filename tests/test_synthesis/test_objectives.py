@@ -8,10 +8,17 @@ import scipy.linalg as la
 from scipy.linalg import expm
 
 import flexplant as fx
-from flexplant.errors import AssumptionError, InfeasibleError, LabelError, ModelError
+from flexplant.errors import (
+    AssumptionError,
+    CertificateError,
+    InfeasibleError,
+    LabelError,
+    ModelError,
+    SolverError,
+)
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.sampling import held_exactly
-from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
+from flexplant.synthesis import H2, AutoBackOff, Hinf, PeakGain, PoleRegion, design_lmi
 from flexplant.synthesis.lmi.objective_design import _balanced_plant
 from flexplant.synthesis.lmi.objectives import ObjectivePrograms, damped, within
 
@@ -163,7 +170,7 @@ def test_the_rate_of_decay_is_searched():
     found = design_lmi(given, minimize=PeakGain()).certificate["LMI optimum"]
     plant = _balanced_plant(given)
     single = [
-        ObjectivePrograms(given, plant, PeakGain(decay=rate * plant.speed), ()).smallest(1.0)
+        ObjectivePrograms(given, plant, PeakGain(decay=rate * plant.speed), (), found).smallest(1.0)
         for rate in np.geomspace(0.05, 2.0, 40)
     ]
     assert found == pytest.approx(min(single), rel=5e-3, abs=0)
@@ -206,6 +213,32 @@ def test_the_scale_of_units_does_not_matter():
     one = design_lmi(given, minimize=H2())
     other = design_lmi(small, minimize=H2())
     assert other.gamma == pytest.approx(np.sqrt(1e3) * one.gamma, rel=1e-2, abs=0)
+
+
+def test_a_back_off_is_used_as_it_is_and_the_automatic_ones_are_listed(monkeypatch):
+    given, solve = plant(), ObjectivePrograms.controller
+    found = design_lmi(given, minimize=H2(), back_off=0.05)
+    assert dict(found.tried) == {"back-off 0.05": found.gamma}
+    (only,) = found.tried.checks
+    assert only.holds and only.limit == found.certificate["LMI bound"]
+    assert only.limit == pytest.approx(1.05 * found.certificate["LMI optimum"])
+
+    def fails_near_the_optimum(self, bound, rate):
+        if bound < 1.1 * found.certificate["LMI optimum"]:
+            raise SolverError("gains without bound.")
+        return solve(self, bound, rate)
+
+    monkeypatch.setattr(ObjectivePrograms, "controller", fails_near_the_optimum)
+    with pytest.raises(CertificateError, match=r"0\.05\): gains without bound\. .* raise back_off"):
+        design_lmi(given, minimize=H2(), back_off=0.05)
+    for back_off in (AutoBackOff(0.05), None):
+        again = design_lmi(given, minimize=H2(), back_off=back_off)
+        *failed, last = again.tried.checks
+        assert failed and all(one.figure == np.inf and not one.holds for one in failed)
+        assert {one.route for one in failed} == {"gains without bound."}
+        assert last.figure == again.gamma and last.holds
+    with pytest.raises(ModelError, match="back_off must be positive"):
+        design_lmi(given, minimize=H2(), back_off=-0.1)
 
 
 def test_refusals():

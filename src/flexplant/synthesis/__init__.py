@@ -83,6 +83,7 @@ from .laws.servo_design import design_servo as design_servo
 from .laws.servo_design import servo_bandwidth as servo_bandwidth
 from .laws.tune import tune_loops as tune_loops
 from .lmi.lmi_programs import Lmi as Lmi
+from .lmi.objective_design import AutoBackOff as AutoBackOff
 from .lmi.objective_design import design_lmi as design_lmi
 from .lmi.objectives import H2 as H2
 from .lmi.objectives import Hinf as Hinf

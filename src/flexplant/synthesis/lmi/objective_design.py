@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -18,6 +18,7 @@ from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant
+from ...store import Value, checked
 from ...tolerances import CLOSE, NEGLIGIBLE, TINY
 from ..controller import Controller, SolvedController
 from ..h2 import design_h2
@@ -34,9 +35,31 @@ from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 _RATES = (0.1, 0.3, 1.0, 3.0)
 #: steps from the best of them, the last one so small that the optimum is flat within it
 _STEPS = tuple(3.0 ** (0.5**i) for i in range(1, 4))
-#: multiples of the back-off that are tried in turn, and multiples of the optimum after them
-_LOOSER, _FARTHER = (1.0, 2.0, 4.0, 8.0), (1.5, 2.5, 5.0, 12.0, 30.0)
+#: number of back-offs that `AutoBackOff` tries: the last one is 500 times the first
+_DOUBLINGS = 10
 _KINDS = (H2, Hinf, PeakGain)
+
+
+@dataclass(frozen=True, eq=False)
+class AutoBackOff(Value):
+    """Back-offs of `design_lmi` that are tried in turn, each twice the one before.
+
+    Next to the optimum of the LMIs gains may be infinite, and the distance at which a controller
+    keeps all bounds in rounding is not known in advance. `Controller.tried` lists the back-offs.
+
+    Parameters
+    ----------
+    first : float
+        The first back-off, relative to the optimum.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.AutoBackOff(0.1)
+    AutoBackOff(first=0.1)
+    """
+
+    first: float = field(default=0.03, metadata=checked(positive))
 
 
 @one_thread()
@@ -45,7 +68,7 @@ def design_lmi(
     *,
     minimize: H2 | Hinf | PeakGain,
     subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
-    back_off: float = 0.03,
+    back_off: float | AutoBackOff | None = None,
     max_states: int = 20,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
@@ -66,9 +89,10 @@ def design_lmi(
         Objective that is minimised, without `below`.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
         Constraints.
-    back_off : float
-        Relative distance of the minimised norm from its optimum, at which gains may be infinite. It
-        is increased if no controller keeps the bounds; the certificate states the value.
+    back_off : float or AutoBackOff, optional
+        Relative distance of the minimised norm from its optimum, at which gains may be infinite. A
+        number is used as it is. None: ``AutoBackOff()`` tries 3 %, 6 % and so on until a controller
+        keeps all bounds.
     max_states : int
         Largest number of states; larger problems are refused, since the time grows with the sixth
         power.
@@ -79,7 +103,8 @@ def design_lmi(
     -------
     Controller
         `gamma` is the verified norm of the minimised objective, `reached` that of every objective,
-        the certificate holds the bound of the LMIs for comparison.
+        the certificate holds the bound of the LMIs for comparison, `tried` the back-offs with the
+        norm that each reached (infinite where a bound was not kept, with the reason).
 
     Raises
     ------
@@ -111,8 +136,25 @@ def design_lmi(
     """
     given = posed(plant, u, y, "synthesis by LMIs")
     _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
-    design = _ObjectiveDesign(minimize, tuple(subject_to), positive(back_off, "back_off"))
+    design = _ObjectiveDesign(minimize, tuple(subject_to), _back_offs(back_off))
     return designed(design, given, given)
+
+
+def _back_offs(given: Any) -> tuple[float, ...]:
+    """Return the back-offs to try: one number, or those of `AutoBackOff`."""
+    if given is None or isinstance(given, AutoBackOff):
+        first = (given or AutoBackOff()).first
+        return tuple(first * 2.0**k for k in range(_DOUBLINGS))
+    return (positive(given, "back_off"),)
+
+
+class _Found(NamedTuple):
+    """A controller, the optimum of the LMIs, the bound of this controller, and all tries."""
+
+    K: StateSpace
+    optimum: float
+    bound: float
+    tried: tuple[Verified, ...]
 
 
 @dataclass(frozen=True)
@@ -121,7 +163,7 @@ class _ObjectiveDesign(Design):
 
     minimize: Any
     subject_to: tuple[Any, ...]
-    back_off: float
+    back_offs: tuple[float, ...]
 
     def prepare(self, plant: AnyPlant) -> ObjectivePrograms:
         scaled = super().prepare(plant)
@@ -132,29 +174,31 @@ class _ObjectiveDesign(Design):
             plant, _balanced_plant(plant), self.minimize, self.subject_to, unit
         )
 
-    def solve(self, problem: ObjectivePrograms) -> tuple[StateSpace, float, float]:
-        # the controller, the optimum of the LMIs, and the bound that it was found for
+    def solve(self, problem: ObjectivePrograms) -> _Found:
         claim, rate = _best_rate(problem)
-        failure: Exception | None = None
-        for factor in (*(1.0 + self.back_off * looser for looser in _LOOSER), *_FARTHER):
+        tried: list[Verified] = []
+        for back_off in self.back_offs:
+            bound = (1.0 + back_off) * claim
             try:
-                K = problem.controller(factor * claim, rate)
-                _verified_values(problem.given, K, self.minimize, self.subject_to)
-                return K, claim, factor * claim
-            # next to the optimum gains have no bound, and the distance that is needed is not known
+                K = problem.controller(bound, rate)
+                reached = _verified_values(problem.given, K, self.minimize, self.subject_to)
             except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
-                failure = error
+                tried.append(Verified(f"back-off {back_off:.3g}", np.inf, str(error), bound))
+                continue
+            norm = reached[repr(self.minimize)]
+            tried.append(Verified(f"back-off {back_off:.3g}", norm, "the closed loop", bound))
+            return _Found(K, claim, bound, tuple(tried))
         raise CertificateError(
-            f"the LMIs claim {claim:.6g}, but no controller kept all bounds: {failure} Loosen "
-            "bounds, add a little noise to each sensor, or raise back_off."
+            f"the LMIs claim {claim:.6g}, but no controller kept all bounds (back-off "
+            f"{self.back_offs[-1]:.3g}): {tried[-1].route} Loosen bounds, add a little noise to "
+            "each sensor, or raise back_off."
         )
 
-    def restore(self, plant: AnyPlant, problem: ObjectivePrograms, found: Any) -> StateSpace:
-        K: StateSpace = found[0]
-        return K
+    def restore(self, plant: AnyPlant, problem: ObjectivePrograms, found: _Found) -> StateSpace:
+        return found.K
 
     def certify(self, solution: Solution) -> Controller:
-        plant, _, K, (_, claim, bound) = solution
+        plant, _, K, (_, claim, bound, tried) = solution
         reached = _verified_values(plant, K, self.minimize, self.subject_to)
         return Controller(
             K,
@@ -168,6 +212,7 @@ class _ObjectiveDesign(Design):
                 )
             ),
             reached=reached,
+            tried=Certificate(tried),
         )
 
 
