@@ -143,33 +143,27 @@ def design_servo(
     task.require_phase(law)
     closed = task.closed(law)
     margin = Verified("modulus margin", closed.modulus_margin, "a sweep of |1 + L| at u")
-    certificate = Certificate((stability_check(closed.spectral_radius, sampled=True), margin))
+    checks = [stability_check(closed.spectral_radius, sampled=True), margin]
     left_out, advice = closed.left_out, ""
-    known = certificate if left_out is None else certificate | left_out.certificate
-    if min(known[key] for key in known if key.startswith("modulus margin")) < 1.0 / TARGET:
+    known = checks if left_out is None else [*checks, *left_out.certificate.checks]
+    if min(one.figure for one in known if one.what.startswith("modulus")) < 1.0 / TARGET:
         try:
             reach = task.largest(TARGET)
         except SolverError as none:
             advice = str(none)
         else:
-            certificate = certificate.extended(
-                Verified("largest bandwidth at 6 dB [Hz]", reach, "a search over bandwidths")
-            )
+            checks.append(Verified("largest bandwidth at 6 dB [Hz]", reach, "a search"))
             advice = f"The largest bandwidth that holds 6 dB there is {reach:.3g} Hz."
     at = _in_words(law)
     if not closed.is_stable:
         _refuse(closed, at, observer is not None, advice)
-    elif closed.is_stable and any(name.endswith(":ref") for name in closed.plant.w):
-        certificate = certificate.extended(
-            Verified(
-                "|S| of the references below 1 up to [Hz]", suppressed_up_to(closed), "a sweep of S"
-            )
-        )
+    elif any(name.endswith(":ref") for name in closed.plant.w):
+        what = "|S| of the references below 1 up to [Hz]"
+        checks.append(Verified(what, suppressed_up_to(closed), "a sweep of S"))
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
-            f"with the modes that the plant truncates the servo's loop at {at} is "
-            f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
-            f"{advice}"
+            f"with the truncated modes the servo's loop at {at} is {left_out.summary}. The machine "
+            f"has these modes{CLOSE if left_out.is_high else ''}. {advice}"
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
@@ -183,9 +177,8 @@ def design_servo(
         for name, axis in zip(law.driven.channels, law.axes, strict=True)
     )
     notes.append(f"lines: {lines}")
-    answer = Controller(
-        task.controller(law), f"servo {at}", certificate=certificate, notes=tuple(notes)
-    )
+    answer = Controller(task.controller(law), f"servo {at}", notes=tuple(notes))
+    answer = answer.replace(certificate=Certificate(tuple(checks)))
     return with_checks(answer, task.plant, closed)
 
 
