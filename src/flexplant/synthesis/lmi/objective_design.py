@@ -148,7 +148,7 @@ def _back_offs(given: Any) -> tuple[float, ...]:
     return (positive(given, "back_off"),)
 
 
-class _Found(NamedTuple):
+class _Kept(NamedTuple):
     """A controller, the optimum of the LMIs, the bound of this controller, and all tries."""
 
     K: StateSpace
@@ -174,7 +174,7 @@ class _ObjectiveDesign(Design):
             plant, _balanced_plant(plant), self.minimize, self.subject_to, unit
         )
 
-    def solve(self, problem: ObjectivePrograms) -> _Found:
+    def solve(self, problem: ObjectivePrograms) -> _Kept:
         claim, rate = _best_rate(problem)
         tried: list[Verified] = []
         for back_off in self.back_offs:
@@ -187,14 +187,14 @@ class _ObjectiveDesign(Design):
                 continue
             norm = reached[repr(self.minimize)]
             tried.append(Verified(f"back-off {back_off:.3g}", norm, "the closed loop", bound))
-            return _Found(K, claim, bound, tuple(tried))
+            return _Kept(K, claim, bound, tuple(tried))
         raise CertificateError(
             f"the LMIs claim {claim:.6g}, but no controller kept all bounds (back-off "
             f"{self.back_offs[-1]:.3g}): {tried[-1].route} Loosen bounds, add a little noise to "
             "each sensor, or raise back_off."
         )
 
-    def restore(self, plant: AnyPlant, problem: ObjectivePrograms, found: _Found) -> StateSpace:
+    def restore(self, plant: AnyPlant, problem: ObjectivePrograms, found: _Kept) -> StateSpace:
         return found.K
 
     def certify(self, solution: Solution) -> Controller:
