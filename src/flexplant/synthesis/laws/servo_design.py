@@ -162,8 +162,8 @@ def design_servo(
         checks.append(Verified(what, suppressed_up_to(closed), "a sweep of S"))
     if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
-            f"with the modes that the plant truncates the servo's loop at {at} is {left_out.summary}"
-            f". The machine has these modes{CLOSE if left_out.is_high else ''}. {advice}"
+            f"with the modes that the plant truncates the loop at {at} is {left_out.summary}. "
+            f"The machine has these modes{CLOSE if left_out.is_high else ''}. {advice}"
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
