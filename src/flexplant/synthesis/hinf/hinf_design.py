@@ -277,6 +277,6 @@ def _require_resolved(P: StateSpace, K: StateSpace) -> None:
     if change > _SENSITIVE:
         raise SolverError(
             f"a controller with gamma {gamma:.4g} was found, but one rounding of each entry of A, "
-            f"B and C changes it by {100 * change:.2g} %. Loosen the weights, or leave out modes that "
-            "u does not move or y does not see: assemble_plant(modes.select([...]), ports)."
+            f"B and C changes it by {100 * change:.2g} %. Loosen the weights, or leave out modes "
+            "that u does not move or y does not see: assemble_plant(modes.select([...]), ports)."
         )
