@@ -195,3 +195,18 @@ def test_the_site(tmp_path):
     verbs = html.unescape((tmp_path / "flexplant" / "algorithms.html").read_text(encoding="utf-8"))
     assert 'id="stage_weights"' in verbs and "#design_kalman" in verbs, "in the contents too"
     assert verbs.count("<math") == 2 and "<math" in (tmp_path / "how_it_works.html").read_text()
+
+
+@pytest.mark.slow
+def test_no_line_within_a_paragraph_looks_like_a_list():
+    """A line that begins with a sign or "2." would become an item of a list on its page."""
+    item, wrong = re.compile(r"\s*([-+]|\d+[.)]) "), []
+    for path in sorted(Path(flexplant.__file__).parent.rglob("*.py")):
+        for doc in re.findall(r'"""(.*?)"""', path.read_text(encoding="utf-8"), re.DOTALL):
+            for paragraph in re.split(r"\n\s*\n", doc):
+                lines = paragraph.splitlines()
+                items = [i for i, line in enumerate(lines) if item.match(line)]
+                if items and items[0] and "math::" not in paragraph and ">>>" not in paragraph:
+                    before = lines[items[0] - 1].strip()
+                    wrong += [] if before.endswith(":") else [(path.name, lines[items[0]].strip())]
+    assert not wrong

@@ -37,9 +37,9 @@ class Sensor(SensorPort):
         filters and simulation refuse: shape the disturbance, let it be held over each
         sample (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
-        One-sided amplitude spectral density of its white noise; a sample has variance asd^2 rate /
-        2. It is added to the samples, after dynamics and latency; use an OutputDisturbance for
-        noise that passes through them.
+        One-sided amplitude spectral density of its white noise; a sample has the variance ``asd^2
+        rate / 2``. It is added to the samples, after dynamics and latency; use an OutputDisturbance
+        for noise that passes through them.
     asd_deviation : float
         Relative deviation of the density, by which machines that are drawn differ.
     dynamics : StateSpace, optional

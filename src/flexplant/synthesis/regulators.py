@@ -141,9 +141,9 @@ def _with_integrals(g: StateSpace, outputs: Iterable[str] | None) -> StateSpace:
 def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = None) -> StateSpace:
     """Return the Kalman filter of a system as a system from (u, y) to its states.
 
-    ``dx/dt = A x + B u + w, y = C x + D u + v``. The estimate follows ``dx^/dt = A x^ + B u + K (y
-    - C x^ - D u)``; of a sampled system it is the state predicted for the next sample.
-    `flexplant.design_kalman` does the same for a plant with its ports and judges the error.
+    ``dx/dt = A x + B u + w, y = C x + D u + v``. The estimate x^ follows ``dx^/dt = A x^ + B u + K
+    e`` with ``e = y - C x^ - D u``; for a sampled system it is the state predicted for the next
+    sample. `flexplant.design_kalman` does the same for a plant with its ports and judges the error.
 
     Parameters
     ----------

@@ -76,11 +76,11 @@ def update(
         Start values. None: zeros, or the means of priors, inside the bounds; then responses are
         first fitted by the logarithm of their magnitude, and poles before shapes, since these
         converge from farther away. Four other starts are always tried (two with more than 100
-        DOFs), to find other minima; print(fit) names those with a similar chi-square. Up to 20 (or
-        4) are tried if no start leads to an end, or if noise does not explain a residual of a tenth
-        of the power of responses or of 0.1 % of a pole (`UpdateResult.starts`). After an end is
-        found, other starts get ten steps, and more if their cost is close; the search stops with
-        eight starts in the best minimum.
+        DOFs), to find other minima; print(fit) names those with a similar chi-square. Up to 20
+        starts (or 4) are tried if no start leads to an end, or if noise does not explain a residual
+        of a tenth of the power of responses or of 0.1 % of a pole (`UpdateResult.starts`). After an
+        end is found, other starts get ten steps, and more if their cost is close; the search stops
+        with eight starts in the best minimum.
     starts : int or (s, q) array, optional
         Start values, or their number; a number of starts is drawn between the bounds (or from the
         priors), including `start`. The best result is kept. 1: only `start`.
