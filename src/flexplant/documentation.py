@@ -41,6 +41,7 @@ _TEXTS = ("how_it_works", "my_matrices", "only_an_frf", "refused", "from_matlab"
 #: what runs are given: no browser, and a size that leaves time for the others
 _ARGUMENTS = {"workbench": ("--no-browser",), "fleet": ("4",)}
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
+_DOT = "\ue001"  # stands for a dot of a name that is a link already: pdoc would make it one too
 _HOME = "@root@/"  # stands for the way from a page to the folder of the site
 
 
@@ -179,12 +180,13 @@ class _Site:
             return match[0]
         # to the class of a member: pdoc would take ".member" in a link for a separate name
         place = f"#{short[0]}" if short else ""
-        return f"[{match[0]}]({_HOME}flexplant/{room}.html{place})"
+        return f"[{match[0].replace('.', _DOT)}]({_HOME}flexplant/{room}.html{place})"
 
     def finished(self, page: str, html: str) -> str:
         """Return a page with its formulas, and links that lead from where it is."""
         html = re.sub(r"formula\d+x", lambda m: self.formulas[m[0]], html)
-        return html.replace(_HOME, "../" * page.count(".")).replace(_COLON, ":")
+        html = html.replace(_HOME, "../" * page.count("."))
+        return html.replace(_COLON, ":").replace(_DOT, ".")
 
     def bibliography(self) -> str:
         """Return the sources as a list with a place for each key."""
