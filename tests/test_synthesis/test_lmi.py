@@ -141,6 +141,12 @@ def test_compleib_up_to_20_states(name):
     check(*compleib(name))
 
 
+def design_problem(parts):
+    """The design by LMIs of the eight matrices."""
+    P, u, y = system(parts)
+    return design_hinf(P, Lmi(), u=u, y=y)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_bound_and_riccati_meet_with_feedthrough(seed):
@@ -310,6 +316,19 @@ def test_too_many_states_or_none():
     )
     with pytest.raises(ModelError, match="static plant"):
         Lmi().solve(prepared(static, ["u"], ["y"]))
+
+
+@pytest.mark.long
+def test_the_largest_that_is_served_is_right():
+    found = design_problem(random_parts(2, n=Lmi().max_states, nw=6, nu=3, nz=6, ny=3))
+    assert found.gamma <= 1.0102 * found.lower
+
+
+@pytest.mark.long
+def test_a_refusal_names_the_number_of_states_that_is_served():
+    """Next to the optimum of 20 states with one input and output gammas are 1e5."""
+    with pytest.raises(SolverError, match=r"up to 20 states of similar.*plant of 20 states"):
+        design_problem(random_parts(1, n=20, nw=2, nu=1, nz=2, ny=1))
 
 
 def test_an_unreachable_unstable_mode_has_no_controller():

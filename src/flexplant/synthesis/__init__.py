@@ -42,7 +42,7 @@ For the implementation: `reduce_controller`, `discretise_controller`, `anti_wind
 | ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
 | ``ultidyn``, ``uss`` | `fx.plant.UnmodelledDynamics`, `uncertain_system` |
 
-Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `design_lmi` 20.
+Dense methods suit plants of up to some 500 states; `Lmi` and `design_lmi` take 20.
 """
 
 from ..plant.uncertainty.delta_blocks import FullBlock as FullBlock

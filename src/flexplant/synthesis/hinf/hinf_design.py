@@ -72,7 +72,7 @@ def design_hinf(
     method : Riccati or Lmi, optional
         By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
         singular, and a little disturbance where w or z misses an undamped mode. `Lmi()` finds
-        gamma by a semidefinite program and suits up to 30 states.
+        gamma by a semidefinite program and serves up to 20 states.
     bandwidth : float [Hz], optional
         Bandwidth for a stage without weights: those of `stage_weights` are used, and the POI must
         have one reference. `design_stage` finds the largest possible bandwidth.

@@ -246,8 +246,11 @@ class Lmi(Value):
     because ``I - X Y`` is nearly singular next to the optimum, and digits would be lost. It is the
     central controller of the Riccati equations, as for `Riccati()`, for a gamma a little larger
     than the smallest one, which is taken at most 0.5 % above the bound. Noise, effort and
-    disturbance are added as for `Riccati()`. Plants of up to 24 states take at most about 10 s; the
-    time grows with the sixth power of the number of states.
+    disturbance are added as for `Riccati()`.
+
+    Plants of up to 20 states are served, in at most 10 s; the time grows with the sixth power of
+    the number of states. Larger plants are refused, and so are plants whose fast and slow states,
+    or large and small gains, the solver does not resolve together.
 
     Parameters
     ----------
@@ -257,7 +260,7 @@ class Lmi(Value):
     tolerance : float
         Tolerance of the solver: gap and residuals, relative.
     max_states : int
-        Largest number of states; larger problems are refused.
+        Largest number of states that is served; more are refused at once.
 
     References
     ----------
@@ -274,7 +277,7 @@ class Lmi(Value):
 
     back_off: float | None = field(default=None, metadata=checked(positive))
     tolerance: float = field(default=1e-9, metadata=checked(positive))
-    max_states: int = field(default=30, metadata=checked(whole))
+    max_states: int = field(default=20, metadata=checked(whole))
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
@@ -293,7 +296,7 @@ class Lmi(Value):
             raise ModelError("Lmi needs states, got a static plant. Use Riccati().")
         if n > self.max_states:
             raise ModelError(
-                f"Lmi takes plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
+                f"Lmi serves plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
                 "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
             )
         high, low = self._smallest(problem)
@@ -318,14 +321,7 @@ class Lmi(Value):
         problem = given.measured_in(unit)
         p, units = problem, (np.ones(len(given.u)), np.ones(len(given.y)))
         plant = Plant(p.A, p.B1, p.B2, p.C1, p.C2, p.D11, p.D12, p.D21, *units)
-        cp, gamma = modelling(), modelling().Variable()
-        states = plant.balanced(X / unit**2, Y).with_unit_channels()
-        X, Y, constraints = projected(states, gamma)
-        goal = cp.Minimize(gamma + _LITTLE * (cp.trace(X) + cp.trace(Y)))
-        settings = dict.fromkeys(TOLERANCES, self.tolerance)
-        settings["static_regularization_constant"] = _REGULARISATION
-        solve_program(cp.Problem(goal, constraints), settings)
-        high = float(gamma.value)
+        high = self._optimum(plant.balanced(X / unit**2, Y).with_unit_channels())
         if high < FOUR_DIGITS:
             raise InfeasibleError(
                 "gamma has no minimum: the infimum is 0. u cancels w in z, at no cost. Weight the "
@@ -335,8 +331,27 @@ class Lmi(Value):
         if not high <= low * (1.0 + _GAP):
             raise SolverError(
                 f"the LMIs give a smallest gamma of {unit * high:.4g}, no proof excludes more than "
-                f"{unit * low:.4g}: "
-                f"{counted(len(problem.A), 'state')} of such unlike speeds are beyond the solver. "
-                "Use Riccati(), loosen weights, or leave slow or fast states out."
+                f"{unit * low:.4g}. {self._served(len(p.A))}"
             )
         return unit * min(high, low * (1.0 + _NEAR)), unit * low
+
+    def _optimum(self, states: Plant) -> float:
+        """Return the smallest gamma of the program, as the solver gives it."""
+        cp, gamma = modelling(), modelling().Variable()
+        X, Y, constraints = projected(states, gamma)
+        goal = cp.Minimize(gamma + _LITTLE * (cp.trace(X) + cp.trace(Y)))
+        settings = dict.fromkeys(TOLERANCES, self.tolerance)
+        settings["static_regularization_constant"] = _REGULARISATION
+        try:
+            solve_program(cp.Problem(goal, constraints), settings)
+        except SolverError as error:
+            raise SolverError(f"{error} {self._served(len(states.A))}") from error
+        return float(gamma.value)
+
+    def _served(self, n: int) -> str:
+        """Return which plants are served, and what to do with one of n states that is refused."""
+        return (
+            f"Lmi serves plants of up to {self.max_states} states of similar speeds and gains. The "
+            f"solver does not resolve those of this plant of {counted(n, 'state')} together. Use "
+            "Riccati(), loosen weights, or leave slow or fast states out."
+        )
