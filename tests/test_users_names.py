@@ -85,7 +85,9 @@ USES = {
     "hinf": lambda c: fx.design_hinf(c.weighted),
     "hinf, unweighted": lambda c: fx.design_hinf(c.plant),
     "hinf of a stage": lambda c: fx.design_hinf(c.stage()),
-    "hinf with added noise": lambda c: fx.design_hinf(c.weighted, fx.Riccati(regularised=True)),
+    "hinf with added noise": lambda c: fx.design_hinf(
+        c.plant.weighted(z={f"{c.die}:x": 1e6}, w={c.amp: 1e-3})
+    ),
     "hinf of a foreign system": lambda c: fx.design_hinf(
         c.weighted.system.to_control(), u=list(c.plant.u), y=list(c.plant.y)
     ),

@@ -30,7 +30,6 @@ from ..preparation import Prepared, badly_scaled
 from .hinf_riccati import Riccati
 from .lower_bound import raised_bound
 from .moved_design import PlantRange, PositionDesign
-from .singular import require_shown
 from .tolerated_modes import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 
 #: in the certificate: the upper bound of real mu of all uncertain frequencies together
@@ -167,13 +166,6 @@ class HinfDesign(Design):
 
     method: SynthesisMethod
     name = "hinf"
-
-    def prepare(self, plant: AnyPlant) -> Prepared:
-        """Return the scaled problem of a plant whose z and w miss no motion that would drift."""
-        problem: Prepared = super().prepare(plant)
-        if plant.modal_blocks.size:
-            require_shown(problem)
-        return problem
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return what the method finds."""

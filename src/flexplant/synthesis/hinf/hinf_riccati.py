@@ -24,7 +24,7 @@ from ...tolerances import MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
-from .singular import lacking, made_regular, require_ranks, require_shown
+from .singular import lacking, made_regular
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
 #: gains stay finite where D12 and D21 have full rank, so that 1 % is kept with the tolerance, and
@@ -70,8 +70,6 @@ class Riccati(Value):
         otherwise.
     tolerance : float
         Relative width at which the bisection stops.
-    regularised : bool, optional
-        True adds noise and effort to any problem, False to none; None decides as above.
     progress : bool, optional
         Whether to show a progress bar of the bisection. None: on a terminal or in a
         notebook, for work of more than two seconds.
@@ -91,7 +89,6 @@ class Riccati(Value):
 
     back_off: float | None = field(default=None, metadata=checked(positive, zero=True))
     tolerance: float = field(default=1e-3, metadata=checked(positive))
-    regularised: bool | None = None
     progress: bool | None = None
 
     def solve(self, problem: Prepared) -> SolvedController:
@@ -99,22 +96,12 @@ class Riccati(Value):
 
         Raises
         ------
-        AssumptionError
-            When z or w misses a mode on the stability boundary, or D12 or D21 does not have full
-            rank, and nothing may be added.
         InfeasibleError
             When gamma has a greatest lower bound that only infinite gain reaches.
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
-        if self.regularised is False:
-            lack = lacking(problem)
-            require_ranks(() if lack.is_full else lack.ranks)
-            require_shown(problem)
-            return regular_controller(problem, self._searched, self.back_off)
-        return back_off_controller(
-            problem, self._searched, self.back_off, always=bool(self.regularised)
-        )
+        return back_off_controller(problem, self._searched, self.back_off)
 
     def _searched(self, problem: Prepared, _: float) -> tuple[float, float]:
         """Return the smallest gamma that was reached below 1, and the largest refuted one."""
@@ -195,14 +182,11 @@ class _Bracket:
 
 
 def back_off_controller(
-    problem: Prepared, search: Search, back_off: float | None, *, always: bool = False
+    problem: Prepared, search: Search, back_off: float | None
 ) -> SolvedController:
-    """Return the controller at a distance from the smallest gamma of a search.
-
-    A little noise and effort is added where the problem needs it, or always.
-    """
+    """Return the controller at a distance from the smallest gamma, regularised where needed."""
     lack = lacking(problem)
-    if not (always or lack.words):
+    if not lack.words:
         return regular_controller(problem, search, back_off)
     step = (_ADDED if lack.is_full else _SINGULAR) if back_off is None else back_off
     return made_regular(problem, lambda regular: regular_controller(regular, search, step), lack)

@@ -11,8 +11,7 @@ import scipy.linalg as la
 
 from ...arrays import ComplexArray
 from ...certificates import Verified
-from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
-from ...lti.blocks_of_states import Matrices
+from ...errors import FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
@@ -90,14 +89,11 @@ def lacking(p: Prepared) -> Lacking:
                 f"{name} has rank {rank} of {D.shape[1]}: a combination of {', '.join(names)} "
                 f"{little}"
             )
-    return Lacking(tuple(ranks), missed_modes(p, _SHOWN), is_full)
+    return Lacking(tuple(ranks), _missed_modes(p), is_full)
 
 
-def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
-    """Return in words which slow modes z or w misses, or shows by less than a size.
-
-    Zeros of u -> z and of w -> y so close to the limit of stability count like such modes.
-    """
+def _missed_modes(p: Prepared) -> tuple[str, ...]:
+    """Return in words which slow modes z or w misses; zeros on the limit of stability count too."""
     p = p.measured_in(p.own_gain)  # the unit of z must not matter
     found = []
     sides = ("z", p.A, p.B2, p.C1, p.D12), ("w", p.A.T, p.C2.T, p.B1.T, p.D21.T)
@@ -108,7 +104,7 @@ def missed_modes(p: Prepared, shown: float) -> tuple[str, ...]:
         spectra = [np.asarray(la.eigvals(M), dtype=np.complex128) for M in (A, inner)]
         for s, distance in (point for poles in spectra for point in _limit(p, poles)):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
-            if la.svdvals(pencil)[-1] <= max(distance, shown):
+            if la.svdvals(pencil)[-1] <= max(distance, _SHOWN):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
                 found.append(_MISSED[side].format(f"{p.frequency(omega):.3g} Hz"))
                 break
@@ -128,21 +124,6 @@ def _limit(p: Prepared, poles: ComplexArray) -> list[tuple[complex, float]]:
     single = distance <= _SLOW
     chosen = single | (np.count_nonzero(apart <= _CHAIN, axis=1) > 1)
     return list(zip(limit[chosen].tolist(), np.where(single, distance, 0.0)[chosen], strict=True))
-
-
-def require_shown(p: Prepared) -> None:
-    """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
-    size = max(float(np.linalg.norm(p.A, 2)) if p.A.size else 0.0, 1.0)
-    for one in missed_modes(p, ROUNDING * size):
-        raise AssumptionError(one)
-
-
-def require_ranks(ranks: Sequence[str]) -> None:
-    """Raise AssumptionError when D12 or D21 has not full rank, with the cure of each."""
-    if ranks:
-        raise AssumptionError(
-            f"{'; '.join(ranks)}, and nothing may be added (regularised=False). {_remedy(ranks)}"
-        )
 
 
 def _remedy(ranks: Sequence[str]) -> str:
@@ -180,11 +161,6 @@ class Regularised:
             u_scale=np.eye(nu),
             y_scale=np.eye(ny),
         ).with_unit_channels()
-
-    def restored(self, K: SolvedController) -> Matrices:
-        """Return A, B, C, D of a controller of this problem, in the channels of the one given."""
-        u, y = self.problem.u_scale, self.problem.y_scale
-        return K.A, K.B @ y, u @ K.C, u @ K.D @ y
 
 
 class _Found(NamedTuple):
@@ -228,11 +204,11 @@ def _with_level(
     norm: Callable[[StateSpace], float],
 ) -> _Found:
     """Return the controller for one level, judged on the problem itself."""
-    problem = regular.given
-    A, B, C, D = regular.restored(solve(regular.problem))
-    system = problem.system
-    K = StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u, dt=system.dt)
-    gamma = norm(lft(system, K))
+    given, found = regular.given, solve(regular.problem)
+    u, y = regular.problem.u_scale, regular.problem.y_scale
+    parts = found.A, found.B @ y, u @ found.C, u @ found.D @ y
+    K = StateSpace(*parts, inputs=given.y, outputs=given.u, dt=given.system.dt)
+    gamma = norm(lft(given.system, K))
     if not np.isfinite(gamma):
         raise SolverError(
             f"with noise and effort of {regular.level:.0e} added, the controller does not "
