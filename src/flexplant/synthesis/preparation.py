@@ -26,16 +26,7 @@ from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import RESIDUAL, ROUNDING, SPLIT, TINY
 from ..words import inner_names
-from .scaling import (
-    POINT,
-    answers,
-    balanced,
-    departure_from_normal,
-    loop_speed,
-    normalised,
-    own_gain,
-    timed,
-)
+from .scaling import POINT, answers, balanced, departure_from_normal, loop_speed, normalised
 
 #: departure from normal above which modal coordinates are taken; the condition of their
 #: eigenvectors may be as many times larger, and from there on a failure is attributed to it
@@ -90,7 +81,8 @@ class Prepared(Value):
     @property
     def own_gain(self) -> float:
         """Size of w in z at the loop's speed, 1 where w does nothing there."""
-        return own_gain(self.A, self.B1, self.C1, self.D11, self.point)
+        gains = answers(self.A, self.B1, self.C1, self.D11, self.point)
+        return float(np.max(gains, initial=0.0)) or 1.0
 
     def measured_in(self, unit: float) -> Prepared:
         """Return the problem with z in multiples of `unit`; u too, so that D12 is kept."""
@@ -185,8 +177,8 @@ def prepared(
         point = complex((1.0 + half) / (1.0 - half))
         A, B, C = balanced(P.A, P.B, P.C, point)
     else:
-        P, point = image, POINT
-        A, B, C = timed(P.A, P.B, P.C, speed)
+        P, point, root = image, POINT, np.sqrt(speed)
+        A, B, C = balanced(P.A / speed, P.B / root, P.C / root, POINT)
     B1, B2, C1, C2 = B[:, :m1], B[:, m1:], C[:p1], C[p1:]
     D11, D12, D21, D22 = P.D[:p1, :m1], P.D[:p1, m1:], P.D[p1:, :m1], P.D[p1:, m1:]
     scales, names = (np.eye(len(u)), np.eye(len(y))), (tuple(u), tuple(y))

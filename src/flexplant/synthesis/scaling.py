@@ -54,25 +54,12 @@ def balanced(
     return A * scale / scale[:, None], B / scale[:, None], C * scale
 
 
-def timed(
-    A: FloatArray, B: FloatArray, C: FloatArray, speed: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the system with speed [rad/s] as its unit of frequency, balanced there."""
-    root = np.sqrt(speed)
-    return balanced(A / speed, B / root, C / root, POINT)
-
-
 def answers(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> FloatArray:
     """Return the sizes (m,) of ``C (s I - A)^-1 B + D`` by column, at least a part of its terms."""
     # what u moves and z does not show has no size there but rounding
     states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
     terms = np.linalg.norm(np.abs(C) @ np.abs(states) + np.abs(D), axis=0)
     return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), NEGLIGIBLE * terms))
-
-
-def own_gain(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> float:
-    """Return the largest of the answers of w in z, 1 where w does nothing."""
-    return float(np.max(answers(A, B, C, D, s), initial=0.0)) or 1.0
 
 
 def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:

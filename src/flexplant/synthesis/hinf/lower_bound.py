@@ -38,7 +38,7 @@ def raised_bound(problem: Prepared, gamma: float, known: float, close: float = _
 
 def pointwise_bound(problem: Prepared) -> float:
     """Return what no controller undercuts at some frequency, nor by the feedthrough."""
-    # parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
+    # Parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
     # reach, `N_z' Pzw` with N_z' Pzu = 0, and on the inputs which y does not show, `Pzw N_w` with
     # Pyw N_w = 0
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
@@ -50,7 +50,9 @@ def pointwise_bound(problem: Prepared) -> float:
     grid = grid[np.all(apart > SPLIT * (1.0 + np.abs(undamped.imag)), axis=1)]
 
     def bounds(freq: FloatArray) -> FloatArray:
-        return parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
+        P = np.moveaxis(responses(system, freq), 2, 0)
+        Pzw, seen = P[:, :p1, :m1], _adjoint(P[:, p1:, :m1])
+        return np.maximum(_perp_norms(P[:, :p1, m1:], Pzw), _perp_norms(seen, _adjoint(Pzw)))
 
     swept, _ = highest(bounds, grid, _REFINEMENTS)
     return max(swept, *(one.direct for one in both_sides(problem)))
@@ -82,13 +84,6 @@ def _bound_at_zeros(side: FullInformation) -> float:
         if 0 < sizes.size == len(null) and sizes[-1] > SAME * sizes[0]:
             found = max(found, float(np.linalg.norm(turn.conj().T @ driven / sizes[:, None], 2)))
     return found
-
-
-def parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
-    """Return the bound of each of a stack of responses (n_freq, p, m)."""
-    Pzw = P[:, :p1, :m1]
-    parts = (_perp_norms(P[:, :p1, m1:], Pzw), _perp_norms(_adjoint(P[:, p1:, :m1]), _adjoint(Pzw)))
-    return np.maximum(*parts)
 
 
 def _perp_norms(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:

@@ -22,8 +22,6 @@ from ..scaling import FELT
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
-#: what certificates call the size of what was added
-ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
 LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
@@ -244,11 +242,9 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
         f"{lack.words}. Designed with noise of {one.level:.0e} on each sensor and as much "
         "effort of each actuator, relative to the plant's own channels, and verified without them"
     )
-    checks = [Verified(ADDED, one.level)]
-    if finer is not one:
-        checks.append(Verified("gamma with a tenth of it", finer.gamma))
-        cost = 100 * (one.gamma / finer.gamma - 1.0) if finer.gamma else 0.0
-        note += f"; a tenth of it gives a gamma {max(cost, 0.0):.2g} % smaller"
+    if finer is not one and finer.gamma:
+        cost = max(100.0 * (one.gamma / finer.gamma - 1.0), 0.0)
+        note += f"; a tenth of it gives a gamma {cost:.2g} % smaller"
     notes = [note + "."]
     if any(not a.settles(b) and b.speed > _GROWTH * a.speed for a, b in pairwise(found[-3:])):
         notes.append(
@@ -256,5 +252,5 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "
             f"{_remedy(lack.ranks)[:-1]} to get a slower one."
         )
-    K = one.K
-    return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, tuple(checks), tuple(notes))
+    K, added = one.K, Verified("added noise", one.level)
+    return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, (added,), tuple(notes))
