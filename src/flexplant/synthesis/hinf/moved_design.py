@@ -119,14 +119,13 @@ class PositionDesign(Design):
     def solve(self, problem: PlantRange) -> tuple[Controller, dict[str, float]]:
         """Return the best controller, and the worst norm of each that was tried."""
         motion, tried, found = _MotionChannels(problem), dict[str, float](), list[Controller]()
-        plants = (*problem.plants, *problem.between.values())
 
         def worst_of(name: str, plant: AnyPlant) -> float:
             if name not in tried:
                 least, tried[name] = min(tried.values(), default=np.inf), np.inf
                 with attempted(f"the design for {name}"):  # another scale may serve
                     one = verified(self.design, solved(self.design, plant))
-                    tried[name] = max(_norm(at, one.system) for at in plants)
+                    tried[name] = _worst_norm(problem, one.system)
                     if tried[name] < least or not found:
                         found.append(one)
                 tick(_DESIGNS)
@@ -163,8 +162,8 @@ class PositionDesign(Design):
     def certify(self, solution: Solution) -> Controller:
         """Return the controller with the norms of all positions."""
         moving, _, K, (best, tried) = solution
-        norms = [_norm(one, K) for one in moving.plants]
-        certificate = moving.certified(lambda one: _norm(one, K), norms)
+        norms = [_position_norm(one, K) for one in moving.plants]
+        certificate = moving.certified(lambda one: _position_norm(one, K), norms)
         bounds = [pointwise_bound(prepared(one.system, one.u, one.y)) for one in moving.plants]
         worst = certificate["worst position"]
         answer: Controller = best.replace(
@@ -232,6 +231,15 @@ def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
     return np.flatnonzero(size > SAME * np.abs(rows).max(axis=1, initial=0.0))
 
 
-def _norm(plant: AnyPlant, K: StateSpace) -> float:
-    """Return the norm of the loop of one position, infinite where it is not stable."""
-    return float(hinf_norm(lft(plant.system, K)))
+def _worst_norm(moving: PlantRange, K: StateSpace) -> float:
+    """Return the largest norm at and between the positions, infinite where a loop is not stable."""
+    plants = (*moving.plants, *moving.between.values())
+    return max(float(hinf_norm(lft(one.system, K))) for one in plants)
+
+
+def _position_norm(plant: AnyPlant, K: StateSpace) -> float:
+    """Return the norm of the loop of one position."""
+    loop = lft(plant.system, K)
+    if not loop.is_stable:
+        raise CertificateError("the loop is not stable.")
+    return float(hinf_norm(loop))
