@@ -347,9 +347,9 @@ def numbered(
     model : Modes, or a model with `.modes()`
         Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
-        Places of the rows of the shapes: along z at a point unless a sensor gives another
-        direction; or Ports, for their sensors and actuators. By default the labels are DOFs of the
-        model.
+        Ports, for the places of their sensors and actuators; or the place of each row of the shapes
+        (a point means along z there, a sensor has its direction). By default the labels are DOFs of
+        the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float

@@ -45,22 +45,21 @@ def identify_output_only(
 ) -> MeasuredModes:
     r"""Return poles and shapes from responses only, without a measured excitation.
 
-    Covariance-driven stochastic subspace identification: with covariances
-    :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation,
+    The method is covariance-driven stochastic subspace identification. The covariances
+    :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation form the matrix
 
     .. math:: H = \begin{bmatrix} R_1 & R_2 & \cdots \\ R_2 & R_3 & \cdots \\ \vdots & & \ddots
-        \end{bmatrix} = O\,C, \quad O = [C;\ C A;\ C A^2;\ \ldots],
+        \end{bmatrix} = O\,C, \quad O = [C;\ C A;\ C A^2;\ \ldots].
 
-    so that the leading singular vectors of H give O up to its basis, its shift gives A, and
-    :math:`\lambda = rate\,\ln \mu(A)`. Poles that are stable over the orders are chosen at the
-    lowest order that has most of them, since more states add noise. White noise of the sensors is
-    in
-    :math:`R_0` only, which is not used. H without each of some blocks of the record (a jackknife)
-    gives the covariance of each pole. With b blocks it is multiplied by (b - 1)/(b - 3), so that
-    squared errors relative to the variance (Student's distribution) have a mean of 1. Poles whose
-    frequency varies by more than 2 % or whose damping varies by more than 60 % count as noise and
-    are left out. A rotating part or mains hum appears as a mode with almost no damping, and
-    excitation that is not white as additional modes.
+    The leading singular vectors of H give O in some basis of the states. A follows from O and O
+    shifted by one block, and the poles are :math:`\lambda = rate\,\ln \mu(A)`. Poles that are
+    stable over the orders are chosen at the lowest order that has most of them, since more states
+    add noise. White sensor noise is in :math:`R_0` only, which is not used. The covariance of each
+    pole is found by leaving out each block of the record in turn (a jackknife). With b blocks it is
+    multiplied by (b - 1)/(b - 3), so that squared errors relative to the variance (Student's
+    distribution) have a mean of 1. Poles whose frequency varies by more than 2 % or whose damping
+    varies by more than 60 % count as noise and are left out. A rotating part or mains hum appears
+    as a mode with almost no damping, and excitation that is not white as additional modes.
 
     Parameters
     ----------

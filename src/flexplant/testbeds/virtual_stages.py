@@ -198,8 +198,9 @@ def magnet_stage(
     Returns
     -------
     WaferStage
-        Its `drawing` holds what `solid_block` takes, its `magnets` the drawn GroundSprings. Modes
-        1 to 6 are the motions of the rigid body; poles are of those from 7 on.
+        Machine whose `drawing` holds the arguments of `solid_block` and whose `magnets` are the
+        drawn GroundSprings. Modes 1 to 6 are the rigid-body motions; `poles` are those of mode 7
+        and above.
 
     Raises
     ------

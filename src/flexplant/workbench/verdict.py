@@ -31,17 +31,17 @@ class LoopLimits(Value):
     Parameters
     ----------
     peak : float
-        Largest |S|; 2 is a modulus margin of 0.5, 6 dB.
+        Largest allowed |S|; 2 is a modulus margin of 0.5, 6 dB.
     gain_margin : float, optional
-        Smallest factor on the gain that makes the loop unstable.
+        Smallest allowed gain margin, as a factor.
     phase_margin : float, optional [deg]
-        Smallest phase margin.
+        Smallest allowed phase margin.
     bandwidth : float, optional [Hz]
         Lowest frequency at which |S| may cross 0 dB.
     suppressed, below : float, optional
-        Largest |S| up to the frequency `below` [Hz].
+        Largest allowed |S| up to the frequency `below` [Hz].
     rms : float, optional
-        Largest predicted rms of the error, in its unit.
+        Largest allowed predicted rms of the error, in its unit.
 
     Examples
     --------
