@@ -43,9 +43,9 @@ def write_c(
 
     The states are transformed to blocks of two, of which a compiler computes several at a time;
     their response is compared with that of the controller. Numbers have 17 digits (9 in single
-    precision), which is exact. The functions are `_reset`; `_start` with the present commands
-    (bumpless: it finds steady states with these commands, if they exist); `_output` and `_update`,
-    or `_step`. A value that is not finite holds the last outputs and raises a flag.
+    precision), which is exact. The functions are `_reset`; `_start`, which begins without a step
+    from the present commands (it finds steady states with these commands, if they exist); `_output`
+    and `_update`, or `_step`. A value that is not finite holds the last outputs and raises a flag.
 
     Parameters
     ----------

@@ -181,8 +181,9 @@ def update(
     residuals : sequence of Residual
         Residuals of the update, or other measurements for the judgement.
     unused : Frf or FrfResidual, optional
-        A measurement that was not fitted, drawn instead of that of the residuals; a residual if its
-        channels are not named by their DOFs, or it was measured after a hold.
+        Measurement that was not fitted, to be drawn in place of that of the residuals. It has to be
+        a residual where its channels are not named by their DOFs, or where it was measured after a
+        hold.
     level : float
         Level of the confidence intervals.
 

@@ -61,7 +61,7 @@ class FullBlock(Value):
     Parameters
     ----------
     w, z : int
-        Numbers of its outputs, which drive the plant, and of its inputs.
+        Number of outputs w of Delta, which drive the plant, and number of its inputs z.
     name : str
 
     Examples

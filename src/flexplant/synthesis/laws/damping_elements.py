@@ -45,7 +45,7 @@ class DampingElement(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VelocityFeedback(DampingElement):
-    """``gain s / (1 + s / w)``: the velocity of a displacement sensor.
+    """Velocity feedback: ``gain s / (1 + s / w)``, the velocity of a displacement sensor.
 
     Between an actuator and a sensor at one place every mode below w gains damping, rigid-body
     modes as well.
@@ -84,11 +84,11 @@ class VelocityFeedback(DampingElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PositivePositionFeedback(DampingElement):
-    """``-gain / (p^2 + 2 damping p + 1)``, p = s / w: ``u = +gain F(s) y``.
+    """Positive position feedback: ``-gain / (p^2 + 2 damping p + 1)``, p = s / w.
 
-    A filter near the frequency of the mode, whose damping the mode shares; it rolls off above.
-    Displacements are fed back with positive sign: the gain at rest must stay below the stiffness,
-    so that a free body cannot be damped by it.
+    The filter has its frequency w near that of the mode and shares its damping with the mode; above
+    w it rolls off. Displacements are fed back with positive sign, ``u = +gain F(s) y``, so that the
+    gain at rest must stay below the stiffness. A free body can therefore not be damped by it.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class PositivePositionFeedback(DampingElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IntegralResonantControl(DampingElement):
-    """``-gain / (1 + s / w)``: an integrator around the plant with a negative feedthrough.
+    """Integral resonant control, ``-gain / (1 + s / w)``: integral feedback with a feedthrough.
 
     An integrator ``k / s`` that reads ``y - d u`` gives gain = 1 / d and w = k d. A feedthrough d
     larger than the static compliance puts a zero below each resonance of a collocated pair, and
