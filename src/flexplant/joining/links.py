@@ -15,6 +15,7 @@ from ..arrays import FloatArray, IntArray, positive
 from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
+from ..sparse.symmetric import DEPENDENT
 from ..structure.rigid import rigid_motions
 from ..tolerances import NEGLIGIBLE, PRECISION, ROOT, SAME, TYPED
 from .component import Component, Model, Pose, components_of
@@ -242,8 +243,6 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
 
 
-#: the same size below which it nearly repeats others
-_DOUBTFUL = 1e-5
 #: preference for later components as followers; far above rounding
 _LATER, _WITHIN = 1e-2, 1e-4
 #: size relative to the largest in its constraint above which a coordinate may follow without
@@ -346,7 +345,7 @@ def _follower_rows(
     R, pivots = la.qr(scaled * prefer, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(R))
     rank = int(np.count_nonzero(diagonal > ROOT * diagonal[0]))
-    if rank and diagonal[rank - 1] < _DOUBTFUL * diagonal[0]:
+    if rank and diagonal[rank - 1] < DEPENDENT * diagonal[0]:
         warn(
             f"joints nearly repeat each other (a pivot is {diagonal[rank - 1] / diagonal[0]:.1g} "
             "of the first): coordinates with few digits make them stiffer than they are. Join "

@@ -177,9 +177,9 @@ def _gain_at(g: StateSpace, freq: float) -> float:
     return float(np.linalg.norm((g.C * d) @ np.linalg.solve(shifted, g.B / d[:, None]) + g.D, 2))
 
 
-#: relative tolerance of the squared H2 norms from both Gramians: five digits, as in the certificate
-#: of `design_h2`; or, if larger, the rounding of their terms
-_SAME_NORM = 1e-5
+#: relative tolerance of H2 norms from two routes: five digits. Squared norms from both Gramians may
+#: also differ by the rounding of their terms
+SAME_NORM = 1e-5
 
 
 @one_thread()
@@ -231,7 +231,7 @@ def h2_norm(sys: System) -> float:
         square, terms = _trace_of_factor(g.C, controllability_factor(g))
         other, their = _trace_of_factor(g.B.T, observability_factor(g))
     direct = float(np.sum(g.D**2)) if g.dt else 0.0
-    allowed = _SAME_NORM * (max(square, other) + direct) + RANK * max(terms, their)
+    allowed = SAME_NORM * (max(square, other) + direct) + RANK * max(terms, their)
     if not abs(square - other) <= allowed:
         raise CertificateError(
             f"the H2 norm of {g!r} is {np.sqrt(max(square, 0.0)):.9g} by the controllability "

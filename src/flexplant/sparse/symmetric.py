@@ -191,11 +191,11 @@ def _eigh(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(squares), np.asarray(mix)
 
 
-#: fraction of a vector outside of a basis below which it depends on the basis
-_DEPENDENT = 1e-5
+#: fraction of a vector outside of a basis below which it depends on the basis: five digits
+DEPENDENT = 1e-5
 
 
-def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPENDENT) -> FloatArray:
+def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = DEPENDENT) -> FloatArray:
     """Return M-orthonormal vectors that span, with V, what V and `part` span."""
     if not part.shape[1]:
         return part

@@ -17,7 +17,7 @@ from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...store import Value
-from ...tolerances import NEGLIGIBLE, RANK, ROUNDING, TINY, TYPED
+from ...tolerances import NEGLIGIBLE, PRECISION, RANK, ROUNDING, TINY, TYPED
 from ...words import name_list
 from ..building import sampled_like
 from ..partitioned import Partition, is_plant
@@ -322,8 +322,6 @@ def _height(weights: StateSpace, gap: ComplexArray, freq: FloatArray) -> FloatAr
 _SMOOTH = 20
 #: steps of the fit, and how much more a weight below the curve counts than one above
 _STEPS, _BELOW = 40, 4.0
-#: relative: rounding of a sum in double precision
-_LOST = 1e-16
 #: a value of the curve below this fraction of its surroundings is not followed; the width of these
 #: surroundings, in logarithms
 _VALLEY, _WIDE = 1e-4, 0.1
@@ -435,7 +433,7 @@ def _log_fit(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> Floa
         # what is below the rounding of a sum is zero: on some matrices with such entries LAPACK's
         # singular values do not converge
         share = terms * np.exp(q) / sums(q)[:, None]
-        return np.asarray(side(q)[:, None] * np.where(share > _LOST, share, 0.0))
+        return np.asarray(side(q)[:, None] * np.where(share > PRECISION, share, 0.0))
 
     # each term as high as it can be below the curve, or nearly so
     start = -np.log(np.quantile(terms / square[:, None], 0.99, axis=0))

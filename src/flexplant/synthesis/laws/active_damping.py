@@ -21,19 +21,16 @@ from ...lti.statespace import StateSpace
 from ...plant import StandardPlant, standard_plant
 from ...plant.uncertainty.uncertain_plants import made_of
 from ...store import Value
-from ...tolerances import ROUNDING
+from ...tolerances import NEGLIGIBLE, ROUNDING
 from .damping_elements import KINDS, DampingElement
+from .servo_loops import HIGHEST
 
 #: gains that are tried, over that at which the loop gain at the mode is 1; then around the best
 _GAINS = np.geomspace(0.02, 50.0, 40)
-#: poles this much slower than the mode count as at rest, where rigid-body modes are
-_REST = 1e-3
 #: least damping of the other modes, relative to their damping without the loop
 _KEPT = 0.7
 #: gains around the best
 _FINE = 41
-#: largest share of the rate at which an element may have its corner
-_BELOW = 0.4
 #: kinds by their names
 Kind = Literal["velocity", "ppf", "irc"]
 
@@ -176,7 +173,7 @@ def damp_modes(
     ends = _one(y, "sensor", "y", sensors), _one(u, "actuator", "u", given.u)
     g = given.Gyu.select([ends[0]], [ends[1]])
     target = _mode(g, whole(mode, "mode"))
-    most = _BELOW / g.dt if g.dt else np.inf
+    most = HIGHEST / g.dt if g.dt else np.inf
     tried = [one for one in chosen.candidates(abs(target) / (2 * np.pi)) if _corner(one) < most]
     loci = [_locus(g, one, target) for one in tried]
     best = _best(loci, wanted, least)
@@ -231,7 +228,7 @@ def _corner(element: DampingElement) -> float:
 def _mode(g: StateSpace, mode: int) -> complex:
     """Return the pole of a mode with positive imaginary part [rad/s]."""
     poles = continuous_poles(g)
-    upper = poles[poles.imag > _REST * np.abs(poles).max(initial=0.0)]
+    upper = poles[poles.imag > NEGLIGIBLE * np.abs(poles).max(initial=0.0)]
     upper = upper[np.argsort(upper.imag)]
     if mode > upper.size:
         raise ModelError(
@@ -260,7 +257,7 @@ def _locus(
     if g.dt:
         with np.errstate(divide="ignore", invalid="ignore"):
             closed = np.log(closed) / g.dt
-    rest, before = _REST * abs(target), continuous_poles(g)
+    rest, before = NEGLIGIBLE * abs(target), continuous_poles(g)
     others = before[
         np.abs(before.real + 1j * np.abs(before.imag) - target) > ROUNDING * abs(target)
     ]

@@ -15,7 +15,7 @@ from ...errors import SolverError
 from ...loop.measured_loop import nyquist_count
 from ...lti.frequency_sweep import local_maxima
 from ...lti.measured_lines import FEWEST, between_lines, hidden_modes, steps_between
-from ...tolerances import TINY
+from ...tolerances import DEVIATIONS, TINY
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section, product, tustin_s
 
@@ -298,8 +298,6 @@ class AxisLaw:
         )
 
 
-#: standard deviations of a line within which the response is taken to lie
-_DEVIATIONS = 2.0
 #: change between two lines, relative to their size and in standard deviations, above which lines
 #: are added
 _STEP, _CLEAR = 0.15, 3.0
@@ -352,7 +350,7 @@ class MeasuredAxis:
     def points(self) -> tuple[FloatArray, ComplexArray, FloatArray]:
         """Frequencies [Hz], responses and bounds on their errors: the lines, and between them."""
         # where a response changes much, it follows the circles through its neighbours
-        f, G, bound = self.freq, self.G, _DEVIATIONS * self.deviation
+        f, G, bound = self.freq, self.G, DEVIATIONS * self.deviation
         if f.size < 4 or self.resolved:
             return f, G, bound
         step = np.abs(np.diff(G))

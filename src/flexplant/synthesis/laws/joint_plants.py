@@ -16,11 +16,10 @@ from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
+from ...tolerances import NEGLIGIBLE
 from .axis_law import are_stable
 from .law import Law, decoupled
 
-#: least size of a channel, relative to the largest
-_IDLE = 1e-3
 #: logarithmic part of a grid through the resonances, and times that it is refined
 _POINTS, _REFINEMENTS = 250, 6
 
@@ -84,8 +83,8 @@ class JointPlant:
         forces = np.linalg.norm(self.before, axis=1)
         shown = np.linalg.norm(np.linalg.pinv(self.after), axis=1)
         return (
-            np.maximum(forces, _IDLE * forces.max(initial=0.0)),
-            np.maximum(shown, _IDLE * shown.max(initial=0.0)),
+            np.maximum(forces, NEGLIGIBLE * forces.max(initial=0.0)),
+            np.maximum(shown, NEGLIGIBLE * shown.max(initial=0.0)),
         )
 
     @property

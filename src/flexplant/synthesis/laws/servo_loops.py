@@ -29,7 +29,7 @@ LEADS = (4.0, 16.0, 64.0)
 
 
 #: highest corner of a law, as a fraction of the rate
-_HIGHEST = 0.4
+HIGHEST = 0.4
 
 
 #: lines on which an axis may lie, by the power of 1 / s of its response: a mass that is free (or
@@ -81,7 +81,7 @@ class Axis:
         """Integral action and lead."""
         if self.line == "mass":
             zero = self.bandwidth / self.lead
-            pole = min(self.bandwidth * self.lead, _HIGHEST * self.rate)
+            pole = min(self.bandwidth * self.lead, HIGHEST * self.rate)
             return (Pid.corners(1.0, integrator=self.integrator, zero=zero, pole=pole),)
         if self.line == "damper":
             return (Integrator(self.integrator),)

@@ -22,6 +22,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.axes import real_gain
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...tolerances import SPLIT
 from .axis_law import AxisLaw, MeasuredAxis, linear_step, near_lowest
 from .controller_elements import Pid
 from .joint_plants import Coupling, JointPlant, Worst
@@ -29,10 +30,6 @@ from .law import Axes, Law, tustin_s
 from .loop_design import DesignedLoops, axes_of, made
 from .pid_tuning import tune_pid
 from .servo_loops import TARGET
-
-#: distance of a pole from zero frequency, relative to the farthest pole, below which it counts as
-#: zero
-_ZERO = 1e-6
 
 
 @one_thread()
@@ -110,7 +107,7 @@ def tune_loops(
         rigid = len(axes.names)
     elif rigid is None:  # a rigid-body mode has two poles at zero frequency
         distance = np.abs(axes.plant.poles() - (1.0 if axes.rate else 0.0))
-        rigid = int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
+        rigid = int(np.count_nonzero(distance <= SPLIT * np.max(distance, initial=0.0))) // 2
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
     if _has_no_line(axes):
@@ -151,7 +148,7 @@ def _has_no_line(axes: Axes) -> bool:
         return False
     poles = g.poles()
     rest = np.abs(poles - (1.0 if axes.rate else 0.0))
-    slow = rest <= _ZERO * np.max(rest)
+    slow = rest <= SPLIT * np.max(rest)
     grows = np.abs(poles) > 1.0 if axes.rate else poles.real > 0.0
     return bool(np.count_nonzero(slow) % 2 or np.any(grows & ~slow))
 
