@@ -20,7 +20,7 @@ from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...store import Value, checked
 from ...tolerances import CLOSE, NEGLIGIBLE, TINY
-from ..controller import Controller, SolvedController
+from ..controller import Controller
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati, h2_controller
@@ -249,17 +249,17 @@ def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most:
 
 def _size_reached(plant: AnyPlant, problem: Prepared, objective: Any) -> float:
     """Return what the controller of least quadratic cost reaches, with some noise and effort."""
-    regular = Regularised(problem, CLOSE, modes=True)
+    regular = Regularised(problem, CLOSE, modes=True).problem
     try:
-        least = h2_controller(regular.problem)
+        least = h2_controller(regular)
     except (la.LinAlgError, OnAxisError) as error:
         raise SolverError(
             "no controller of least quadratic cost stabilises in rounding: "
             + beyond_rounding(problem)
         ) from error
-    found = SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
+    B, C, D = least.B @ regular.y_scale, regular.u_scale @ least.C, np.zeros(least.D.shape)
     w, z = objective.chosen(plant)
-    loop = lft(plant.system, problem.restored(*regular.restored(found)))
+    loop = lft(plant.system, problem.restored(least.A, B, C, D))
     size = float(objective.measured(loop.select(z, w))) if loop.is_stable else np.inf
     if not np.isfinite(size):
         raise SolverError(
