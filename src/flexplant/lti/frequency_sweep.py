@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..arrays import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
 from ..tolerances import ROOT, ROUNDING, SETTLED, SPLIT, TINY, TYPED
-from .response_solvers import continuous_poles, responder
+from .response_solvers import Responder, continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
 #: number of log-spaced frequencies of a search for peaks, and of refinements of these
@@ -243,14 +243,26 @@ def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inside, np.asarray(0.5 * slope * way)
 
 
-def largest_gains(H: ComplexArray) -> FloatArray:
-    """Return the largest singular values of responses (p, m, n): lower bounds off the peak."""
+def swept_gains(respond: Responder, freq: FloatArray) -> FloatArray:
+    """Return the largest gains at frequencies [Hz], not all of whose responses are held at once."""
+    found, most = [], 0.0
+    for first in range(0, freq.size, POINTS):
+        found.append(largest_gains(respond(freq[first : first + POINTS]), most))
+        most = max(most, float(found[-1].max()))
+    return np.concatenate([*found, np.zeros(0)])
+
+
+def largest_gains(H: ComplexArray, most: float = 0.0) -> FloatArray:
+    """Return the largest singular values of responses (p, m, n): lower bounds off the peak.
+
+    `most`: a gain that is known, below which bounds are enough.
+    """
     # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
     squares = [np.einsum("pmn,pmn->n", part, part) for part in (H.real, H.imag)]
     size, root = np.sqrt(squares[0] + squares[1]), np.sqrt(min(H.shape[:2]))
     if root == 1.0:
         return np.asarray(size)
-    near = size * root >= size.max(initial=0.0) * (1.0 - ROUNDING)
+    near = size * root >= size.max(initial=most) * (1.0 - ROUNDING)
     size[~near] /= root
     size[near] = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
     return np.asarray(size)

@@ -12,7 +12,7 @@ from ..parallel import Progress, one_thread
 from ..tolerances import MISSED, MOST_STEPS, RANK, SAME, SETTLED
 from .blocks_of_states import bilinear_matrices, is_block_diagonal
 from .equations import axis_frequencies, state_scale
-from .frequency_sweep import POINTS, ROUNDS, SOUGHT, highest, largest_gains, resonance_grid
+from .frequency_sweep import POINTS, resonance_grid, swept_gains
 from .lyapunov import (
     controllability_factor,
     controllability_gramian,
@@ -263,7 +263,7 @@ def level_set_peak(
     answer = respond or responder(g)
 
     def find(freq: FloatArray) -> FloatArray:
-        return largest_gains(answer(freq))
+        return swept_gains(answer, freq)
 
     gain, freq = _swept_peak(g, find, top)
     if not gain:
@@ -291,10 +291,13 @@ def level_set_peak(
 def _swept_peak(
     g: StateSpace, find: Callable[[FloatArray], FloatArray], top: float
 ) -> tuple[float, float]:
-    """Return the largest gain of a sweep, including the feedthrough, and its frequency [Hz]."""
-    grid = np.append(0.0, resonance_grid(g.poles(), g.dt, points=POINTS, around=SOUGHT))
+    """Return a large gain and its frequency [Hz]: the feedthrough, or one at a resonance."""
+    # a step of the level set costs less than a fine sweep
+    grid = np.append(0.0, resonance_grid(g.poles(), g.dt, points=POINTS // 4, around=(0.0,)))
     through = np.linalg.norm(g.evaluated(-1.0) if g.dt else g.D, 2)
-    return max((float(through), top), highest(find, grid, ROUNDS))
+    sizes = find(grid)
+    best = int(np.argmax(sizes))
+    return max((float(through), top), (float(sizes[best]), float(grid[best])))
 
 
 class _Level:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..certificates import (
     Certificate,
     Verified,
@@ -21,7 +21,7 @@ from ..certificates import (
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..loop.on_measurement import NOT_MEASURED
-from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
+from ..lti.frequency_sweep import highest, largest_gains, resonance_grid, swept_gains
 from ..lti.norms import peak_gain
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
@@ -188,20 +188,44 @@ def certified_norm(loop: StateSpace, claim: float, respond: Responder | None = N
     )
 
 
-def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> Certificate:
+class ReachedNorms:
+    """Responses (p, m, n) of a loop, and the largest gain so far from each group of w to each of z.
+
+    Groups follow the names that `assemble_plant` gives; one group on each side says nothing new.
+    """
+
+    def __init__(self, P: AnyPlant, loop: StateSpace) -> None:
+        self.respond = responder(loop)
+        w = {"references": ":ref", "noises": ":noise"}
+        sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
+        self._places = {
+            f"{to} from {source}": np.ix_(rows, columns)
+            for to, rows in sides[0].items()
+            for source, columns in sides[1].items()
+            if len(sides[0]) * len(sides[1]) > 1
+        }
+        self._largest = dict.fromkeys(self._places, 0.0)
+
+    def __call__(self, freq: FloatArray) -> ComplexArray:
+        """Return the responses at frequencies [Hz]."""
+        gain = self.respond(freq)
+        for name, places in self._places.items():
+            most = self._largest[name]
+            self._largest[name] = float(largest_gains(gain[places], most).max(initial=most))
+        return gain
+
+    @property
+    def norms(self) -> Certificate:
+        """The largest gain of each pair of groups, of 1 that the weights require."""
+        found = self._largest.items()
+        return Certificate(tuple(Verified(what, one, SWEEP, 1.0) for what, one in found))
+
+
+def reached_norms(P: AnyPlant, loop: StateSpace) -> Certificate:
     """Return the largest gain of a loop from each group of w to each group of z, by a sweep."""
-    # groups by the names that `assemble_plant` gives; one group on each side says nothing new
-    w = {"references": ":ref", "noises": ":noise"}
-    sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
-    if len(sides[0]) * len(sides[1]) < 2:
-        return Certificate()
-    gain = respond(_loop_grid(loop))
-    norms = (
-        (f"{to} from {source}", float(largest_gains(gain[rows][:, columns]).max()))
-        for to, rows in sides[0].items()
-        for source, columns in sides[1].items()
-    )
-    return Certificate(tuple(Verified(what, one, SWEEP, 1.0) for what, one in norms))
+    respond = ReachedNorms(P, loop)
+    swept_norm(loop, respond)
+    return respond.norms
 
 
 def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
@@ -218,13 +242,9 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
     respond = respond or responder(loop)
-    swept, _ = highest(lambda freq: largest_gains(respond(freq)), _loop_grid(loop), 3)
+    grid = np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
+    swept, _ = highest(lambda freq: swept_gains(respond, freq), grid, 3)
     return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
-
-
-def _loop_grid(loop: StateSpace) -> FloatArray:
-    """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
-    return np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
 
 
 #: what a high peak means

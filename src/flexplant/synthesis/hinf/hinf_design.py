@@ -12,19 +12,12 @@ from ...certificates import Certificate, Verified
 from ...errors import CertificateError, ModelError, SolverError, counted, short
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
-from ...lti.response_solvers import remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import AnyPlant, StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...words import instance
-from ..controller import (
-    Controller,
-    SolvedController,
-    SynthesisMethod,
-    certified_norm,
-    reached_norms,
-)
+from ..controller import Controller, ReachedNorms, SolvedController, SynthesisMethod, certified_norm
 from ..pipeline import Design, Solution, designed, posed, solved, verified
 from ..preparation import Prepared, badly_scaled
 from .hinf_riccati import Riccati
@@ -175,7 +168,7 @@ class HinfDesign(Design):
         """Return the controller with the norm of its loop, by two routes, and a lower bound."""
         plant, problem, K, found = solution
         loop = lft(plant.system, K)
-        respond = remembered(responder(loop))  # swept twice over the same frequencies
+        respond = ReachedNorms(plant, loop)
         try:
             certificate = certified_norm(loop, found.gamma, respond)
         except CertificateError:
@@ -193,7 +186,7 @@ class HinfDesign(Design):
             gamma=gamma,
             lower=lower,
             certificate=Certificate((*certificate.checks, *found.checks)),
-            reached=reached_norms(plant, loop, respond),
+            reached=respond.norms,
             notes=found.notes,
             tried=Certificate((Verified(f"{name}()", gamma),)),
         )

@@ -246,9 +246,11 @@ class ModeLoop:
         """Return beta, the largest over the grid: the Deltas and gains over it are all shown."""
         # the design's D and G first, D for a beta that is `near`; where that is the largest, D that
         # evens out the loop, with G and without, and the best of the three
-        plain = self._levels(self.M, self.shift, near)
+        count = len(self.M)
+        pieces = np.array_split(np.arange(count), -(-count // _AT_ONCE))
+        plain = np.concatenate([self._levels(self.M[i], self.shift[i], near) for i in pieces])
         most = 0.0
-        for part in np.array_split(np.argsort(-plain), -(-plain.size // _AT_ONCE)):
+        for part in np.array_split(np.argsort(-plain), len(pieces)):
             if plain[part[0]] <= most:
                 break
             M = evened(self.M[part], self.where)

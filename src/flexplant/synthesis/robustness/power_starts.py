@@ -106,23 +106,22 @@ def power_iterations(
     firsts = blocks.w.channels[blocks.w.first]
     half = (count + 1) // 2
     q[half:][blocks.real & (drawn[half:, 0, 0][:, firsts] < 0)] = -1.0
-    old, a = b.copy(), b @ M.T
-    on = np.arange(count)  # starts that have not settled
+    old, adjoint = b, M.conj()
+    on = np.ones(count, dtype=bool)  # starts that have not settled
+    kept = [q.copy(), b @ M.T, w.copy()]
     for _ in range(_STEPS):
-        a[on] = b[on] @ M.T
-        on = on[a[on].any(axis=1)]
-        a[on] = _unit(a[on])
-        q[on] = blocks.updated(q[on], a[on], b[on], w[on])
-        w[on] = blocks.back(q[on], a[on], w[on]) @ M.conj()
-        on = on[w[on].any(axis=1)]
-        w[on] = _unit(w[on])
-        q[on] = blocks.updated(q[on], a[on], old[on], w[on])
-        b[on] = _unit(blocks.through(q[on], a[on], w[on]))
-        moved = np.linalg.norm(b[on] - old[on], axis=1) >= _SETTLED
-        old[on] = b[on]
-        on = on[moved]
-        if not on.size:
+        a = _unit(b @ M.T)
+        q = blocks.updated(q, a, b, w)
+        w = _unit(blocks.back(q, a, w) @ adjoint)
+        q = blocks.updated(q, a, old, w)
+        b = _unit(blocks.through(q, a, w))
+        for known, new in zip(kept, (q, a, w), strict=True):
+            known[on] = new[on]
+        on &= np.linalg.norm(b - old, axis=1) >= _SETTLED
+        if not on.any():
             break
+        old = b
+    q, a, w = kept
     full = [p for p in where if not isinstance(p.block, RepeatedScalar)]
     return [
         Perturbation(
@@ -137,6 +136,8 @@ def power_iterations(
 def _unit(vectors: ComplexArray) -> ComplexArray:
     """Return rows of size one; a row of zeros becomes the first unit vector."""
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if size.all():
+        return np.asarray(vectors / size)
     first = np.zeros_like(vectors)
     first[:, 0] = 1.0
     return np.where(size > 0, vectors / np.where(size > 0, size, 1.0), first)

@@ -99,6 +99,10 @@ class Scalings:
         self.column: IntArray = np.array([e[2] for e in entries])
         self.value: ComplexArray = np.array([e[3] for e in entries], dtype=np.complex128)
         self.leveled = np.array([e[4] for e in entries])
+        # the places of S that derivatives fill: of each entry, and in P of each pair of places
+        size = self.w + self.z
+        places, self.at = np.unique(self.row * size + self.column, return_inverse=True)
+        self.across: IntArray = size * (places % size)[:, None] + places // size
 
     def coefficients(self, level: float) -> ComplexArray:
         """Return the entries of S for x = 1, at a level."""
@@ -157,12 +161,15 @@ def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     square[..., k, k] = 0.0
     tiny = ROUNDING * np.maximum(np.sqrt(square.max(axis=(-2, -1), initial=0.0)), TINY)
     d = np.ones(square.shape[:-1])
+    inverse = d.copy()
+    rows, columns = np.moveaxis(square, -2, 0), np.moveaxis(square, -1, 0)
     for _ in range(20):
         for i in k:
             own = np.sqrt(d[..., i])
-            row = np.sqrt(np.sum(square[..., i, :] / d, axis=-1)) * own + tiny
-            column = np.sqrt(np.sum(square[..., i] * d, axis=-1)) / own + tiny
+            row = np.sqrt(np.vecdot(rows[i], inverse)) * own + tiny
+            column = np.sqrt(np.vecdot(columns[i], d)) / own + tiny
             d[..., i] *= column / row
+            inverse[..., i] = 1.0 / d[..., i]
     return np.asarray(d / np.exp(np.mean(np.log(d), axis=-1, keepdims=True)))
 
 

@@ -174,7 +174,7 @@ def _descended(
         # the value is off by the square of it
         if not decrement > 1e-6:
             break
-        t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
+        t = 1.0  # it lowers the value at the latest at 1 / (1 + decrement)
         # shorter steps are rounding of x
         while t > 1e-10 and not (new := merit(x + t * step)) < value:  # a step of rounding
             t *= 0.5
@@ -200,12 +200,9 @@ class _Slopes(NamedTuple):
     @classmethod
     def of(cls, scalings: Scalings, value: ComplexArray) -> _Slopes:
         """Return those of values for each entry of S, zero where an entry does not move."""
-        size = scalings.w + scalings.z
-        places, at = np.unique(scalings.row * size + scalings.column, return_inverse=True)
-        n = places.size
-        values = sp.csr_array((value, (scalings.owner, at)), (scalings.count, n))
-        across = size * (places % size)[:, None] + places // size
-        return cls(across, values, np.empty((2, n, n), dtype=np.complex128))
+        n = len(scalings.across)
+        values = sp.csr_array((value, (scalings.owner, scalings.at)), (scalings.count, n))
+        return cls(scalings.across, values, np.empty((2, n, n), dtype=np.complex128))
 
     def derivatives(
         self, W: ComplexArray, scalings: Scalings, x: FloatArray, level: float
@@ -224,6 +221,11 @@ class _Slopes(NamedTuple):
 def _add_of_D(scalings: Scalings, x: FloatArray, gradient: FloatArray, hessian: FloatArray) -> None:
     """Add the derivatives of ``-sum log det D``."""
     for (own, basis), D in zip(scalings.alike, scalings.stacks(x), strict=True):
+        if len(basis) == 1:  # numbers
+            inverse = 1.0 / D[:, 0, 0].real
+            gradient[own[:, 0]] -= inverse
+            hessian[own[:, 0], own[:, 0]] += inverse**2
+            continue
         turned = np.linalg.inv(D)[:, None] @ basis
         gradient[own] -= np.einsum("bpii->bp", turned).real
         flat = turned.reshape(*own.shape, -1)

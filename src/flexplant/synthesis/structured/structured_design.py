@@ -13,7 +13,6 @@ from ...arrays import FloatArray, whole
 from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, short
 from ...lti.interconnection import lft
-from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
@@ -234,7 +233,7 @@ class _Structured(Design):
         final, loop = search.family.structure(found.x), lft(plants[worst].system, K)
         reached = Certificate()
         if kind == "H-infinity":
-            reached = reached_norms(plants[worst], loop, responder(loop))
+            reached = reached_norms(plants[worst], loop)
         return Controller(
             K,
             f"{kind} of structure {(self.structure if final is None else final)!r}",
