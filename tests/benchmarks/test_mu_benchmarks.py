@@ -7,7 +7,16 @@ import pytest
 
 import flexplant as fx
 from flexplant.lti import StateSpace
-from flexplant.synthesis import H2, FullBlock, Hinf, RepeatedScalar, design_lmi, design_mu, mu
+from flexplant.synthesis import (
+    H2,
+    FullBlock,
+    Hinf,
+    RepeatedScalar,
+    design_lmi,
+    design_mu,
+    mu,
+    robust_stability,
+)
 from flexplant.synthesis.robustness.uncertainty_blocks import Scalings
 from stages import ports, sampled, some_modes
 
@@ -133,3 +142,21 @@ def test_design_mu_of_twenty_modes(capsys):
         print(f"\ndesign_mu, 20 modes: {found.method}, mu {found.gamma:.4f}, {spent:.1f} s of CPU")
     assert found.gamma < 0.88
     assert spent < 20.0
+
+
+@pytest.mark.parametrize("off", [0.005, 0.02, 0.05])
+def test_robust_stability_of_twenty_modes(off, capsys):
+    """A Kalman filter with a servo of 40 Hz, 118 states: the quick bound, then the whole search."""
+    plant = sampled(some_modes(1e-3, 23, attached=False), ports(asd=1e-2))
+    blocks = fx.design_kalman(plant), fx.design_servo(plant, bandwidth=40.0)
+    found, spent = {}, {}
+    for quick in (True, False):
+        start = time.process_time()
+        found[quick] = robust_stability(plant.uncertain(frequency=off), *blocks, quick=quick)
+        spent[quick] = time.process_time() - start
+    with capsys.disabled():
+        print(f"\nfrequencies off by {100 * off:g} %: mu <= {found[True].upper:.3f} in "
+              f"{spent[True]:.2f} s of CPU, mu <= {found[False].upper:.3f} in "
+              f"{spent[False]:.1f} s, {found[False].bounds.size} bounds")  # fmt: skip
+    assert found[False].upper < found[True].upper < 1.0
+    assert spent[True] < 2.0

@@ -275,11 +275,9 @@ class PoleFit:
         self, plus: ComplexArray, minus: ComplexArray, participation: ComplexArray
     ) -> Iterator[FloatArray]:
         """Yield per output the columns (n_in 2 n_freq, 2 m) of shapes, free of residual terms."""
-        l = participation[:, :, None]  # noqa: E741 - the field's letter
-        first, second = l * plus, l.conj() * minus
-        both = np.concatenate([first + second, 1j * (first - second)], axis=1)
+        both = np.array([_turned(_halves(plus, minus), own) for own in participation])
         for (Q, _), w in zip(self.lines.smooth_bases, self.lines.weight, strict=True):
-            columns = _off(Q, _real_and_imag(both * w[:, None, :]))
+            columns = _off(Q, both * _twice(w)[:, None, :])
             yield columns.swapaxes(0, 1).reshape(2 * len(plus), w.shape[0] * columns.shape[2]).T
 
     @property
@@ -388,18 +386,23 @@ class PoleFit:
         """The fitted responses."""
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
 
-    def _moving(self, o: int) -> FloatArray:
-        """Return the derivatives (n_in, 4 m, 2 n_freq) of rows; 2 m for a single input."""
+    @cached_property
+    def _rows(self) -> FloatArray:
+        """The rows (4 m, 2 n_freq) whose combinations are all derivatives; 2 m for one input."""
+        # of the poles, then of the participation, which is held at 1 for a single input
+        of_poles = _halves(self.slope, self.slope_minus)
+        if len(self.participation) == 1:
+            return of_poles
+        return np.concatenate([of_poles, _halves(self.plus, self.minus)])
+
+    def _combined(self, rows: FloatArray, o: int, i: int) -> FloatArray:
+        """Return the derivatives of an output by an input from `_rows`, or from products of it."""
         # with Re and Im of the poles, then with those of the participation of the row's own input
-        shape = self.shapes[o][:, None]
-        l = self.participation[:, :, None]  # noqa: E741
-        a, b = shape * l * self.slope, (shape * l).conj() * self.slope_minus
-        parts = np.concatenate([a + b, 1j * (a - b)], axis=1)
-        if l.shape[0] > 1:  # the participation of a single input is held at 1
-            c, d = shape * self.plus, shape.conj() * self.minus
-            more = np.concatenate([c + d, 1j * (c - d)])
-            parts = np.concatenate([parts, np.broadcast_to(more, parts.shape)], axis=1)
-        return _real_and_imag(parts * self.lines.weight[o][:, None, :])
+        m, shape = self.m, self.shapes[o]
+        parts = [_turned(rows[: 2 * m], shape * self.participation[i])]
+        if len(rows) > 2 * m:
+            parts.append(_turned(rows[2 * m :], shape))
+        return np.concatenate(parts)
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
@@ -423,7 +426,9 @@ class PoleFit:
         n_in = self.participation.shape[0]
         Q = self.bases[o][0]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
-        moving = _off(self.lines.smooth_bases[o][0], self._moving(o))
+        weights = _twice(self.lines.weight[o])
+        rows = [self._combined(self._rows * w, o, i) for i, w in enumerate(weights)]
+        moving = _off(self.lines.smooth_bases[o][0], np.array(rows))
         for own, D, (mine, at) in zip(J, moving, self._places, strict=True):
             own[:, at] = D[mine].T
         J = J.reshape(Q.shape[0], -1)
@@ -438,9 +443,10 @@ class PoleFit:
     def _equations(self) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
         """J^T J and J^T e, and per output the projection Q^T D on the shapes."""
         # `J^T J = D^T D - (Q^T D)^T Q^T D` and `J^T e = D^T e`, summed over the inputs, whose rows
-        # depend only on their participation. Q is the basis of the residual terms and of the
-        # shapes, which are orthogonal to them, as e is. J itself is formed where the difference
-        # would lose more digits than the least damping of a step allows
+        # depend only on their participation; products of the common rows are combined. Q is the
+        # basis of the residual terms and of the shapes, which are orthogonal to them, as e is. J
+        # itself is formed where the difference would lose more digits than the least damping of a
+        # step allows
         n_in = self.participation.shape[0]
         count = 2 * self.participation.size
         self.lines.work.add(self.lines.data.size * count**2)
@@ -450,14 +456,19 @@ class PoleFit:
             errors = error.reshape(n_in, -1)
             bases = Q.reshape(*errors.shape, 2 * self.m)
             left, smooth = np.zeros_like(N), self.lines.smooth_bases[o][0]
-            parts = zip(self._moving(o), smooth, bases, errors, self._places, strict=True)
-            for D, terms, basis, e, (mine, at) in parts:
-                own = D if mine.size == len(D) else D[mine]
-                square, off = own @ own.T, own @ terms
+            weights = _twice(self.lines.weight[o])
+            parts = zip(weights, smooth, bases, errors, self._places, strict=True)
+            for i, (w, terms, basis, e, (mine, at)) in enumerate(parts):
+                rows = self._rows * w
+                half = self._combined(rows @ rows.T, o, i)
+                square = self._combined(half.T, o, i)[np.ix_(mine, mine)]
+                right = rows @ np.concatenate([terms, basis, e[:, None]], axis=1)
+                own = self._combined(right, o, i)[mine]
+                off = own[:, : terms.shape[1]]
                 whole[np.ix_(at, at)] += square
                 left[np.ix_(at, at)] += square - off @ off.T
-                g[at] += own @ e
-                common[:, at] += (own @ basis).T
+                g[at] += own[:, -1]
+                common[:, at] += own[:, terms.shape[1] : -1].T
             left -= common.T @ common
             if np.any(np.diag(left) < OWN_SQUARE * np.diag(whole)):
                 J = self._jacobian(o)
@@ -509,6 +520,23 @@ def _damped_step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:
 
 def _real_and_imag(values: Any) -> FloatArray:
     return np.concatenate([values.real, values.imag], axis=-1)
+
+
+def _twice(weight: FloatArray) -> FloatArray:
+    """Return the weights of real and imaginary parts."""
+    return np.concatenate([weight, weight], axis=-1)
+
+
+def _halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
+    """Return the rows (2 m, 2 n_freq) of terms and their conjugates for residues 1, and for j."""
+    return _real_and_imag(np.concatenate([plus + minus, 1j * (plus - minus)]))
+
+
+def _turned(rows: FloatArray, residues: ComplexArray) -> FloatArray:
+    """Return the rows (2 m, n) of `_halves` for residues (m,), and for j times these."""
+    first, second = np.split(rows, 2)
+    real, imag = residues.real[:, None], residues.imag[:, None]
+    return np.concatenate([real * first + imag * second, real * second - imag * first])
 
 
 def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
