@@ -239,9 +239,9 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     """Return the largest gain over a grid that is refined at resonances and at its own peak."""
     if not loop.D.size:
         return 0.0
-    if not loop.n_states:
-        return float(np.linalg.norm(loop.D, 2))
     respond = respond or responder(loop)
+    if not loop.n_states:
+        return float(swept_gains(respond, np.zeros(1))[0])
     grid = np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
     swept, _ = highest(lambda freq: swept_gains(respond, freq), grid, 3)
     return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
