@@ -16,6 +16,7 @@ from flexplant.lti import (
     frequency_response,
     series,
 )
+from flexplant.lti.frequency_sweep import POINTS, swept_gains
 from flexplant.lti.response_solvers import diagonal_form
 from oracles_lti import sweep
 from systems_lti import machine
@@ -349,3 +350,22 @@ def test_measured_rotations_have_their_units_from_their_labels_and_keep_them():
     found = (*(named.channel_units[name] for name in ("joint", "motor", "tip", "hammer")),)
     assert found == units
     assert Frf([1.0], np.ones((1, 1, 1)), ["1:rz"], ["2:rz"]).unit("2:rz", "1:rz") is None
+
+
+def test_a_sweep_in_pieces_shows_every_gain_near_the_largest():
+    """Gains off the peak are bounds from below; no piece of the responses is larger than stated."""
+    rng, sizes = np.random.default_rng(5), []
+    freq = np.linspace(1.0, 2.0, 3 * POINTS + 7)
+    H = rng.standard_normal((3, 4, freq.size)) + 1j * rng.standard_normal((3, 4, freq.size))
+
+    def respond(part):
+        sizes.append(part.size)
+        return H[:, :, np.searchsorted(freq, part)]
+
+    found = swept_gains(respond, freq)
+    exact = np.linalg.svd(np.moveaxis(H, 2, 0), compute_uv=False)[:, 0]
+    near = exact >= np.linalg.norm(H, axis=(0, 1)).max() / np.sqrt(3.0)
+    assert np.argmax(exact) in np.flatnonzero(near)
+    np.testing.assert_allclose(found[near], exact[near], rtol=1e-12)
+    assert np.all(found <= exact * (1 + 1e-12))
+    assert max(sizes) <= POINTS

@@ -135,8 +135,8 @@ def robust_stability(
         Controller, as for `close_loop`.
     quick : bool
         If all Deltas are frequencies, first compute a simpler bound: one channel for each mode, to
-        first order, on a grid through the resonances (a fraction of a second for ten modes). If it
-        is below 1, it is the result; otherwise the full search follows.
+        first order, on a grid through the resonances (below a second for twenty modes, whose full
+        search takes ten). If it is below 1, it is the result; otherwise the full search follows.
     machines : int
         Number of machines drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
