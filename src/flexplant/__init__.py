@@ -85,29 +85,30 @@ and the names of the same functions in other tools.
 - run a controller in C with the machine, at 10 kHz: `examples/real_time.py`
 
 **Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
-package (peer) in one run of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
+package (peer) in two runs of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
 above 1 means that flexplant is faster; the results are compared first. Times vary by about 20 %
-from run to run; other work on both cores made the quick calls of this run up to 50 % slower.
+from run to run; other work on both cores made the quick calls of these up to 50 % slower.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
 | 24 modes of a solid, 27 783 DOFs | 4.2 s | scipy eigsh | 35 s | 8.3 |
 | 24 modes of a plate, 30 603 DOFs | 1.5 s | scipy eigsh on CHOLMOD | 1.6 s | 1 |
-| all 243 modes of a plate, dense | 14 ms | scipy eigh | 5.6 ms | 0.39 |
+| all 243 modes of a plate, dense | 14 ms | scipy eigh | 5.7 ms | 0.42 |
 | 200 lines of a plate's responses, 30 000 DOFs | 2.4 s | scipy splu (4 of them) | 590 s | 250 |
 | 8 x 8 frequency responses, 10 000 lines | 9.9 ms | python-control, slycot | 0.22 s | 23 |
-| H-infinity norm, 48 states, 0.1 % damping | 4.4 ms | slycot ab13dd | 2.5 ms | 0.57 |
-| the same, A dense | 3.7 ms | slycot ab13dd | 2.5 ms | 0.68 |
+| H-infinity norm, 48 states, 0.1 % damping | 3.8 ms | slycot ab13dd | 2.6 ms | 0.7 |
+| the same, A dense | 3.4 ms | slycot ab13dd | 2.6 ms | 0.75 |
 | H2 norm, 200 states | 4.8 ms | python-control, slycot | 9 ms | 1.9 |
-| zero-order hold, 48 states | 0.19 ms | scipy cont2discrete | 0.18 ms | 0.95 |
+| zero-order hold, 48 states | 0.16 ms | scipy cont2discrete | 0.17 ms | 1.1 |
 | a discrete Riccati equation, 48 states | 5.5 ms | scipy solve_discrete_are | 9.1 ms | 1.7 |
 | 100 000 samples through a Kalman filter | 60 ms | filterpy (5000 of them) | 9.2 s | 150 |
 | 100 000 samples of a loop, 212 states | 100 ms | python-control | 1.6 s | 16 |
 | the same, commands saturated | 2.8 s | python-control (2000 of them) | 6 s | 2.1 |
-| H-infinity, 3 states: norm 0.137 | 28 ms | python-control, slycot: 0.137 | 23 ms | 0.82 |
-| H-infinity, 61 states of a stage: norm 0.901 | 0.66 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 31 ms | slycot ab13md, the upper one | 15 ms | 0.49 |
-| poles of a close pair in noise: error 5e-07 | 0.55 s | scikit-rf: 7e-07 | 0.34 s | 0.61 |
+| H-infinity, 3 states: norm 0.137 | 22 ms | python-control, slycot: 0.137 | 20 ms | 0.91 |
+| H-infinity, 61 states of a stage: norm 0.901 | 0.63 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 20 ms | slycot ab13md, the upper one | 15 ms | 0.77 |
+| the upper bound alone | 11 ms | slycot ab13md, the upper one | 15 ms | 1.4 |
+| poles of a close pair in noise: error 5e-07 | 0.58 s | scikit-rf: 7e-07 | 0.51 s | 0.88 |
 | a sparse OUTPUT4 file of Nastran | 16 ms | pyYeti | 36 ms | 2.3 |
 
 Peers are faster where checks are not wanted. For all modes of the plate, a third of the time goes
