@@ -483,7 +483,8 @@ class ObjectivePrograms:
 
     def smallest(self, rate: float) -> float:
         """Return the smallest bound of what is minimised, sought again in its own unit."""
-        # what keeps X and Y finite weighs next to nothing only where the unit is near the optimum
+        # the unit scales the Lyapunov matrix of this norm, which all objectives share: the bound is
+        # smallest in a unit near it, and a third larger in one three times as large
         unit = self.unit
         for _ in range(_UNITS):
             found = self._optimum(unit, rate)
