@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..errors import AssumptionError, ModelError, aligned, only_one, require_kno
 from ..loop import ClosedLoop, bandwidth
 from ..loop.machine_figures import MARGIN
 from ..plant import FigureInterval
-from ..plant.machine_plants import interval_text
+from ..plant.machine_plants import PlantMachines, interval_text
 from ..store import Value, checked
 from ..tolerances import INTERVAL
 from ..words import in_unit, instance
@@ -117,12 +117,12 @@ class Verdict(Value):
         lines = ["specification: passed" if self.passed else
                  f"specification: FAILED ({', '.join(self.failed)})"]  # fmt: skip
         columns = (self.names, self.units, self.values, self.limits, self.at_least, self.met)
-        rows = []
+        rows: list[tuple[str, ...]] = []
         for name, unit, value, limit, least, met in zip(*columns, strict=True):
             factor, shown = in_unit(float(limit), unit) if np.isfinite(limit) else (1.0, unit)
             must = f"{'>=' if least else '<='} {limit / factor:.4g}"
             rows.append((name, f"{value / factor:.4g}", must, shown, "" if met else "FAILED"))
-        head = ("", "reached", "limit", "", "")
+        head: tuple[str, ...] = ("", "reached", "limit", "", "")
         if not self.sentences:
             return "\n".join([*lines, *aligned(head, rows)])
         there = zip(self.low, self.high, self.units, self.met_on_machines, strict=True)
@@ -143,18 +143,20 @@ def _on_machines(low: float, high: float, unit: str, met: bool) -> tuple[str, st
 
 
 #: figures of a loop, by the name of their row
-_FIGURES = {"bandwidth": bandwidth, "modulus margin": MARGIN}
+_FIGURES: dict[str, str | Callable[[ClosedLoop], float]] = {
+    "bandwidth": bandwidth,
+    "modulus margin": MARGIN,
+}
 _ONE_RUN = (
     "no interval of a single run: pass a function of a loop, lambda one: simulate(one, ...), "
     "which is repeated on other machines"
 )
 
 
-def _stable(loop: ClosedLoop) -> FigureInterval:
+def _stable(loop: ClosedLoop, known: PlantMachines) -> FigureInterval:
     """Return whether a loop is stable on all machines, as an interval of 0 or 1."""
-    margin = loop.interval(MARGIN)
-    if loop.plant.machine.machines.missing:
-        return margin
+    if known.missing:
+        return loop.interval(MARGIN)
     loops = loop.on_machines
     count = len(loops.loops)
     low, high = float(loops.unstable == 0), float(loops.unstable < count)
@@ -244,47 +246,51 @@ class Specification(Value):
             As for `exposure_errors`; by default all after `start` (and `settling`).
         """
         instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-        again = run if callable(run) else None
-        run = again(loop) if again is not None else run
+        done = run(loop) if callable(run) else run
         needed = [name for name in _OF_RUNS if getattr(self, name) is not None]
-        if needed and not isinstance(run, Response):
+        if needed and not isinstance(done, Response):
             raise ModelError(
-                f"the limits on {', '.join(needed)} need a run, got {short(run)}. Pass "
+                f"the limits on {', '.join(needed)} need a run, got {short(done)}. Pass "
                 "simulate(loop, reference=move, duration=...)."
             )
         rows = [("stable", "", float(loop.is_stable), 1.0, True), *self._of_loop(loop)]
-        if run is not None:
-            rows += self._of_run(loop, run, exposures)
+        if done is not None:
+            rows += self._of_run(loop, done, exposures)
         names, units, values, limits, least = zip(*rows, strict=True)
-        found = self._intervals(loop, again, rows, exposures)
-        ends = np.array([one[:2] for one in found], dtype=float).reshape(-1, 2)
+        found = self._intervals(loop, run, rows, exposures)
+        low, high = np.array([one[:2] for one in found], dtype=float).reshape(-1, 2).T
         said = tuple(one.sentence for one in found)
         return Verdict(
-            names, units, np.array(values), np.array(limits), np.array(least), *ends.T, said
+            names, units, np.array(values), np.array(limits), np.array(least), low, high, said
         )
 
     def _intervals(
-        self, loop: ClosedLoop, run: Callable[[ClosedLoop], Any] | None, rows: Any, exposures: Any
+        self, loop: ClosedLoop, run: _Run | None, rows: Sequence[_Row], exposures: Any
     ) -> list[FigureInterval]:
         """Return the interval of each row over the machines of the plant; none without machines."""
-        if loop.plant.machine.machines is None:
+        known = loop.plant.machine.machines
+        if known is None:
             return []
 
         @cache
         def values(one: ClosedLoop) -> dict[str, float]:
-            return {row[0]: row[2] for row in self._of_run(one, run(one), exposures)}
+            done: Any = run(one) if callable(run) else run
+            return {row[0]: row[2] for row in self._of_run(one, done, exposures)}
+
+        def of_run(name: str, one: ClosedLoop) -> float:
+            return values(one)[name]
 
         found = []
         for name, unit, *_ in rows:
             if name == "stable":
-                found.append(_stable(loop))
+                found.append(_stable(loop, known))
             elif name in _FIGURES or name == "noise":
                 figure = _FIGURES.get(name) or self._watched(loop)
                 found.append(loop.interval(figure, unit=unit))
-            elif run is None:
-                found.append(FigureInterval(None, None, _ONE_RUN))
+            elif callable(run):
+                found.append(loop.interval(partial(of_run, name), unit=unit))
             else:
-                found.append(loop.interval(lambda one, n=name: values(one)[n], unit=unit))
+                found.append(FigureInterval(None, None, _ONE_RUN))
         return found
 
     def _watched(self, loop: ClosedLoop) -> str:
