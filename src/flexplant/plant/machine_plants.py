@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -129,7 +129,10 @@ class PlantMachines:
         ModelError
             When a machine is not physical: what is known reaches beyond what the structure allows.
         """
-        machines = []
+        return list(self.each(count, rng=rng))
+
+    def each(self, count: int, *, rng: Rng) -> Iterator[Any]:
+        """Yield the machines of `drawn` one after the other."""
         seeds = generator(rng).spawn(whole(count, "count", maximum=MOST_DRAWS))
         for i, own in enumerate(seeds, 1):
             try:
@@ -137,13 +140,12 @@ class PlantMachines:
                 uncertain = self.plant.uncertainty
                 if uncertain is not None and uncertain.delta_blocks:
                     machine = uncertain.with_drawn_blocks(machine, own)
-                machines.append(machine)
             except ModelError as error:
                 raise ModelError(
                     f"machine {i} of those drawn is not physical: {error} The uncertainty reaches "
                     "beyond what the structure allows; measure more modes, or scale the covariance."
                 ) from None
-        return machines
+            yield machine
 
     def _machine(self, rng: np.random.Generator) -> Any:
         """Return one machine: its modes drawn together, then all else that is stated."""
