@@ -230,7 +230,8 @@ class _StageTask(Design):
     def _fitted(self) -> Iterator[AnyPlant] | None:
         """Return machines that agree with the measurement of a fit, None where it is not known."""
         # the first of those of its intervals, one after the other: each takes 5 MB
-        measured, fit = self.uncertain.machines, self.uncertain.machines.fit
+        measured: PlantMachines = self.uncertain.machines
+        fit = measured.fit
         if fit is None or measured.missing:
             return None
         return measured.each(_DRAWS, rng=fit.seed)
