@@ -155,6 +155,7 @@ def made():
     yield from (lti.step(fx.lti.tf([1.0], [1.0, 1.0])), lti.step_info(fx.lti.tf([1.0], [1.0, 1.0])))
     yield from (
         lti.split_stable(more),
+        synthesis.AutoBackOff(0.1),
         synthesis.Lmi(),
         synthesis.RepeatedScalar(2),
         synthesis.H2(z=["die:z"]),
