@@ -170,7 +170,8 @@ class _Modes:
         self.system = loop.system.select([channel], loop.machine.w)
         # delays are chains of states whose poles, zero to some root of rounding, have no basis of
         # eigenvectors: these and poles that a sample takes away are split off as a whole
-        T, Z, k = la.schur(self.system.A, output="complex", sort=lambda z: abs(z) > NEGLIGIBLE)
+        lasting: Any = lambda pole: abs(pole) > NEGLIGIBLE  # noqa: E731  # SciPy's stubs want reals
+        T, Z, k = la.schur(self.system.A, output="complex", sort=lasting)
         coupled = la.solve_sylvester(T[:k, :k], -T[k:, k:], T[:k, k:])
         self.values, vectors = np.linalg.eig(T[:k, :k])
         self.right = Z[:, :k] @ vectors
