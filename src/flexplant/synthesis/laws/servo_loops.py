@@ -47,6 +47,11 @@ _ASIDE = 0.8
 _STEP, _BELOW, _VANISHED = 1.05, 1e-3, 1e-2
 
 
+#: loops of this number of plants are kept: their designs at other bandwidths begin with them; and
+#: laws of this number of axes
+_KEPT = 8
+
+
 @dataclass(frozen=True)
 class Axis:
     """The law of an axis, sampled by Tustin's rule, with which its loop crosses 1 at the bandwidth.
@@ -88,7 +93,7 @@ class Axis:
         return (Pid(0.0, i=1.0),) if self.line == "spring" else ()
 
 
-@lru_cache
+@lru_cache(maxsize=_KEPT)
 def _shape(axis: Axis) -> Law:
     law = Law((*axis.action, LowPass(axis.rolloff), *axis.notches), rate=axis.rate)
     return law * float(1.0 / abs(law.at(np.array([axis.bandwidth]))[0]))
@@ -151,8 +156,6 @@ _WIDTHS = (0.3, 0.45)
 _BELOW_TARGET = 0.98
 #: points where |S| is at least this fraction of its peak are judged first for a further notch
 _HIGH = 0.5
-#: loops of this number of plants are kept: their designs at other bandwidths begin with them
-_KEPT = 8
 #: distance of a growing pole from the mode that it belongs to, relative to its frequency
 _DRIVEN = 0.3
 #: loop gain at a resonance below which a notch there serves nothing
