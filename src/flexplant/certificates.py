@@ -61,13 +61,14 @@ class Verified(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Value, Mapping[str, float]):
-    """What was verified of an answer: figures with their limits, found by other routes.
+    """Verified figures of a result with their limits, computed by a second method.
 
     ``certificate["norm"]`` is the figure of a check; ``certificate.checks`` holds all of them.
 
     Parameters
     ----------
     checks : sequence of Verified
+        Verified figures, each with its name, limit and method.
 
     Examples
     --------
@@ -84,7 +85,7 @@ class Certificate(Value, Mapping[str, float]):
 
     @property
     def holds(self) -> bool:
-        """Whether all limits are kept."""
+        """Whether all figures are within their limits."""
         return all(check.holds is not False for check in self.checks)
 
     def __getitem__(self, what: str) -> float:

@@ -137,6 +137,7 @@ def estimate_frf(
     outputs : (n_out, n_time) or (n_exp, n_out, n_time) array, or mapping
         Measured signals, in the same form.
     rate : float [Hz]
+        Sampling rate of the records.
     reference : array or mapping, optional
         Excitation added inside the loop, one signal per input.
     method : H1Estimator, H2Estimator, HvEstimator or Periodic

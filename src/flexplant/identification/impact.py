@@ -210,6 +210,7 @@ def impact_frf(
     response : array or mapping
         Measured responses, as for `estimate_frf`.
     rate : float [Hz]
+        Sampling rate of the records.
     segment : float [s]
         Length of record for each blow; its inverse is the resolution.
     decay : float [s], optional
@@ -220,8 +221,8 @@ def impact_frf(
     limits : mapping {channel: value}, or float, optional
         Full scale of each channel, or of all channels: a blow that reaches it is refused. A channel
         without a limit counts as clipped where it stays at its extreme value after a steep rise,
-        unless this is its value at rest; ``limits=1e9`` disables this test. A warning names outputs
-        that keep one value.
+        unless this is its value at rest; ``limits=1e9`` disables this test. A warning names each
+        output that never changes its value.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the responses.
 

@@ -40,23 +40,25 @@ class MeasuredModes(Value):
     modes : sequence of m int, optional
         Number of each mode in the model, counted from 1 with rigid-body modes. Updating needs them.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
-        Variance E|d lambda|^2 of each pole, its real and imaginary parts equally uncertain and
-        independent, or the covariance matrix of [Re lambda; Im lambda]; stored as the latter.
+        Either the variance E|d lambda|^2 of each pole, whose real and imaginary parts are then
+        equally uncertain and independent, or the covariance matrix of the vector [Re lambda; Im
+        lambda]. It is stored as this matrix.
     shapes : (n, m) complex array, optional
         Mode shapes at n measured DOFs; the shape of a conjugated pole is conjugated too.
     dofs : sequence of n str, optional
         Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
     xyz : (n, 3) array [m], optional
-        Points of these DOFs, which `numbered` takes from sensors and points.
+        Coordinates of these DOFs. `numbered` finds them from the given sensors or points.
     directions : sequence of n str, optional
-        Their directions there.
+        Direction of each of these DOFs, such as "z".
 
     Raises
     ------
     ShapeError, ModelError, LabelError
-        When lengths differ, or only one of shapes and dofs is given; poles are not finite, real
-        (overdamped or rigid) or unstable, a shape is zero or not finite, or the covariance is not
-        positive definite; mode numbers are not integers from 1, or numbers or labels appear twice.
+        When lengths differ, or only one of `shapes` and `dofs` is given. When a pole is not finite,
+        is real (overdamped or rigid) or is unstable. When a shape is zero or not finite, or the
+        covariance is not positive definite. When mode numbers are not integers from 1, or a number
+        or label appears twice.
 
     Examples
     --------

@@ -214,19 +214,23 @@ def multisine(
     rms: float = 1.0,
     rng: int | np.random.Generator | None = None,
 ) -> FloatArray:
-    r"""Return random-phase multisines for `count` inputs in as many orthogonal experiments.
+    r"""Return random-phase multisines for `count` inputs, in `count` orthogonal experiments.
 
-    Input i in experiment e has the spectrum ``U(f) exp(2 pi i e k / count)`` with a common random
-    phase per line, so that U U^H is diagonal at every line [Dobrowiecki2006]_.
+    Input k in experiment e has the spectrum ``U(f) exp(2 pi j e k / count)``, with j the imaginary
+    unit. U(f) has a random phase at each excited frequency (line), common to all inputs and
+    experiments. The matrix of all inputs in all experiments is therefore orthogonal at every line,
+    so that the inputs can be separated with the least error [Dobrowiecki2006]_.
 
     Parameters
     ----------
     count : int
+        Number of inputs, which is also the number of experiments.
     rate : float [Hz]
+        Sampling rate of the signals.
     period : float [s]
-        A whole number of samples.
+        Duration of one period, a whole number of samples; its inverse is the distance of the lines.
     periods : int
-        Repetitions.
+        Number of repetitions of the period in each experiment.
     band : (low, high) [Hz], optional
         Band of excited lines; all below half the rate by default.
     rms : float

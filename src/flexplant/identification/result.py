@@ -262,7 +262,7 @@ class IdentifiedModes(MeasuredModes):
     Parameters
     ----------
     poles, modes, covariance, shapes, dofs, xyz, directions
-        As in `MeasuredModes`; shapes psi_k at the outputs.
+        As in `MeasuredModes`. The shapes psi_k are those at the outputs.
     participation : (n_in, m) complex array
         Participation vectors l_k of the inputs.
     inputs, outputs : sequences of str
@@ -270,11 +270,12 @@ class IdentifiedModes(MeasuredModes):
     input_dofs : sequence of n_in str
         Labels of the inputs' DOFs, or their names where no DOF is known.
     terms : (n_out, n_in, lower + upper) array
-        E(s), coefficients of powers of s scaled by the largest frequency.
+        Coefficients of E(s), the effect of modes outside the band: `lower` terms in 1/s, 1/s^2,
+        ..., then the terms in 1, s, .... Here s is divided by ``2 pi top``.
     lower : int
-        Number of the terms 1/s, 1/s^2, ...
+        Number of the terms in 1/s, 1/s^2, ....
     top : float [Hz]
-        The largest frequency.
+        Largest frequency of the measured lines, which scales s in E(s).
     hold : float [Hz], optional
         Rate of the zero-order hold in the measurement.
     delay : float [samples]
@@ -284,24 +285,27 @@ class IdentifiedModes(MeasuredModes):
     unreported : complex array
         Poles just outside the band that improve the fit, with their shapes and participation.
     mass_normalised : bool
-        Whether shapes satisfy phi^T (2 lambda M + D) phi = 2i Im(lambda), as those of a model
-        do: where an input and an output share a DOF. Otherwise their largest entry is 1.
+        Whether the shapes are scaled as those of a model, ``phi^T (2 lambda M + D) phi = 2i
+        Im(lambda)``. This needs an input and an output at the same DOF. Otherwise the largest entry
+        of each shape is 1.
     misfit : float
-        Cost per degree of freedom; 1 when the residual is only noise with the stated variance.
+        Weighted squared error of the fit per degree of freedom: 1 when the error is only noise with
+        the stated variance.
     diagram : StabilisationDiagram, optional
         Diagram from which the poles were chosen.
     channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
-        E[n n^H] of the error n of each mode's [shape; participation], including the error of scale,
-        from the variance of the FRF and the correlation of the errors of outputs (assumed
-        independent where it is not known).
+        Covariance E[n n^H] of the error n of the vector [shape; participation] of each mode,
+        including the error of its scale. It follows from the variance of the FRF and from the
+        correlation between the errors of outputs, which are assumed independent where this
+        correlation is not known.
     rejected : sequence of (frequency [Hz], damping ratio, reason)
         Poles and mains lines that are not reported.
     first_answer : str
-        Reason why the poles were not refined by maximum likelihood; empty where they were
-        (`refined`).
+        Reason why the poles were not refined by maximum likelihood; empty if they were (`refined`).
     inconsistency : float, optional
-        Relative deviation of the frequencies between outputs (or inputs), where they disagree:
-        poles are then means over these, and their covariance follows from the differences.
+        Relative difference of the frequencies that separate outputs (or inputs) show, if they
+        disagree. The poles are then means over these channels, and their covariance follows from
+        the differences.
     inconsistent : str
         Kind of the channels that disagree, "outputs", "inputs" or "runs"; empty if they agree.
     undamped : float [rad/s]

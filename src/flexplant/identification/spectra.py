@@ -26,7 +26,10 @@ class SpectralMethod(Value):
 
 
 class H1Estimator(SpectralMethod):
-    """``G = S_yu S_uu^-1``: unbiased with noise on outputs, in open loop.
+    """The estimator H1, ``G = S_yu S_uu^-1``, for noise on the outputs.
+
+    S_yu is the matrix of cross spectra between outputs y and inputs u, and S_uu that of the inputs.
+    The estimate has no bias from noise on the outputs if the machine is measured in open loop.
 
     Parameters
     ----------
@@ -55,12 +58,15 @@ class H1Estimator(SpectralMethod):
 
 
 class H2Estimator(SpectralMethod):
-    """``G = S_yy S_uy^-1``: unbiased with noise on inputs; for one input, or n_out = n_in.
+    """The estimator H2, ``G = S_yy S_uy^-1``, for noise on the inputs.
+
+    It needs as many outputs as inputs; with one input, each output is estimated separately. The
+    spectra are named as in `H1Estimator`.
 
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`, with the same errors raised and the same source.
+        As for `H1Estimator`; the source is the same.
 
     Examples
     --------
@@ -70,14 +76,15 @@ class H2Estimator(SpectralMethod):
 
 
 class HvEstimator(SpectralMethod):
-    """Total least squares of every output and all inputs, each scaled to unit power per line.
+    """The estimator Hv, for noise on inputs and outputs: total least squares.
 
-    For one input its magnitude is the geometric mean of those of H1 and H2.
+    At each frequency every output is fitted together with all inputs, each scaled to unit power.
+    For one input the magnitude is the geometric mean of those of H1 and H2.
 
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`, with the same errors raised and the same source.
+        As for `H1Estimator`; the source is the same.
 
     Examples
     --------

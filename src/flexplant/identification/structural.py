@@ -35,16 +35,18 @@ def structural_modes(
 ) -> Modes:
     r"""Return identified modes as modes of a structure for `assemble_plant`.
 
-    From the fit :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`,
-    mass-normalised at a place where the machine was both driven and measured:
+    From the fit :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`, which is
+    mass-normalised at a place where the machine was both driven and measured, the modes of the
+    structure are:
 
     - shapes :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
       :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, their mean at places
       that are both;
-    - the remainder, approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band:
-      rigid-body modes :math:`\Phi_r \Phi_r^T = A` in the span of the rigid-body motions of the
-      geometry, and residual vectors :math:`v v^T/\omega_v^2 = G`, completed from the places that
-      are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`;
+    - the remainder, approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band.
+      A gives the rigid-body modes, :math:`\Phi_r \Phi_r^T = A`, as combinations of the rigid-body
+      motions of the geometry. G gives residual vectors v, :math:`v v^T/\omega_v^2 = G`, with a
+      frequency :math:`\omega_v` above the band. Between places that are not both driven and
+      measured (o), G follows from those that are (c): :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`;
     - modes just outside the band become residual vectors too, with their frequency and damping,
       where they are modes of a structure: real shapes with equal input and output shapes.
 
@@ -69,14 +71,15 @@ def structural_modes(
         neglected imaginary parts ("imaginary") and, with `over`, the relative error of the
         expansion of measured shapes in modes of the model ("expansion"); above 0.1 a warning is
         given. ``plant.uncertain(numbered(measured, modes))`` passes the covariance of the poles to
-        the plant. ``Shapes(shape_deviations(measured, dofs), measured.modes)`` as a further
-        argument passes that of the shapes.
+        the plant. The covariance of the shapes is passed by a further argument,
+        ``Shapes(shape_deviations(measured, dofs), measured.modes)``.
 
     Raises
     ------
     ModelError, LabelError
-        When the scale of shapes is not known, the term in 1/s^2 is not an inertia, `over` has more
-        modes than places, or a channel is not in `dofs`.
+        When the scale of shapes is not known, the term in 1/s^2 is not that of a body with positive
+        inertia, `over` has more modes than there are measured places, or a channel is not in
+        `dofs`.
 
     References
     ----------

@@ -65,10 +65,11 @@ class ClosedLoop(Value):
         Connected blocks; `close_loop(other_plant, *loop.blocks)` closes the same controller around
         another machine.
     controller : StateSpace
-        All blocks as one system: plant.y -> the driven actuators, then the other outputs of the
-        blocks (such as estimates of an observer), which are monitored.
+        All blocks as one system, with the outputs y of the plant as inputs. Its outputs are the
+        commands of the driven actuators, then the monitored outputs, such as estimates of an
+        observer.
     idle : sequence of str
-        Actuators that nothing drives.
+        Actuators that no block drives.
 
     Examples
     --------
@@ -128,7 +129,7 @@ class ClosedLoop(Value):
 
     @property
     def watched(self) -> tuple[str, ...]:
-        """The outputs of blocks that drive no actuator, such as `die:hat`."""
+        """The outputs of blocks that are not commands of actuators, such as `die:hat`."""
         return tuple(name for name in self.controller.outputs if name not in self.driven)
 
     @cached_property
@@ -177,11 +178,11 @@ class ClosedLoop(Value):
     def frequency_response(self, freq: npt.ArrayLike) -> Frf:
         """Return the response from w to z, using the structure of plant and controller.
 
-        ``P11 + P12 K (I - P22 K)^-1 P21`` at each frequency: a plant in modal blocks costs O(n),
-        while the closed loop as one system has no blocks.
+        The response is ``P11 + P12 K (I - P22 K)^-1 P21`` at each frequency. It is faster than that
+        of `system`, because the plant is evaluated mode by mode.
 
-        `freq` (n_freq,) [Hz] is not above half the rate. ModelError when a frequency is not
-        allowed, or the loop is singular at one.
+        Frequencies `freq` (n_freq,) [Hz] are at most half the rate. ModelError when a frequency is
+        out of range, or the loop is singular at a frequency.
         """
         grid = sampled_freq(freq, self.plant.dt)
         data = self._responses(self.plant.w, self.plant.z)(grid)
@@ -190,8 +191,8 @@ class ClosedLoop(Value):
     def gain(self, reference: str, error: str) -> Responder:
         """Return the function of frequency [Hz] that gives the response from a w to a z.
 
-        It is prepared once for many calls: frequencies are not checked, and it returns (1, 1,
-        n_freq).
+        Use it for many calls: it is prepared once and does not check frequencies. It returns an
+        array (1, 1, n_freq).
         """
         return self._responses([reference], [error])
 
@@ -221,7 +222,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def broken(self) -> BrokenLoop:
-        """Plant and controller between u and the y that u moves."""
+        """Plant and controller of the open loop: between u and the outputs y that u moves."""
         read = self.controller.input_index(self.fed_back)
         return BrokenLoop(
             self.driven,
@@ -282,7 +283,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def left_out(self) -> SpillOver | None:
-        """Stability and margin with the truncated modes; None if these are not known."""
+        """Stability and margin with the truncated modes; None if they are not known."""
         whole = self.completed
         if whole is None:
             return None
@@ -299,10 +300,10 @@ class ClosedLoop(Value):
 
     @cached_property
     def modulus_margin(self) -> float:
-        """Smallest distance of the loop gain to the critical point, broken at u.
+        """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances; with scaled axes where actuators have several units, as
+        loop's resonances; with scaled axes where actuators have different units, as in
         `LoopReport.scaled_margin`. It is 0 for an unstable loop.
         """
         return self.broken.margin()
@@ -366,7 +367,7 @@ class ClosedLoop(Value):
     def tolerances(self) -> ModeTolerances | None:
         """Tolerances of modes; None for coupled modes or an unstable loop.
 
-        If frequencies are stated as uncertain, truncated modes are included where they are known;
+        If the plant has uncertain frequencies, truncated modes are included where they are known.
         `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
         or up to 2.5 times their uncertainty.
         """
@@ -379,15 +380,15 @@ class ClosedLoop(Value):
     def mode_tolerances(self, *, margin: float = MARGIN, known: Any = None) -> ModeTolerances:
         """Return the tolerance of the loop to errors of frequency and damping of each mode.
 
-        One mode changes at a time, exactly: the result is the change at which a pole crosses the
-        stability boundary, and that at which the modulus margin falls to a stated value. A model of
-        a structure is seldom accurate to 0.2 % for unmeasured modes, while a loop with a gain above
-        1 at a mode of 0.1 % damping may tolerate less.
+        One mode changes at a time. The results are the exact changes at which a pole crosses the
+        stability boundary, and at which the modulus margin falls to `margin`. A loop with a gain
+        above 1 at a mode of 0.1 % damping may tolerate less than 0.2 %, while the frequencies of
+        unmeasured modes of a model are seldom that accurate.
 
         Parameters
         ----------
         margin : float
-            Required modulus margin, broken at u.
+            Required modulus margin, with the loop opened at u.
         known : UncertainPlant, float, (m,) array or {mode: float}, optional
             Relative uncertainty of the frequency of each elastic mode; by default that of the
             plant.
@@ -434,7 +435,7 @@ class ClosedLoop(Value):
         return float(np.sqrt(variances.sum()))
 
     def drawn_rms(self, channel: str) -> float:
-        """Return the same by one route: for a machine that is drawn around a verified loop."""
+        """Return `rms` without its second check, for random machines around a verified loop."""
         variances = unverified_variances(self.monitored, *self._noises(channel))
         return float(np.sqrt(variances.sum()))
 

@@ -28,22 +28,23 @@ _MOST = 2_000_000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DelayedLoop(Value):
-    """The loop ``u = K y`` around a plant, one or both of which are delayed.
+    """The loop ``u = K y`` around a plant, where plant, controller or both have a delay.
 
     ``L = -G K`` is computed exactly at every frequency. Poles of the loop in the right half plane
-    are counted by the argument of ``det(I + L)`` along the imaginary axis, on points that are
-    added until it turns by less than 0.5 rad between two.
+    are counted from the phase of ``det(I + L)`` along the imaginary axis (Nyquist). Points are
+    added until this phase changes by less than 0.5 rad between neighbours.
 
     Parameters
     ----------
     plant, controller : StateSpace or Delayed, continuous
-        G and K; the sign of the feedback is in K. K may differentiate where G does not pass steps.
+        G and K; K includes the sign of the feedback. K may be improper (differentiate) if G has no
+        direct feedthrough.
 
     Raises
     ------
     ModelError
-        When neither has a delay, or when their product differentiates, which no real loop
-        does.
+        When neither has a delay, or when their product is improper (differentiates), which no real
+        loop is.
 
     References
     ----------
@@ -51,7 +52,7 @@ class DelayedLoop(Value):
 
     Examples
     --------
-    A PD law of an integrator with 1 s of delay:
+    A PD controller for an integrator with a delay of 1 s:
 
     >>> import flexplant as fx
     >>> plant = fx.lti.Delayed(fx.lti.tf([1.0], [1.0, 0.0]), 1.0)
@@ -86,9 +87,10 @@ class DelayedLoop(Value):
 
     @cached_property
     def unstable_poles(self) -> int:
-        """Number of poles of the loop in the right half plane; infinitely many raise.
+        """Number of poles of the loop in the right half plane.
 
-        SolverError when the contour needs too many points.
+        AssumptionError when there are infinitely many; SolverError when the contour needs too many
+        points.
         """
         if self._at_infinity >= 1.0:
             raise AssumptionError(
@@ -136,7 +138,7 @@ class DelayedLoop(Value):
 
     @cached_property
     def lines(self) -> FloatArray:
-        """Frequencies [Hz] on which margins and norms are sought."""
+        """Frequencies [Hz] at which margins and norms are searched."""
         low, high = self._slow, self._fast
         decades = np.log10(high / low)
         even = np.geomspace(low, high, int(_POINTS * decades) + 2)
@@ -199,7 +201,8 @@ class DelayedLoop(Value):
     def norm(self, which: Literal["S", "T", "KS"]) -> tuple[float, float]:
         """Return the H-infinity norm of S, T or K S and its frequency [Hz].
 
-        The largest peaks of `lines`, each refined; inf of an unstable loop.
+        The largest peaks at the frequencies `lines` are refined. The norm of an unstable loop is
+        infinite.
         """
         if not self.is_stable:
             return np.inf, np.nan
@@ -211,16 +214,16 @@ class DelayedLoop(Value):
 
     @property
     def modulus_margin(self) -> float:
-        """Smallest distance of L to -1, ``1 / max |S|``; 0 of an unstable loop."""
+        """Smallest distance of L to -1, ``1 / max |S|``; 0 for an unstable loop."""
         return 1.0 / self.norm("S")[0]
 
     @cached_property
     def margins(self) -> dict[str, tuple[float, float]]:
-        """Least gain, phase and delay margins of a loop of one channel, each with its frequency.
+        """Smallest gain, phase and delay margins of a loop with one channel, with frequencies.
 
-        ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``; a gain margin
-        below 1 is that of a loop that becomes unstable when its gain falls. Margins that do
-        not exist are infinite.
+        ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``; a gain margin below 1
+        means that the loop becomes unstable when its gain is reduced by this factor. A margin that
+        does not exist is infinite.
         """
         if len(self.gain.inputs) != 1 or len(self.gain.outputs) != 1:
             raise ModelError(
@@ -248,8 +251,9 @@ class DelayedLoop(Value):
     def lsim(self, reference: Callable[[float], float], time: npt.ArrayLike) -> FloatArray:
         """Return y (p, n) of the loop that follows a reference from rest, by the method of steps.
 
-        On each interval of one delay the delayed error is known; SciPy's solver of order 8 goes
-        through it with a relative error of 1e-9.
+        On each interval of one delay the delayed error is already known, so that an ordinary
+        differential equation remains. SciPy's solver of order 8 solves it with a relative tolerance
+        of 1e-9.
 
         Parameters
         ----------

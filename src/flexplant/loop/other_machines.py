@@ -204,13 +204,15 @@ BEYOND = 1.25
 class ModeTolerances(Value):
     """The smallest change of each mode, with the others unchanged, at which a loop fails.
 
-    Two columns: the change downwards (negative) and upwards; infinite where none is found up to
-    `limit`. A frequency changes by its stiffness, with an unchanged damping force.
+    Each array with two columns holds the change downwards (negative) and the change upwards;
+    infinite if the loop does not fail up to `limit`. In the printed table, ">5" means that it does
+    not fail up to 5 %. A frequency is changed through the stiffness of the mode, while its damping
+    force stays the same.
 
     Parameters
     ----------
     modes : (m,) array
-        Numbers from 1, rigid-body modes included.
+        Numbers of the modes, from 1, with rigid-body modes counted.
     freq : (m,) array [Hz]
         Frequencies of the modes in the plant.
     stable : (m, 2) array
@@ -220,7 +222,7 @@ class ModeTolerances(Value):
     damping : (m, 2) array
         Relative changes of damping at which it becomes unstable, from -1 to 2.
     margin : float
-        Modulus margin of `within`, broken at u.
+        Modulus margin for `within`, with the loop opened at u.
     limit : (m,) array
         Largest relative change of frequency examined.
     known : (m,) array, optional

@@ -29,21 +29,22 @@ _LEVEL = 0.5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopMargins(Value):
-    """One loop, broken at one place while the others stay closed.
+    """Margins of one loop, opened at one channel while the other loops stay closed.
 
     Parameters
     ----------
     name : str
-        The channel where it is broken.
+        Channel where the loop is opened.
     crossovers : tuple of float [Hz]
         Frequencies at which the loop gain crosses 1; the first is the bandwidth, resonances may add
         more.
     gain_margin, gain_reduction : float
-        Factors on the gain, above and below 1, at which the loop reaches the critical point;
-        infinite and 0 if no such factor exists.
+        Factor above 1 and factor below 1 by which the gain can be multiplied until the loop gain
+        reaches the critical point; infinite and 0 if no such factor exists.
     phase_margin : float [deg]
-        Smallest phase margin at the crossovers, lead or lag; 180 without a crossover. For an
-        unstable loop this and the others are distances to the critical point, not margins.
+        Smallest phase margin at the crossovers, for added lead or lag; 180 without a crossover. For
+        an unstable loop this and the other figures are distances to the critical point, not
+        margins.
     modulus_margin : float
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
@@ -51,10 +52,11 @@ class LoopMargins(Value):
     gain_freq, phase_freq : float [Hz]
         Frequencies of the smaller gain margin and of the phase margin; NaN without them.
     phases : tuple of float [deg]
-        Phase that reaches the critical point at each crossover: a lag where positive, a lead where
-        negative.
+        Change of phase at each crossover that moves the loop gain to the critical point: positive
+        for a lag, negative for a lead.
     gains : tuple of (float [Hz], float)
-        Frequencies at which a factor on the gain reaches the critical point, with the factors.
+        Frequencies at which a change of the gain moves the loop gain to the critical point, each
+        with the factor.
 
     Examples
     --------
@@ -417,9 +419,9 @@ def compare_loops(
         Loops to compare: designs on one machine, or one design on a model and the machine. Each is
         judged on the evaluation model of its plant, if it has one.
     reference : str, optional
-        Channel of w for S, if there are several; `axis_sensitivities` has all.
+        Reference (channel of w) for which S is compared; needed if there are several.
     error : str, optional
-        Channel of z for S; by default that of the reference.
+        Error (channel of z) for which S is compared; by default that of the reference.
 
     Returns
     -------

@@ -131,16 +131,16 @@ def schedule_loops(
     position: str | None = None,
     places: npt.ArrayLike,
 ) -> ScheduledLoop:
-    """Return closed loops of one design made at several positions, linear between them.
+    """Return a closed loop whose controller is interpolated between designs at several positions.
 
     Parameters
     ----------
     plant : StandardPlant
-        With positions (`Ports(positions=[...])`).
+        Plant with positions (`Ports(positions=[...])`).
     design : callable
         Function from the plant at a position to the blocks that run there, such as a Kalman filter,
-        a servo and a feedforward. All must have the same channels and states: fix choices that a
-        design makes automatically, such as notches.
+        a servo and a feedforward. The blocks must have the same channels and states at all
+        positions. Fix choices that a design makes automatically, such as the number of notches.
     position : str, optional
         The scheduling variable; by default the only position.
     places : (k,) array [m or rad]
@@ -157,14 +157,16 @@ def schedule_loops(
         When the machine at rest half way between two places is not stable with the interpolated
         controller.
     LabelError
-        When the position is unknown, or not named among several; when channels differ.
+        When the position is unknown, or there are several and none is named. When channels differ
+        between positions.
     ModelError
         When a place is out of range, or designs differ in their states.
 
     Notes
     -----
-    Stability is checked at the places and half way between them, of the machine at rest there.
-    `rms_along(..., repeats=True)` computes the growth along one trajectory.
+    Stability is checked with the machine at rest, at the places and half way between them.
+    Stability while the machine moves is checked for one repeated trajectory by ``rms_along(...,
+    repeats=True)``.
 
     Examples
     --------

@@ -343,8 +343,9 @@ def modulus_margin(loop: Loop) -> float:
 def bandwidth(loop: Loop) -> float:
     """Return the frequency [Hz] at which |S| first crosses 0 dB from below.
 
-    |S| is the largest singular value of S broken at u, among the directions of u in which the loop
-    acts at low frequency: with more actuators than controlled motions S = 1 in the others.
+    |S| is the largest singular value of S with the loop opened at u. With more actuators than
+    controlled motions, some combinations of actuators are never used, and S = 1 for these. Only the
+    combinations in which the loop acts at low frequency are therefore counted.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ class Exchange(Search):
     starts: int = field(default=10, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> SearchResult:
-        """Return the best of all starts, bounded by relaxation; see `Search.search`."""
+        """Return the best choice of all starts, with a lower bound by relaxation."""
         relaxed = problem.relaxed()
         chosen, history, evaluations = best_start(problem, self.starts, relaxed, work)
         value = min(steps[-1] for steps in history)
@@ -175,19 +175,20 @@ _ALL = 20_000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Screened(Search):
-    """Choices ranked by a fast criterion, the first few scored by the one that counts.
+    """A search that ranks choices by a fast criterion and scores the best with the slow one.
 
-    All choices are ranked where there are at most 20 000; else that on which exchanges by the fast
-    criterion end, and all that differ from it by one candidate. For a plant with many modes:
-    ``Screened(OverMachines(PoiVariance(), [plant_with_few_modes]))``, confirmed by
-    `PoiVariance` on a plant with an evaluation model, where truncated modes are noise.
+    All choices are ranked if there are at most 20 000. Otherwise exchanges by the fast criterion
+    find one choice, and this choice is ranked with all that differ from it by one candidate. An
+    example for a plant with many modes is the fast criterion ``OverMachines(PoiVariance(),
+    [plant_with_few_modes])``. The slow criterion is then `PoiVariance` on a plant with an
+    evaluation model, which treats truncated modes as noise.
 
     Parameters
     ----------
     by : Criterion or callable
         The fast criterion.
     keep : int
-        How many choices are scored by the criterion that counts.
+        Number of choices that are scored by the slow criterion, that of `place_sensors`.
     starts : int
         Number of starts of the exchanges.
 
@@ -207,7 +208,7 @@ class Screened(Search):
     starts: int = field(default=6, kw_only=True, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> SearchResult:
-        """Return the best of the first few, bounded by relaxation; see `Search.search`."""
+        """Return the best of the `keep` first choices, with a lower bound by relaxation."""
         own = problem.layouts
         fast = layouts_of(own.plant, own.side, own.candidates, self.by)
         ranked = self._ranked(replace(problem, layouts=fast), work)

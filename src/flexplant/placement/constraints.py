@@ -220,8 +220,9 @@ class CountLimits(Constraint):
     Parameters
     ----------
     names : sequence of str
+        Names of these candidates.
     at_least, at_most : int, optional
-        How many of them.
+        Least and largest number of them in a choice.
 
     Examples
     --------
@@ -241,7 +242,7 @@ class CountLimits(Constraint):
         check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the count of them between its limits."""
+        """Return the linear inequalities for the number of chosen candidates."""
         row = np.zeros(places.total)
         row[places.index(self.names, "candidate among others")] = 1.0
         return LinearRows.counted(row, self.at_least, self.at_most)

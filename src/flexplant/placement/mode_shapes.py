@@ -125,15 +125,17 @@ class ModeInformation(ByShapes):
 
 @dataclass(frozen=True, eq=False)
 class RowSelection(Search):
-    """Selection of rows of mode shapes by the methods of `select_dofs`, for `ModeInformation`.
+    """A search for `ModeInformation` that selects rows of mode shapes as `select_dofs` does.
 
     Parameters
     ----------
     method : SelectionCriterion
-        EffectiveIndependence (the default) repeatedly removes the candidate of least ``E_i
-        = phi_i' F^-1 phi_i``, with the information ``F = sum phi_i phi_i'``: without it the
-        determinant of F is ``1 - E_i`` times as large. PivotedQr and Greedy add one after
-        the other; when all modes are covered, they start again with the rest.
+        Method of the selection. `EffectiveIndependence` (the default) repeatedly removes the
+        candidate i with the least ``E_i = phi_i' F^-1 phi_i``, where ``F = sum phi_i phi_i'`` is
+        the information on the modes and phi_i the row of the candidate. Removing a candidate
+        multiplies the determinant of F by ``1 - E_i``. `PivotedQr` and `Greedy` add one candidate
+        after the other. As soon as there are as many as modes, they start again with the remaining
+        candidates.
     driving_point : bool
         Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
         that places that move little are left out first (EfI-DPR).
@@ -165,7 +167,7 @@ class RowSelection(Search):
             )
 
     def search(self, problem: Problem, work: Work) -> SearchResult:
-        """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random."""
+        """Return the choice with a lower bound by relaxation, without random numbers."""
         scorer = problem.layouts.scorer
         if not isinstance(scorer, ModeRows):
             raise ModelError(

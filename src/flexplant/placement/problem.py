@@ -186,9 +186,9 @@ class Placement(Value):
     history : tuple of tuples of float
         The value after each improvement, for each start.
     criterion : str
-        What was minimised.
+        Name of the criterion that was minimised.
     ports : tuple of Sensor or Actuator
-        The chosen ones.
+        Chosen sensors or actuators.
     side : {"y", "u", "yu"}
         Whether they are sensors, actuators, or both.
     stopped : str
@@ -196,7 +196,8 @@ class Placement(Value):
     unit : str
         Unit of the square root of the value, where it is a mean square of a motion.
     unjudged : str
-        What is said of such a motion where the plant has no evaluation model.
+        Remark that the value does not include truncated modes; empty where the plant has an
+        evaluation model.
     left_out : tuple of str
         Sensors or actuators of the plant that were not among the candidates: none of them is part
         of the choice, and the value is that without them.
@@ -432,19 +433,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The result of a search: chosen names, value, bound, evaluations.
+    """The result of a search: chosen candidates, value, bound, number of evaluations.
 
     Parameters
     ----------
     chosen : tuple of int
-        Indices of the candidates chosen.
+        Positions of the chosen candidates in the list of candidates, from 0.
     value, bound, evaluations, history, stopped
         As those of a `Placement`.
 
     Examples
     --------
     >>> import flexplant as fx
-    >>> found = fx.placement.SearchResult(("s1",), 2.0, 1.5, 7, (3.0, 2.0))
+    >>> found = fx.placement.SearchResult((0,), 2.0, 1.5, 7, (3.0, 2.0))
     >>> found.value - found.bound
     0.5
     """
@@ -471,9 +472,10 @@ class Search(Value):
     def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best choice that was found.
 
-        The problem has `score(sets)`, `bound()`, `choices()` and a `start`. With the work's
-        `mapped` and `rng` the result is the same to the bit on any executor, and work that was
-        stopped goes on from a file.
+        A method uses `score(sets)`, `bound()`, `choices()` and `start` of the problem. It calls
+        functions through ``work.mapped`` and draws random numbers from ``work.rng``. Its result is
+        then the same to the bit on every executor, and a search that was stopped continues from
+        its checkpoint file.
         """
 
 

@@ -35,19 +35,20 @@ class Scores(Value):
     values : (n,) array
         Scores, ascending; infinite for a layout that is infeasible.
     reasons : sequence of str
-        Why a layout is infeasible; empty when it is not.
+        Reason why each layout is infeasible; empty for a feasible one.
     order : (n,) array of int
-        Index of each layout in the given list.
+        Position of each layout in the list that was given to the function, from 0.
     criterion : str
-        What was scored.
+        Name of the criterion.
     candidates : sequence of Sensor or Actuator
-        All that appear in a layout.
+        Sensors or actuators that appear in at least one layout.
     side : {"y", "u"}
         Whether they are sensors or actuators.
     unit : str
-        Unit of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square root of a value, if the values are mean squares of a motion.
     unjudged : str
-        What is said of such motions where the plant has no evaluation model.
+        Remark that the scores do not include truncated modes; empty where the plant has an
+        evaluation model.
     interval : str
         Ratio of the error of the best layout to that of the next one on 95 % of the plant's
         machines, or the reason why this interval does not exist; empty where no machines
@@ -82,7 +83,7 @@ class Scores(Value):
         return self.layouts[0]
 
     def table(self, count: int = 10) -> str:
-        """Return the best few as text, one per line."""
+        """Return a text with the best layouts, one per line."""
         lines = []
         for i, value in enumerate(self.values[: whole(count, "count")]):
             why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
@@ -90,7 +91,7 @@ class Scores(Value):
         return "\n".join(lines)
 
     def on(self, plant: StandardPlant, *, rank: int = 0) -> StandardPlant:
-        """Return a plant of the machine with the layout of a rank (0 is the best)."""
+        """Return the plant with the layout of a given rank; rank 0 is the best layout."""
         rank = whole(rank, "rank", minimum=0, maximum=len(self) - 1)
         known = {port.name: port for port in self.candidates}
         return with_side(plant, self.side, [known[name] for name in self.layouts[rank]])
@@ -264,12 +265,13 @@ class DeviceWorth(Value):
     Parameters
     ----------
     names : sequence of str
+        Names of the n devices.
     value : float
-        With all of them.
+        Value of the criterion with all devices.
     without : (n,) array
-        Without each one; infinite where the others do not suffice.
+        Value without each device; infinite where the others do not suffice.
     unit : str
-        Unit of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square root of a value, if the values are mean squares of a motion.
 
     Examples
     --------

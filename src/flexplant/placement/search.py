@@ -187,31 +187,33 @@ def place_both(
 ) -> Placement:
     """Return the best choice of sensors and actuators together, for one cost of the closed loop.
 
-    Exchanges of either kind go on until none helps: a pair that is best for each other may differ
-    from the best sensors for given actuators.
+    Sensors and actuators are exchanged, one at a time, until no exchange lowers the cost. This may
+    give a better pair than choosing actuators first and sensors for these afterwards.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, assembled from a structure; its own sensors and actuators are not used.
+        Sampled plant that was assembled from a structure. Its sensors and actuators are not used.
     sensors, actuators : sequence of Sensor, sequence of Actuator
+        Candidates among which the sensors and the actuators are chosen.
     counts : (int, int)
-        How many sensors and how many actuators, `required` included.
+        Number of sensors and number of actuators to choose, including `required`.
     criterion : ClosedLoopH2 or callable, optional
         Function of a plant that returns a float, smaller is better; by default `ClosedLoopH2()`.
     required, constraints, method, executor, checkpoint, progress, rng : optional
-        As for `place_sensors`, of candidates of either kind. Constraints see sensors and actuators
-        alike: a minimum distance is also one between a sensor and an actuator.
+        As for `place_sensors`, for candidates of both kinds. A constraint does not distinguish
+        sensors from actuators: a minimum distance also applies between a sensor and an actuator.
 
     Returns
     -------
     Placement
-        Its `sensors` and `actuators`, with a lower bound for every pair of choices.
+        The chosen `sensors` and `actuators`, with a lower bound on the cost of every pair of
+        choices.
 
     Raises
     ------
     ModelError, LabelError, AssumptionError, InfeasibleError, CertificateError
-        As `place_sensors`; or when counts are not two.
+        As for `place_sensors`. ModelError also when `counts` is not a pair.
 
     Examples
     --------
@@ -295,7 +297,7 @@ class Exhaustive(Search):
     limit: int = field(default=200_000, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> SearchResult:
-        """Return the best of all subsets; see `Search.search`. Nothing is random."""
+        """Return the best of all subsets, without random numbers."""
         if problem.subsets > self.limit:
             raise ModelError(
                 f"there are {counted(problem.subsets, 'subset')}, more than "

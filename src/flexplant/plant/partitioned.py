@@ -168,7 +168,7 @@ class PartitionedSystem(Value):
 
     @property
     def unjudged(self) -> str:
-        """What answers on this plant say where it has no evaluation model; else empty.
+        """Remark of results on this plant if it has no evaluation model; otherwise empty.
 
         A plant that was assembled from a full FEModel lacks no modes and has no larger model.
         """

@@ -167,14 +167,14 @@ Part = PointMass | Spring | Damper
 
 @dataclass(frozen=True, eq=False, repr=False)
 class HeldShape(Interpolation):
-    """The shapes of a structure some of whose DOFs are held still.
+    """The interpolation of a structure after some of its DOFs were held by `FEModel.fixed`.
 
     Parameters
     ----------
     free : Interpolation
         Interpolation of the structure with all its DOFs.
     rows_left : (n,) array of int
-        The DOFs that remain, in order.
+        Positions of the remaining DOFs among all, from 0, ascending.
 
     Examples
     --------
@@ -190,15 +190,15 @@ class HeldShape(Interpolation):
     rows_left: IntArray
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of the DOFs that are left in a motion at a point."""
+        """Return the weights (n,) with which the remaining DOFs give the motion at a point."""
         return np.asarray(self.free.row(xyz, direction)[self.rows_left])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        """Return the weights (p, n) at many points (p, 3), one `row` for each point."""
         return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None."""
         found = self.free.dependent(label)
         return None if found is None else (found[0][self.rows_left], found[1])
 

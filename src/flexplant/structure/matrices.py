@@ -343,6 +343,7 @@ class FEMatrices(Value):
             Whether to free rigid-body motions that are held only because K lost digits (text,
             single precision), as `freed` does.
         name : str, optional
+            Name of the model, as it is printed.
 
         Raises
         ------

@@ -47,21 +47,24 @@ class FEModel(Placed, Value):
     K : (n, n) array or sparse matrix [N/m, N, N m]
         Stiffness: symmetric, positive semi-definite; singular for a free structure, with negative
         eigenvalues only where they belong to rigid-body motion (magnets). K needs double precision.
-        A K in single precision leads to an error or a warning where its rounding holds rigid-body
-        motions; ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees these.
+        The rounding of a K in single precision may act as springs on the rigid-body motions, which
+        leads to an error or a warning; ``FEMatrices(K, M, dofs=dofs).model(free=True)`` removes
+        these springs.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
     dofs : DofSet, optional
-        DOFs of the n rows, with coordinates. None: row i is the displacement of node i along x,
-        "1:x" to "n:x", at a place that is not known.
+        DOFs of the n rows, with coordinates. By default row i is the displacement of node i along
+        x, "1:x" to "n:x", with unknown coordinates.
     name : str, optional
+        Name of the model, as it is printed.
     held_inertia : (n, 6) array, optional
-        Loads ``M_fs r_s`` of the held DOFs s on the free ones f, through the mass matrix, when the
-        ground accelerates in one of its six rigid-body motions about the origin. `fixed` computes
-        them.
+        Forces ``M_fs r_s`` that the held DOFs s exert on the free DOFs f through the mass matrix
+        when the ground accelerates, one column for each of the six rigid-body motions of the ground
+        about the origin. `fixed` computes them.
     joint_motions : (n, m) array, optional
-        M-orthonormal motions of the components of a joined machine as rigid bodies that its rigid
-        joints allow (a slide, a hinge), in place of those that follow from the coordinates.
+        M-orthonormal motions that a joined machine makes without deforming: its components move as
+        rigid bodies, as far as the joints (a slide, a hinge) allow. They replace the rigid-body
+        motions that follow from the coordinates.
     joining : Value, optional
         Record of how a machine was joined, with its checks; None after M or K is changed.
 
@@ -76,9 +79,9 @@ class FEModel(Placed, Value):
     Warns
     -----
     FlexplantWarning
-        When K is in single precision and its rounding holds rigid-body motions or changes the first
-        elastic eigenvalue; or when every DOF is too slow for a machine, which may mean that K and M
-        are swapped.
+        When K is in single precision, and its rounding stiffens rigid-body motions or changes the
+        first elastic eigenvalue. When the frequencies of all DOFs are too low for a machine, which
+        may mean that K and M are swapped.
 
     References
     ----------
@@ -177,10 +180,10 @@ class FEModel(Placed, Value):
 
         They follow from the coordinates and are therefore exact: translations first, then rotations
         about the centre of gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0)
-        when held. Pieces that neither K nor M joins each have their own, the largest piece first.
-        Where coordinates have few digits (down to four), rotations are the null vectors of K
-        closest to the geometric ones. A motion that is held by a spring, however soft, is not
-        included.
+        when held. Pieces that neither K nor M connects each have separate motions, the largest
+        piece first. Where coordinates have few digits (down to four), rotations are the null
+        vectors of K closest to the geometric ones. A motion that is held by a spring, however soft,
+        is not included.
         """
         return np.asarray(
             frozen(rigid_body_basis(self.M, self.K, self.body_motions, self.dofs.xyz))
@@ -209,7 +212,7 @@ class FEModel(Placed, Value):
         return np.asarray(self.M @ motions)
 
     def ground_inertia(self, ground: FloatArray) -> FloatArray:
-        """Return the load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
+        """Return the inertia load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
 
         The motion is about the origin: x, y, z, rx, ry, rz. The coupling is known for DOFs held by
         `fixed`.
@@ -218,11 +221,11 @@ class FEModel(Placed, Value):
         return load if self.held_inertia is None else load + self.held_inertia @ ground
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return how much of each of the six rigid-body motions DOFs held by `fixed` prevent (6,).
+        """Return how strongly DOFs held by `fixed` prevent each of the six rigid-body motions (6,).
 
         Springs to ground prevent no motion, since the DOFs can still make it. The measure is ``max
-        |K r|_i / max (|K| |r|)_i``, with forces relative to the root of K_ii: the terms of K r
-        cancel everywhere except next to held DOFs.
+        |K r|_i / max (|K| |r|)_i``, with forces relative to the root of K_ii. It is 0 for a free
+        motion: the terms of K r cancel everywhere except next to held DOFs.
         """
         if self.held_inertia is None:
             return np.zeros(6)
@@ -244,8 +247,8 @@ class FEModel(Placed, Value):
         """Return the model with the matrix D of a damping law, or with a measured D.
 
         Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix. Rayleigh
-        damping is ``alpha M + beta K``. Rigid-body motions are undamped in both unless the law says
-        so (`rigid`).
+        damping is ``alpha M + beta K``. Both leave rigid-body motions undamped, unless the law has
+        damping for them (`rigid`).
 
         Parameters
         ----------
@@ -305,8 +308,9 @@ class FEModel(Placed, Value):
     def fixed(self, labels: Iterable[str]) -> FEModel:
         """Return the model with some DOFs held still: their rows and columns are taken out.
 
-        Places between nodes stay known, and so does the load that the mass of the held DOFs makes
-        when the ground moves (`held_inertia`). Parts that are added later load free DOFs only.
+        Points between nodes can still be used. The forces that the mass of the held DOFs causes
+        when the ground moves are kept in `held_inertia`. Parts that are added later act on free
+        DOFs only.
 
         Parameters
         ----------
@@ -389,7 +393,7 @@ class FEModel(Placed, Value):
         return model
 
     def with_unchecked_damping(self, D: Matrix) -> Self:
-        """Return the model with a D that is known to be symmetric and harmless; not checked."""
+        """Return the model with a D that is known to be symmetric and stable; it is not checked."""
         return self._with(D=frozen(D))
 
     def _with(self, **changes: Any) -> Self:

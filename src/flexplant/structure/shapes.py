@@ -231,9 +231,9 @@ class BlockShape(GridShape):
     elements : (int, int, int)
         Number of elements in x, y and z.
     present : (nz, ny, nx) array of bool, optional
-        Which elements exist; None: all.
+        True for each element that exists; by default all exist.
     poisson_ratio : float
-        Poisson's ratio, by which a bent element curves across.
+        Poisson's ratio, which curves a bent element in the transverse direction.
 
     Examples
     --------
@@ -255,8 +255,8 @@ class BlockShape(GridShape):
         """Return the weights (n,) of all DOFs in the motion of the material at a point.
 
         The bending modes inside an element follow its corners. Rotations rx, ry, rz are half the
-        curl of the displacements; they step a little between elements, and the element on the side
-        of larger coordinates is taken.
+        curl of the displacements. They change by a small step between two elements; there, those of
+        the element on the side of larger coordinates are returned.
         """
         require_known("motion", [direction], _BLOCK_MOTIONS, "a solid")
         point = real_array(xyz, "xyz", (3,))

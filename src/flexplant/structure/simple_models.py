@@ -56,6 +56,7 @@ def chain(
     spacing : float [m]
         Distance of neighbours; only the coordinates depend on it.
     name : str, optional
+        Name of the model, as it is printed.
 
     Returns
     -------
@@ -153,6 +154,7 @@ def beam(
     ends : (str, str)
         How each end is held: "free", "pinned" (z), "clamped" (z and ry) or "guided" (ry).
     name : str, optional
+        Name of the model, as it is printed.
 
     Returns
     -------
@@ -233,13 +235,14 @@ def kirchhoff_plate(
 ) -> FEModel:
     """Return a free thin rectangular plate in bending, without shear and rotary inertia.
 
-    Four-node non-conforming elements with the complete cubic and x^3 y, x y^3 (Adini, Clough and
-    Melosh), stiffness and consistent mass integrated exactly. The plate lies in the x-y plane with
-    one corner at the origin and its middle plane at z = 0. Nodes are numbered from 1, x fastest;
-    each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad].
+    The elements are those of Adini, Clough and Melosh: four nodes, non-conforming, with the
+    complete cubic polynomial and the terms x^3 y and x y^3. Stiffness and consistent mass are
+    integrated exactly. The plate lies in the x-y plane with one corner at the origin and its middle
+    plane at z = 0. Nodes are numbered from 1, x fastest; each has the DOFs z [m], rx = dz/dy and ry
+    = -dz/dx [rad].
 
-    Thickness and material are one number, an array (nx, ny) with one for each element, or a
-    function of the centre (x, y) of an element.
+    Thickness, density and the constants of the material may each be one number, an array (nx, ny)
+    with a number for each element, or a function of the centre (x, y) of an element.
 
     Parameters
     ----------
@@ -250,20 +253,24 @@ def kirchhoff_plate(
     elements : (2,) array of int
         Number of elements nx, ny.
     density : float, (nx, ny) array or function [kg/m^3]
+        Density of the material.
     youngs_modulus : float, (nx, ny) array or function [Pa]
+        Young's modulus of the material.
     poisson_ratio : float, (nx, ny) array or function [-]
-        Above -1 and below 0.5.
+        Poisson's ratio, above -1 and below 0.5.
     name : str, optional
+        Name of the model, as it is printed.
 
     Returns
     -------
     FEModel
-        Sparse, without D, its DofSet interpolating with the element's own shape functions.
+        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
+        shape functions of the elements.
 
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, or there is not one for each element.
+        When a number is not physical, or an array has not one number for each element.
 
     Examples
     --------
@@ -309,9 +316,10 @@ def solid_block(
 ) -> FEModel:
     """Return a free rectangular block of eight-node bricks, corner at the origin.
 
-    Trilinear displacements with incompatible modes inside each element (Wilson and Taylor), so that
-    bending is not locked; consistent mass. Nodes are numbered from 1, x fastest, then y, z; each
-    has the DOFs x, y, z [m]. With holes, nodes keep the numbers of the full block.
+    Displacements are trilinear, with the incompatible modes of Wilson and Taylor inside each
+    element, so that the elements are not too stiff in bending (locking). The mass matrix is
+    consistent. Nodes are numbered from 1, x fastest, then y, z; each has the DOFs x, y, z [m]. With
+    holes, nodes keep the numbers of the full block.
 
     Parameters
     ----------
@@ -320,22 +328,27 @@ def solid_block(
     elements : (3,) array of int
         Number of elements nx, ny, nz.
     density : float, (nx, ny, nz) array or function of an element's centre [kg/m^3]
+        Density of the material.
     youngs_modulus : float, (nx, ny, nz) array or function of an element's centre [Pa]
+        Young's modulus of the material.
     poisson_ratio : float [-]
-        Above -1 and below 0.5, the same everywhere.
+        Poisson's ratio, above -1 and below 0.5, the same everywhere.
     holes : (nx, ny, nz) array of bool or function of an element's centre, optional
-        Which elements are missing (True).
+        True for each element that is missing.
     name : str, optional
+        Name of the model, as it is printed.
 
     Returns
     -------
     FEModel
-        Sparse, without D, its DofSet interpolating with the shape functions of its elements.
+        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
+        shape functions of the elements.
 
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, there is not one for each element, or the block falls apart.
+        When a number is not physical, an array has not one number for each element, or the holes
+        divide the block into separate pieces.
 
     Examples
     --------

@@ -67,19 +67,21 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
 
 
 def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
-    """Return a model whose slides are accepted as motions at 0 Hz by `solve_modes`.
+    """Return a model whose slides `solve_modes` accepts as modes at 0 Hz.
 
     Parameters
     ----------
     model : FEModel
+        Model with slides: motions without energy that are not rigid-body motions, such as that of a
+        carriage on its guide.
     names : sequence of str, optional
-        Labels of the accepted slides (see `slides`); all by default. Others stay mechanisms, which
-        are refused.
+        Labels of the accepted slides, as `slides` gives them; all by default. `solve_modes` refuses
+        each other slide as a mechanism.
 
     Raises
     ------
     LabelError, ModelError
-        When the slide does not exist; as for `slides`.
+        When a named slide does not exist, or the model is too large for `slides`.
 
     Examples
     --------

@@ -136,14 +136,15 @@ def _collected(terms: Terms) -> Terms:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ThickPlateShape(PlateShape):
-    """The fields of a rectangular grid of plate elements that shear.
+    """The shape functions of a rectangular grid of plate elements with shear deformation.
 
     Parameters
     ----------
     size, thickness, elements
         As for `PlateShape`.
     softness : float or (ny, nx) array [m^2]
-        Bending stiffness over shear stiffness of the elements; 0: nothing shears.
+        Ratio of bending stiffness to shear stiffness of the elements; 0 is a plate without shear
+        deformation.
 
     Examples
     --------
@@ -203,13 +204,16 @@ def plate(
         Number of elements nx, ny. Elements smaller than the thickness show how a free edge twists:
         larger ones make the lowest frequency of a plate of 0.6 x 0.6 x 0.027 m up to 1 % too high.
     density : float, (nx, ny) array or function [kg/m^3]
+        Density of the material.
     youngs_modulus : float, (nx, ny) array or function [Pa]
+        Young's modulus of the material.
     poisson_ratio : float, (nx, ny) array or function [-]
         Above -1 and below 0.5.
     shear_factor : float, optional
         k of the shear stiffness k G h; 5/6 for a plate whose shear stress is a parabola over the
         thickness. None: the plate does not shear, but its sections have inertia.
     name : str, optional
+        Name of the model, as it is printed.
 
     Returns
     -------

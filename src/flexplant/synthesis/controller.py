@@ -62,7 +62,8 @@ class Controller(Value):
     structure : FixedOrder, TunedLaws or ObserverGains, optional
         For `design_structured`: the given structure, with the parameters found.
     tried : Certificate
-        Attempts in their order, with the gamma that each reached; infinite where it failed.
+        Attempts of the design in the order in which they were made, each with its gamma; infinite
+        for an attempt that failed.
 
     Examples
     --------

@@ -18,7 +18,7 @@ from ..tolerances import NEGLIGIBLE, RANK
 def lqr(
     sys: System, *, Q: FloatArray, R: FloatArray, N: FloatArray | None = None
 ) -> RiccatiSolution:
-    """Return the state feedback of least quadratic cost, continuous or sampled.
+    """Return the linear-quadratic regulator (LQR), continuous or sampled.
 
     ``u = -F x`` with F the `gain` of the answer minimises ``int x' Q x + 2 x' N u + u' R u dt``, or
     the sum over samples where the system is sampled (``dlqr``).
@@ -26,6 +26,7 @@ def lqr(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
+        System with n states, m inputs and p outputs.
     Q, R, N : (n, n), (m, m), (n, m) arrays
         Weights on states, inputs and both; R is positive definite.
 
@@ -38,8 +39,8 @@ def lqr(
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `flexplant.lti.control_care`: when weights do not fit, R is singular, or a mode cannot
-        be stabilised.
+        As for `flexplant.lti.control_care`: when the weights have wrong sizes, R is singular, or a
+        mode cannot be stabilised.
 
     References
     ----------
@@ -60,17 +61,20 @@ def lqr(
 def lqi(
     sys: System, *, Q: FloatArray, R: FloatArray, outputs: Iterable[str] | None = None
 ) -> RiccatiSolution:
-    """Return the state feedback of least quadratic cost with integrators of outputs.
+    """Return the linear-quadratic regulator with integral action (LQI).
 
-    ``u = -F [x; q]`` with ``dq/dt = r - y`` (``q[k+1] = q[k] + dt (r - y)`` where the system is
-    sampled): outputs follow constant references r without an error.
+    The feedback ``u = -F [x; q]`` minimises the cost of `lqr` for the states x and the integrals q,
+    ``dq/dt = r - y`` (``q[k+1] = q[k] + dt (r - y)`` if the system is sampled). The outputs follow
+    constant references r without a stationary error.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
+        System with n states, m inputs and p outputs.
     Q : (n + p, n + p) array
-        Weight on the states and then the integrals.
+        Weight on the n states, followed by the p integrals.
     R : (m, m) array
+        Weight on the inputs, positive definite.
     outputs : iterable of str, optional
         The p outputs that are integrated; by default all.
 
@@ -82,10 +86,10 @@ def lqi(
     Raises
     ------
     AssumptionError
-        When outputs have a zero at rest, or are more than the inputs: some of their integrals
-        cannot be stabilised.
+        When the system has a zero at zero frequency, or more outputs than inputs: some integrals
+        then cannot be stabilised.
     ShapeError, ModelError, SolverError
-        As `lqr`.
+        As for `lqr`.
 
     Examples
     --------
@@ -139,17 +143,20 @@ def _with_integrals(g: StateSpace, outputs: Iterable[str] | None) -> StateSpace:
 
 
 def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = None) -> StateSpace:
-    """Return the Kalman filter of a system as a system from (u, y) to its states.
+    """Return the Kalman filter of a system, from inputs u and outputs y to estimated states.
 
-    ``dx/dt = A x + B u + w, y = C x + D u + v``. The estimate x^ follows ``dx^/dt = A x^ + B u + K
-    e`` with ``e = y - C x^ - D u``; for a sampled system it is the state predicted for the next
-    sample. `flexplant.design_kalman` does the same for a plant with its ports and judges the error.
+    The system is ``dx/dt = A x + B u + w, y = C x + D u + v`` with white noises w and v. The
+    estimate x^ follows ``dx^/dt = A x^ + B u + K e`` with the innovation ``e = y - C x^ - D u``.
+    For a sampled system x^ is the state predicted for the next sample. `flexplant.design_kalman`
+    does the same for a plant with its ports, and computes the error of the estimate.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
+        System with n states, m inputs and p outputs.
     W, V, N : (n, n), (p, p), (n, p) arrays
-        Densities (covariances, where sampled) of w and v, and between them.
+        Spectral densities of w, of v and between w and v; covariances for a sampled system. N is
+        zero by default.
 
     Returns
     -------
@@ -159,7 +166,7 @@ def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = Non
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `flexplant.lti.filter_care`.
+        As for `flexplant.lti.filter_care`.
 
     References
     ----------
@@ -207,6 +214,7 @@ def lqg(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
+        System with n states, m inputs and p outputs.
     Q, R : (n, n), (m, m) arrays
         As in `lqr`; (n + p, n + p) as in `lqi` where outputs are integrated.
     W, V : (n, n), (p, p) arrays
@@ -263,6 +271,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
+        System with n states, m inputs and p outputs.
     poles : (n,) array [rad/s, or 1 where sampled]
         Poles in conjugate pairs; each may be given at most as often as there are inputs.
 
@@ -275,7 +284,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     ShapeError
         When the number of poles is not that of the states.
     ModelError
-        When poles cannot be placed there: a mode that no input reaches, or a pole that is asked for
+        When the poles cannot be placed: no input moves one of the modes, or a pole is asked for
         more often than there are inputs.
 
     References

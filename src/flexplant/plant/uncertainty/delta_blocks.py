@@ -31,6 +31,7 @@ class RepeatedScalar(Value):
     real : bool
         Whether delta is a real number (a parameter) or a complex one.
     name : str
+        Name of the uncertainty in results and messages.
 
     Examples
     --------
@@ -63,6 +64,7 @@ class FullBlock(Value):
     w, z : int
         Number of outputs w of Delta, which drive the plant, and number of its inputs z.
     name : str
+        Name of the uncertainty in results and messages.
 
     Examples
     --------

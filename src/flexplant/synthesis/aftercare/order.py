@@ -332,14 +332,16 @@ def discretise_controller(
     Returns
     -------
     Controller
-        The certificate holds spectral radius and margin, and the continuous ones.
+        Sampled controller. The certificate holds the spectral radius and the modulus margin of the
+        sampled loop, and the stability and margin of the continuous loop.
 
     Raises
     ------
     CertificateError
-        When the sampled loop is unstable or loses more margin, or the continuous one is unstable.
+        When the sampled loop is unstable or loses more than the allowed margin, or the continuous
+        loop is unstable.
     ModelError
-        When the plant is not sampled or weighted, or the controller is sampled already.
+        When the plant is continuous, the plant has weights, or the controller is already sampled.
 
     Warns
     -----

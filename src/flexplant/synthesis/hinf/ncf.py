@@ -62,33 +62,35 @@ def design_ncf(
     Parameters
     ----------
     plant : StandardPlant or StateSpace
-        Plant, of which u -> y is used; a StateSpace is used whole.
+        Plant. Of a StandardPlant the channels from u to y are used.
     before, after : StateSpace or array, optional
         Shaping at u and at y, with the plant's sampling time: filters that give the loop its slope,
         and transformations to decoupled axes (`decouple`: accelerations and to_motions).
     bandwidth : float [Hz], optional
         Bandwidth of every channel. ``after G before`` must be square; each of its channels is
-        multiplied by ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with k for a gain of 1 at the
+        multiplied by ``k (1 + w / (10 s))`` with w = 2 pi bandwidth, and k makes its gain 1 at the
         bandwidth.
     back_off : float
-        Relative distance from gamma_min, at which K_s is singular.
+        Relative distance of gamma from gamma_min. It must be positive, because K_s is singular at
+        gamma_min.
 
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` gamma_min; the certificate holds the margin 1 / gamma
-        of the shaped plant, gamma_min from the Hankel norm of the factors, and the modulus margin
-        of the loop at u. A gamma below 4 is called robust.
+        `gamma` is the verified norm, and `lower` is gamma_min. The certificate holds the margin 1 /
+        gamma of the shaped plant, gamma_min from the Hankel norm of the factors, and the modulus
+        margin of the loop at u. As a rule of thumb, a design with a gamma below 4 is robust.
 
     Raises
     ------
     AssumptionError
-        When u does not move, or y does not show, an undamped or unstable mode, or the shaping hides
-        one.
+        When u does not excite an undamped or unstable mode, or y does not measure it, or the
+        shaping filters cancel it.
     CertificateError
         When the closed loop exceeds the claimed norm.
     ModelError, ShapeError
-        When plant, shaping and bandwidth do not fit.
+        When the sizes or sampling times of plant and shaping filters differ, or the bandwidth is
+        out of range.
 
     References
     ----------

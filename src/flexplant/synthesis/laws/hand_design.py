@@ -236,22 +236,24 @@ class LoopDesign(Value):
         return "\n".join(lines)
 
     def is_made_on(self, plant: Any) -> bool:
-        """Return whether a plant is the one that it was made on, by its numbers.
+        """Return whether the design was made on this plant, which is compared by its numbers.
 
         Parameters
         ----------
         plant : StandardPlant, StateSpace or Frf
+            Plant to compare with.
         """
         return self.fingerprint == _digest(plant)
 
     def with_axis(self, name: str, axis: ShapedAxis) -> LoopDesign:
-        """Return the design with another axis in the place of one.
+        """Return the design with one axis replaced.
 
         Parameters
         ----------
         name : str
+            Name of the axis that is replaced.
         axis : ShapedAxis
-            Its elements.
+            New axis, with its elements.
         """
         require_known("axis", [name], self.axes)
         return self.replace(axes={**self.axes, name: axis})

@@ -187,6 +187,7 @@ class Law(LawElement):
     factors : sequence of elements
         `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`.
     gain : float
+        Number by which the factors are multiplied.
     rate : float [Hz]
         Sampling rate; 0 when continuous.
     prewarped : bool

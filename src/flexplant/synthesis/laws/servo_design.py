@@ -59,28 +59,29 @@ def design_servo(
 ) -> Controller:
     """Return a controller with one law for each axis that the actuators move.
 
-    ``u = -T C(z) (hat - ref)``. T decouples the axes on the real axis,
-    ``T = pinv(G(sigma)) / sigma^2`` at sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). The
-    law of an axis follows from the slope of its response at the bandwidth w_b: on a mass line (a
-    free body, or above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``,
-    on a damper line ``k (1 + w_i / s) F(s)``, on a spring line ``k F(s) / s``, and ``k F(s)`` if
-    the response is zero at rest. F is a second-order roll-off and the notches. The gain k makes the
-    loop of the axis cross 1 at the bandwidth, with the exact response of the plant. If that law
-    does not keep |S| at u below 6 dB next to a resonance, the gain on the real axis is used if its
-    law does. If the slope lies between two lines, the law with the smaller peak of |S| at u is
-    used. In the same way the lead of a mass line is chosen wide (16 instead of 4, or 64 if 16 does
-    not keep 6 dB) if a mode lies above the bandwidth within a factor of 4. A wide lead suppresses
-    the error up to a higher frequency, but less at low frequencies, and passes more noise to the
-    actuators. A notch has the damping of its mode. Its frequency is that of the mode or, for a fast
-    mode, lies below it, so that the loop tolerates an error of that frequency. Its width is chosen
-    by |S|. The certificate is for the complete loop: with observer, flexible modes and delay, and
-    truncated modes if they are known. `servo_bandwidth` gives the largest bandwidth with a peak of
-    6 dB.
+    The controller is ``u = -T C(z) (hat - ref)``, with the estimates hat and the references ref. T
+    decouples the axes: ``T = pinv(G(sigma)) / sigma^2``, where G is the response of the plant at
+    the real number s = sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). C has one law for
+    each axis. The law follows from the slope of the axis's response at the bandwidth w_b:
+
+    - mass line (above all springs): ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``;
+    - damper line: ``k (1 + w_i / s) F(s)``;
+    - spring line: ``k F(s) / s``; response that is zero at zero frequency: ``k F(s)``.
+
+    Here w_i is the corner of the integral action; F is a second-order roll-off with the notches.
+    Between two lines, the law with the smaller peak of |S| at u is used. The gain k makes the loop
+    of the axis cross 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance, k is
+    computed from the response at s = sigma, provided that this keeps 6 dB. If a mode lies above the
+    bandwidth within a factor of 4, wider leads are tried on a mass line: 16 in place of 4, or 64 if
+    16 does not keep 6 dB. A wide lead suppresses the error up to a higher frequency, but less at
+    low frequencies, and passes more noise to the actuators. A notch has the damping of its mode,
+    and its frequency or, for a fast mode, a lower one, so that the loop tolerates errors of the
+    mode's frequency. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled.
+        Sampled plant.
     bandwidth : float or mapping {axis: float} [Hz]
         Frequency at which the loop of each axis crosses 1; below a fifth of the rate. If the plant
         resonates, the error is suppressed only up to a lower frequency: the certificate has both.
@@ -94,8 +95,8 @@ def design_servo(
         with a wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
     integrator : float [Hz], optional
         Corner of the integral action; by default a tenth of the bandwidth. With a wide lead it is
-        the fastest up to that which raises |S| at u by at most 10 %; on springs it is up to half
-        the bandwidth, where |S| at a twentieth of the bandwidth would exceed 0.3 otherwise.
+        the highest corner up to this that raises |S| at u by at most 10 %. On springs it is up to
+        half the bandwidth, if |S| at a twentieth of it would exceed 0.3 otherwise.
     notches : sequence of float [Hz], optional
         Frequencies of resonances to notch, each below half the rate. By default they are placed at
         the plant's modes, one by one, while |S| at u is above 6 dB (or the loop is unstable) and a
@@ -107,9 +108,9 @@ def design_servo(
     -------
     Controller
         From the references `die:ref`, ... (if any) and the estimates `die:hat`, `die:rx:hat`, ...
-        to the actuators. The certificate holds spectral radius and modulus margin of the plant with
-        the observer, and with the truncated modes; the frequency up to which |S| of every reference
-        is below 1; where |S| at u exceeds 6 dB, the largest bandwidth.
+        to the actuators. The certificate holds spectral radius and modulus margin of the complete
+        loop, also with truncated modes; and the frequency up to which |S| of every reference is
+        below 1. If |S| at u exceeds 6 dB, it also holds the largest bandwidth that keeps 6 dB.
 
     Raises
     ------
@@ -215,18 +216,18 @@ def servo_bandwidth(
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
-    Plant and observer are swept once over a grid that includes their resonances. The loop is broken
-    at the plant's input, as in `modulus_margin`; the observer still reads u. A bandwidth that keeps
-    the peak on this grid is accepted if its eigenvalues are stable, every axis with a reference has
-    |S| of at most 0.3 at a twentieth of it, and `modulus_margin` keeps the peak, also with
-    truncated modes if they are known. Bandwidths are tried in steps of 9 %, from
-    the top down, then between the first success and the step above it.
+    Plant and observer are swept once over a grid that includes their resonances. The loop is opened
+    at the plant's input; the observer still receives u. A bandwidth that keeps the peak on this
+    grid is accepted on three conditions: the closed loop is stable, every axis with a reference has
+    |S| of at most 0.3 at a twentieth of the bandwidth, and `modulus_margin` keeps the peak.
+    Truncated modes are included if known. Bandwidths are tried in steps of 9 %, from the top down,
+    then between the first success and the step above it.
 
     Parameters
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Bound on the largest singular value of S at u; 2 is 6 dB.
+        Upper bound on the largest singular value of S at u; 2 is 6 dB.
 
     Returns
     -------
@@ -235,9 +236,9 @@ def servo_bandwidth(
     Raises
     ------
     AssumptionError, LabelError, ModelError
-        As `design_servo`; ModelError when peak is not above 1.
+        As for `design_servo`. ModelError also when `peak` is not above 1.
     SolverError
-        When no bandwidth keeps the peak; the message states the closest result, and its limit.
+        When no bandwidth keeps the peak. The message gives the closest result and what limits it.
 
     Examples
     --------

@@ -23,19 +23,20 @@ from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredObjective(Value):
-    """The base class of objectives of your own: a positive number of the closed loop.
+    """The base class for objectives of your own: a positive number that a closed loop gives.
 
-    A new objective defines `measured`, a smooth function of the loop from w to z in seconds and the
-    user's units; it is infinite for a stable loop that is not acceptable. It must not depend on the
-    choice of states. Its derivatives with respect to the n parameters of the controller are found
-    by differences: each gradient closes 2 n more loops, which `evaluations` does not count.
+    A new objective defines the method `measured`: a smooth function of the closed loop from w to z,
+    in seconds and in the units of the channels. It returns infinity for a stable loop that is not
+    acceptable, and must not depend on the choice of states. The search computes its derivatives
+    with respect to the n parameters of the controller by differences: each gradient closes 2 n more
+    loops, which `evaluations` does not count.
 
     Parameters
     ----------
     w, z : sequences of str, optional
-        Channels; by default all.
+        Channels of the closed loop that `measured` receives; by default all.
     below : float, optional
-        Bound; the number is expressed as a multiple of it.
+        Upper bound on the number. The search uses the number divided by this bound.
 
     Examples
     --------
@@ -59,17 +60,17 @@ class MeasuredObjective(Value):
     below: float | None = field(default=None, metadata=checked(positive))
 
     def chosen(self, plant: AnyPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of w and z, all where none were given."""
+        """Return the names of the channels w and z; by default all of the plant."""
         for side in "wz":
             require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
         return self.w or plant.w, self.z or plant.z
 
     @abstractmethod
     def measured(self, closed: StateSpace) -> float:
-        """Return the number of a closed loop from w to z."""
+        """Return the objective of a closed loop from w to z."""
 
     def judges(self, plant: AnyPlant, order: int) -> Sequence[Judge]:
-        """Return the judges (`Judge`) that compute the number for controllers of an order."""
+        """Return the objects (`Judge`) that compute the objective for controllers of an order."""
         return [MeasuredJudge(plant, self, order)]
 
 
