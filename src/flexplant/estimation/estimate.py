@@ -40,6 +40,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     Parameters
     ----------
     time : (N,) array [s]
+        Instants of the samples.
     names : sequence of str
         Names of the estimates.
     data : (nz, N) array [m or rad]
@@ -48,6 +49,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         Standard deviations of their errors, on the filter's model, where truncated modes count as
         white noise. Infinite as long as an estimate is not determined.
     sensors : sequence of str
+        Names of the sensors.
     innovations : (ny, N) array
         Measurements minus their prediction, in the sensors' units; NaN where one is missing or not
         predicted yet.
@@ -61,6 +63,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     state : (n,) array
         State x[N|N-1], from which `estimate(..., start=)` continues with the next record.
     units : mapping {channel: unit}
+        Unit of each channel.
     gate : float
         Number of deviations above which a sample counted as missing; infinite without a gate.
     gated : (ny, N) array of bool

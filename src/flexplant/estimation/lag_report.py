@@ -59,6 +59,7 @@ class LagReport(Value):
     note : str
         Reason why no static relation exists, or "".
     units : mapping {channel: unit}
+        Unit of each channel.
 
     Examples
     --------

@@ -20,7 +20,7 @@ from ..tolerances import SAME
 from ..words import flag
 from .c_text import CText
 
-#: keywords of C, and names of its library with the ending _t
+#: keywords of C, and names of its library that end in _t
 _RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if
     inline int long register restrict return short signed sizeof static struct switch typedef

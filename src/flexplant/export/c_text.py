@@ -132,7 +132,7 @@ static void outputs_of(const {real} *restrict x, const {real} *restrict in,
 }}
 """
 
-#: partial sums, so that a compiler may vectorise without -ffast-math
+#: code with several partial sums, which a compiler may vectorise without -ffast-math
 _SUM = """\
         {real} s[{lanes}] = {{{zero}}};
         const {real} *restrict row = C[first + i];
@@ -176,7 +176,7 @@ _REST = """\
     }}
 """
 
-#: matrices of both places, interpolated linearly entry by entry
+#: code that interpolates linearly between the matrices of two places, entry by entry
 _MOVING = """\
 static void advance({real} *restrict x, const {real} *restrict in, int q, {real} part)
 {{
@@ -298,7 +298,7 @@ class CText:
         self.system, self.form, self.single, self.limits = K, form, single, limits
         self.states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
         self.driven, self.places, self.count = driven, places, max(places.size, 1)
-        #: whether A and B depend on the place too
+        #: whether A and B also depend on the place
         self.moving = form.rest.ndim == 3
         rest, precision = form.rest.shape[-1], "single" if single else "double"
         error = f"blocks within {form.error:.1e} of the largest gain of each channel"
@@ -315,7 +315,7 @@ class CText:
         }  # fmt: skip
 
     def number(self, value: float) -> str:
-        """Return a literal: exact, of the type that is computed in."""
+        """Return a number as an exact C literal of the type in which the code computes."""
         digits = f"{value:.9g}" if self.single else f"{value:.17g}"
         digits = digits if any(mark in digits for mark in ".en") else f"{digits}.0"
         return f"{digits}F" if self.single else digits

@@ -158,14 +158,15 @@ static int dropped(void **state)
 
 """
 
-#: parameters that many functions share, and bodies of functions that do nothing
+#: abbreviations of parameters, and of bodies below, that many functions share
 _SHORT = {
     "$C": "void *c",
     "$V": "void *c, const unsigned int *v, size_t n",
     "$M": "const char *label, const char *token, const char *place, _Bool visible, _Bool logging",
 }
 _BODIES = {"": "return ERROR;", "ok": "return OK;", "none": "return n ? ERROR : OK;"}
-#: one function a line, int unless another result is written; without a body it is not supported
+#: functions of FMI 2.0, one a line. They return int unless another type is written; a function
+#: without a body is not supported
 _TWO = """
 const char *GetTypesPlatform(void): return "default";
 const char *GetVersion(void): return "2.0";
@@ -205,7 +206,7 @@ GetIntegerStatus($C, int which, int *value)
 GetBooleanStatus($C, int which, int *value)
 GetStringStatus($C, int which, const char * *value)
 """
-#: kinds of variables of FMI 3.0 that these units do not have
+#: types of variables of FMI 3.0 that the exported units do not use, and their types in C
 _NUMBERS_OF_THREE = {
     "Float32": "float", "Int8": "signed char", "UInt8": "unsigned char", "Int16": "short",
     "UInt16": "unsigned short", "Int32": "int", "UInt32": "unsigned int", "Int64": "long long",
@@ -289,14 +290,14 @@ ActivateModelPartition($C, unsigned int clock, double time)
 
 
 def interface(K: StateSpace, name: str, version: str) -> str:
-    """Return the source of the functions of one version, all that the specification lists."""
+    """Return the source of all functions that one version of the specification lists."""
     prefix, listed = ("fmi3", _THREE) if version == "3.0" else ("fmi2", _TWO)
     common = _COMMON.format(name=name, dt=K.dt, m=len(K.inputs), p=len(K.outputs))
     return common + "\n".join(_function(line, prefix) for line in listed.splitlines() if line)
 
 
 def _function(line: str, prefix: str) -> str:
-    """Return one function; without a body it answers that it is not supported."""
+    """Return one function; without a body it returns the error of an unsupported function."""
     for short, long in _SHORT.items():
         line = line.replace(short, long)
     head, _, body = (line if "): " in line else f"{line}: ").partition("): ")
@@ -310,14 +311,14 @@ def _function(line: str, prefix: str) -> str:
     return f"EXPORT {head};\n{head}\n{{\n{unused}    {lines}\n}}\n"
 
 
-#: base units of FMI, and units with a name, in terms of others
+#: base units of FMI, and named units as products of other units
 _BASE = ("kg", "m", "s", "A", "rad")
 _NAMED = {
     "N": "kg m s^-2", "Pa": "N m^-2", "J": "N m", "W": "J s^-1", "V": "W A^-1", "Hz": "s^-1",
     "T": "V s m^-2",
 }  # fmt: skip
 _FACTOR = re.compile(r"([A-Za-z]+)(?:\^(-?\d+))?")
-#: folder of the binary of a system by version of FMI, and suffix of a shared library
+#: folders of the library in FMI 2.0 and 3.0, and its suffix, by operating system
 _FOLDERS = {
     "linux": ("linux{bits}", "{cpu}-linux", ".so"),
     "darwin": ("darwin{bits}", "{cpu}-darwin", ".dylib"),
@@ -567,5 +568,5 @@ def _build(name: str, sources: Sequence[str]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return an attribute's value; what XML's own module has for it loads the network's."""
+    """Return the quoted value of an attribute; xml.sax.saxutils would import network modules."""
     return f'"{escape(text)}"'

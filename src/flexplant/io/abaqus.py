@@ -31,7 +31,7 @@ from .files import (
 )
 from .triplets import from_triplets
 
-#: value that Abaqus writes on the diagonal of a degree of freedom with a boundary condition
+#: value that Abaqus writes on the diagonal for a degree of freedom with a boundary condition
 _HELD = 1e35
 _WORD = re.compile(rb"[^\s,]+")
 
@@ -130,7 +130,7 @@ def read_abaqus(
 
 @dataclass
 class _Triplets:
-    """Entries of one matrix; a code is 16 node + degree of freedom, or 16 row."""
+    """Entries of one matrix. A code is 16 node + degree of freedom, or 16 row."""
 
     path: str
     named: bool

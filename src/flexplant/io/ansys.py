@@ -20,7 +20,7 @@ from .foreign_parsers import in_child
 from .tables import read_nodes_table
 from .triplets import assembled, missing_extra
 
-#: a local coordinate system turned less than this [deg] counts as the global one
+#: a local coordinate system that is turned by less than this [deg] counts as the global one
 _STRAIGHT = SAME
 
 

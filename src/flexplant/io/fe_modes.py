@@ -21,7 +21,8 @@ from ..tolerances import FOUR_DIGITS
 from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
-#: distance of generalised masses from 1 that few digits of mass-normalised shapes explain
+#: largest deviation of generalised masses from 1 that comes from few digits of mass-normalised
+#: shapes
 _ONE = 1e-5
 MISSING = (
     "no residual attachment vectors: the static motion of truncated modes is missing "
@@ -31,7 +32,7 @@ MISSING = (
 
 @dataclass(frozen=True)
 class FileShapes:
-    """Mode shapes as a file holds them, in its units."""
+    """Mode shapes of a file, in the units of the file."""
 
     omega: FloatArray
     phi: FloatArray
@@ -42,8 +43,8 @@ class FileShapes:
     units: Units | None = None
 
 
-#: function by suffix that reads the shapes of a file (its path, that of its nodes); each reader
-#: registers
+#: functions that read the shapes of a file, by its suffix; their arguments are the path of the file
+#: and that of a file with the nodes. Each reader adds its function
 MODE_READERS: dict[str, Callable[[Path, Path | None], FileShapes]] = {}
 
 
@@ -55,7 +56,7 @@ def scaled_modes(
     system: Units,
     path: str,
 ) -> Modes:
-    """Return the Modes of shapes, scaled to unit mass and SI."""
+    """Return the Modes with these shapes, scaled to unit generalised mass and to SI units."""
     if not (np.all(np.isfinite(shapes.phi)) and np.all(np.isfinite(shapes.omega))):
         raise damaged(path, "NaN or infinite numbers in its modes")
     shapes = _unit_mass(shapes, path)
@@ -87,7 +88,7 @@ def scaled_modes(
 
 
 def damping_ratios(zeta: Any, order: IntArray) -> FloatArray:
-    """Return the damping ratios (k,) of modes in order, of one number or of one for each."""
+    """Return the damping ratios (k,) of modes, from one number or from one for each mode."""
     given, k = real_array(zeta, "zeta"), order.size
     if given.shape not in ((), (k,)):
         raise ShapeError(
@@ -97,7 +98,7 @@ def damping_ratios(zeta: Any, order: IntArray) -> FloatArray:
 
 
 def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
-    """Return shapes of generalised mass 1, as far as the file has them."""
+    """Return shapes scaled to generalised mass 1, if the file has generalised masses."""
     masses = shapes.masses
     if masses is None:
         note = "taken as mass-normalised, which the file does not say"
@@ -115,7 +116,7 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
 
 
 def frequencies(omega: FloatArray, rigid_below: float | None, path: str) -> Any:
-    """Return frequencies [rad/s] in order, how many are 0, and which mode each was."""
+    """Return ascending frequencies [rad/s], the number of zeros, and the original positions."""
     limit = None if rigid_below is None else 2 * np.pi * positive(rigid_below, "rigid_below")
     rigid = np.abs(omega) < limit if limit is not None else omega == 0
     order = np.argsort(np.where(rigid, -np.inf, omega), kind="stable")
@@ -174,6 +175,7 @@ def read_modes(
     Parameters
     ----------
     path : str or Path
+        Path of the file.
     zeta : float, (k,) array or None
         Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
         modes have none.

@@ -20,16 +20,15 @@ from ..words import several
 
 #: least number of characters of a number printed by a program; shorter ones may be typed by hand
 _PRINTED = 12
-#: number of digits: shorter numbers may be exact; longer ones were rounded to their number of
-#: digits
+#: least number of digits of a rounded number; a number with fewer digits may be exact
 _ROUNDED = 6
-#: digits that a sign and one more digit of the exponent take from a number in a fixed field
+#: number of digits that a number in a fixed field loses to its sign and to a longer exponent
 _FIELD = 2
-#: least fraction of numbers with all digits: fewer end in several zeros by chance
+#: least fraction of the numbers that have all digits; the others end in zeros by chance
 _ALIKE = 0.6
-#: number of digits that shows double precision, even if the other numbers are shorter
+#: a number with this number of digits shows double precision, even if all others are shorter
 _DOUBLE = 15
-#: an exponent without its letter: 1.5-100, 3.+7
+#: an exponent without the letter E or D: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
 _DECIMAL = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eEdDqQ]([+-]?[0-9]+)|([+-][0-9]+))?")
 _DIGITS = re.compile(rb"[+-]?0*(\d*)\.?(\d*)")
@@ -190,7 +189,7 @@ def refused(path: object, what: str, do: str) -> FlexplantError:
 
 
 def unread(path: object, what: str, do: str) -> ModelError:
-    """Return the error of a file that does not hold M, D, K or shapes of a structure."""
+    """Return the error for a file that does not hold M, D, K or shapes of a structure."""
     return ModelError(f"{str(path)!r} {what}. {do}")
 
 
@@ -215,11 +214,11 @@ def three_units(units: Any) -> tuple[Any, ...]:
 
 def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
     """Refuse a text that ends, without a line end, in a number shorter than all others."""
-    # a number without its last digits is still a number
+    # a number that lost its last digits is still a valid number
     last = content[-80:].split()[-1:]
     if content.endswith((b"\n", b"\r")) or not last:
         return
-    # the last number itself may be among them
+    # the words may contain the last number too
     others = [len(word) for word in (w.strip().lstrip(b"+-") for w in words) if word not in last[0]]
     if others and len(last[0].lstrip(b"+-")) < min(others) >= _PRINTED:
         raise damaged(path, "the last number is shorter than all others")
@@ -227,7 +226,7 @@ def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
 
 @contextmanager
 def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
-    """Turn whatever a parser of another package raises into the error of a damaged file."""
+    """Turn every exception of a parser of another package into the error for a damaged file."""
     try:
         yield
     except FlexplantError:
@@ -256,16 +255,16 @@ def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-#: stands for the matrix with a usual name, if there is one
+#: stands for the matrix that has one of the usual names, if there is such a matrix
 USUAL = "usual"
 #: largest number of characters of a line of numbers; lines of cards have 80
 LINE = 4096
-#: number of bytes at the beginning of a file that must show its format
+#: number of bytes at the beginning of a file from which its format is recognised
 HEAD = 20000
 
 
 def _by_suffix_alone(head: bytes) -> bool:
-    """Return False: the first bytes of a file do not tell its format."""
+    """Return False: the format is not recognised from the first bytes of a file."""
     return False
 
 
@@ -322,7 +321,7 @@ class Elsewhere:
     begins: Callable[[bytes], bool] = lambda head: True
 
 
-#: formats registered by the readers: their files, and files of the same program without matrices
+#: formats that the readers register, and files of the same programs without matrices
 FORMATS: list[Format] = []
 ELSEWHERE: list[Elsewhere] = []
 
@@ -333,6 +332,7 @@ def add_format(form: Format) -> None:
     Parameters
     ----------
     form : Format
+        Description of the format, with its reader.
 
     Raises
     ------

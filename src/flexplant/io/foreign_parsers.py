@@ -15,7 +15,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-#: number of bytes that any file may need in addition to a multiple of its size
+#: number of bytes that a parser may use in addition to a multiple of the size of the file
 _SPARE = 2**26
 #: whether this process only runs parsers, so that its memory and time may be limited
 ALONE = False
@@ -25,7 +25,7 @@ def matlab(path: str) -> dict[str, Any]:
     """Return {name: value} of a MATLAB file up to version 7; structures become dicts."""
     import scipy.io.matlab
 
-    # deflated data grow a thousand times at most
+    # compressed data expand at most a thousand times
     _bound_memory(path, 1100)
     content = scipy.io.matlab.loadmat(path, struct_as_record=False, spmatrix=False)
     return {name: _plain_value(value) for name, value in content.items() if name[:2] != "__"}

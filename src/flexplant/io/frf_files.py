@@ -39,6 +39,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     path : str or Path
         The file, written atomically.
     frf : Frf
+        Frequency responses to write.
     units : mapping {channel: unit}, optional
         Units of channels, such as {"y1": "rad", "u1": "N m"}. By default those of the Frf are
         written; where it has no units, N for inputs and, by the quantity of the Frf, m, m/s or

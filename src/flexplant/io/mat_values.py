@@ -70,7 +70,7 @@ def write_mat(
         content = {str(name): _struct_fields(item) for name, item in value.items()}
     else:
         content = _struct_fields(value)
-    file: Any  # the type stubs take names of files only
+    file: Any  # the type stubs only allow names of files
     with written(path) as file:
         scipy.io.savemat(file, content, oned_as="column", long_field_names=True)
 

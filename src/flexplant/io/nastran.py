@@ -30,7 +30,7 @@ from .tables import read_nodes_table
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
 _INCLUDE = re.compile(r"\s*INCLUDE\s+(?:'([^']*)'|\"([^\"]*)\"|([^\s$]+))", re.IGNORECASE)
 _END = re.compile(r"\s*ENDDATA\b", re.IGNORECASE)
-#: files within files, at most
+#: largest depth of files that include other files
 _DEEP = 20
 #: advice for two cards with the same number
 _DEFINED_ONCE = "Remove the card that is not of this run."
@@ -97,12 +97,12 @@ def basic_nodes(
 
 def _bulk_lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
     """Return (file, line number, text) of all lines, those of INCLUDEd files in their place."""
-    # ENDDATA, in whatever file, ends all of them
+    # ENDDATA ends the whole input, also in an included file
     found = []
     continued = ""
     for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
         joined = continued + (line.lstrip() if continued else line)
-        # the name may go on in the next line, until its quote is closed
+        # the name may continue in the next lines, until its quote is closed
         continued = joined.rstrip() if _goes_on(joined) else ""
         match = None if continued else _INCLUDE.match(joined)
         if match is None:
@@ -311,9 +311,10 @@ class Block:
 
 def blocks(content: bytes, path: str) -> Iterator[Block]:
     """Yield the data blocks of a file."""
-    # format: MSC Nastran DMAP Programmer's Guide, OUTPUT2. Fortran records, of which those of one
-    # word are keys: above 0 as many words follow as the next record, below 0 a logical record ends,
-    # 0 ends a data block, and once more the file. Each logical record begins with its kind
+    # format: MSC Nastran DMAP Programmer's Guide, OUTPUT2. The file consists of Fortran records. A
+    # record of one word is a key: above 0 it is the number of words of the next record, below 0 it
+    # ends a logical record, 0 ends a data block, and a second 0 ends the file. Each logical record
+    # begins with its kind
     order, size = _word_layout(content, path)
     at, pieces, records = 0, list[bytes](), list[bytes]()
     while at < len(content):
@@ -323,7 +324,7 @@ def blocks(content: bytes, path: str) -> Iterator[Block]:
         key = int(np.frombuffer(piece, f"{order}i{size}")[0])
         if key > 0:
             piece, after = _record(content, at, order, path)
-            # columns of matrices, of kind 1, count numbers of two words
+            # keys of matrix columns (kind 1) count numbers, which may have two words each
             column = len(records) > 2 and pieces and any(pieces[0])
             if len(piece) != key * size and not column:
                 what = f"byte {at}: a record of {len(piece)} bytes for {key} words of {size}"
@@ -334,7 +335,7 @@ def blocks(content: bytes, path: str) -> Iterator[Block]:
             records.append(b"".join(pieces))
             pieces = []
         else:
-            # name, trailer and header, the last one and all data behind the word of their kind
+            # the first records are name, trailer and header; data follow, after a word for the kind
             if len(records) > 2 and len(records[0]) == 2 * size:
                 name = _letters(records[0], size)
                 yield Block(name, [record[size:] for record in records[3:]], order, size)
@@ -374,16 +375,16 @@ def _letters(record: bytes, size: int) -> str:
     return text.replace("\0", " ").strip()
 
 
-#: approach (real eigenvalues) and table (eigenvectors, real numbers, mode by mode)
+#: codes of the approach (real eigenvalues) and of the table (real eigenvectors, mode by mode)
 _APPROACH, _TABLE = 2, 7
-_IDENT = 146  # words of the record before the numbers
-#: cards of nodes and of coordinate systems in GEOM1, by the first of the three words that a record
-#: begins with, whose second is a hundredth of the first; and the third
+_IDENT = 146  # number of words of the record before the numbers
+#: cards of nodes and of coordinate systems in GEOM1. A record begins with three words: the first is
+#: the key of this table, the second is a hundredth of the first, and `_THIRD` holds the third
 _NUMBERED = {4501: "GRID", 2101: "CORD2R", 2001: "CORD2C", 2201: "CORD2S"}
 _THIRD = {"GRID": 1, "CORD2R": 8, "CORD2C": 9, "CORD2S": 10}
-#: what the third word has more where real numbers have 8 bytes
+#: number that is added to the third word if real numbers have 8 bytes
 _DOUBLE = {kind: 1_120_000 if kind == "GRID" else 2_220_000 for kind in _THIRD}
-#: cards by the three words, and the bytes of their real numbers; None: of the words of the file
+#: card by its three words, and number of bytes of its real numbers (None: as a word of the file)
 _CARDS = {
     (first, first // 100, _THIRD[kind] + more): (kind, size)
     for first, kind in _NUMBERED.items()
@@ -417,7 +418,7 @@ def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
     )
 
 
-#: codes of the kind of results in the record before the numbers, and the kinds
+#: kind of results by its code in the record before the numbers
 _APPROACHES = {
     1: "static displacements",
     5: "frequency responses",

@@ -112,9 +112,9 @@ def _matrix(
     places: list[tuple[int, int]],
 ) -> Any:
     """Return one matrix from the places of its columns."""
-    # a column is (column, first row, words of data) and then the values; the first row is 0 where
-    # it is sparse, and the data are strings, each with a header: (L + 1, row) in the big form, row
-    # + 65536 (L + 1) in the other, for L words of values
+    # a column begins with (column, first row, number of words); the values follow. In a sparse
+    # matrix the first row is 0, and the values are in strings with a header each: for L words of
+    # values (L + 1, row) in the big form, and row + 65536 (L + 1) in the other form
     size, dtype = words.integer, np.dtype(words.real[0] if kind in (1, 3) else words.real[1])
     per = dtype.itemsize * (2 if kind > 2 else 1)
     value: Any = np.dtype(f"{words.order}c{per}") if kind > 2 else dtype
@@ -157,10 +157,11 @@ def _placed(
     *,
     sparse: bool,
 ) -> Any:
-    """Return the matrix of strings of numbers: each its column and first row (from 1), its length.
+    """Return a matrix from strings of numbers, given by column, first row (from 1) and length.
 
-    The numbers stand one behind the other, an array for each string of a dense matrix. It is sparse
-    too where it would be too large for the numbers that the file holds of it.
+    Numbers are in the order of the strings, with a separate array for each string of a dense
+    matrix. The matrix is also sparse if a dense one would be very large for the numbers in the
+    file.
     """
     column, row, count = strings
     if not sparse and shape[0] * shape[1] <= max(_SMALL, _TIMES * int(count.sum())):
@@ -223,7 +224,7 @@ def _broken(path: str, at: int, name: str) -> FlexplantError:
     return damaged(path, what, "Write it again (above 65535 rows with BIGMAT=YES).")
 
 
-#: digits of single precision (types 1 and 3), however many are printed
+#: number of digits of single precision (types 1 and 3), even if more are printed
 _SINGLE = 7
 _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
@@ -241,7 +242,7 @@ def text_matrices(content: bytes, path: str) -> list[tuple[str, Any, int, int]]:
 
 @dataclass
 class _Reader:
-    """Goes through the lines; `at` is the next one (from 0)."""
+    """A reader of lines; `at` is the position of the next line, from 0."""
 
     lines: list[bytes]
     path: str
@@ -391,7 +392,7 @@ _SMALL = 2**20
 _TIMES = 16
 
 
-#: a matrix of the file: dense where the file holds it dense, real or complex
+#: a matrix of the file, real or complex; dense if the file stores it as dense
 Op4Matrix: TypeAlias = Any
 _ENDINGS = ("AA", "AAX", "GG", "XX", "FF", "LL", "2GG", "TT", "")
 

@@ -110,7 +110,7 @@ def read_dmig(
     K, M, D = (None if name is None else blocks[name] for name in names)
     assert K is not None  # noqa: S101 - its name is known
     given = [part for part in (K, M, D) if part is not None]
-    # a DOF as one number: 16 node + component
+    # a DOF is coded as one number: 16 node + component
     codes = [code for part in given for code in (part.rows, part.columns)]
     if "VAX" in blocks:
         codes.append(blocks["VAX"].rows)
@@ -142,12 +142,12 @@ def read_dmig(
 
 @dataclass
 class _Block:
-    """One matrix: codes 16 node + component of rows and columns, and values."""
+    """One matrix: values with the codes (16 node + component) of rows and columns."""
 
     name: str
     form: int
     kind: int
-    size: int  # columns that the header announces; 0 where it does not
+    size: int  # number of columns in the header; 0 if not stated
     rows: IntArray
     columns: IntArray
     values: FloatArray
@@ -230,7 +230,7 @@ def _read_block(
 
 
 def _large(part: list[bytes], first: int, real: bool, path: str) -> Any:
-    """Return columns, rows, values of cards in large fields, all at once."""
+    """Return columns, rows and values of all cards in large fields, in one step."""
     # of a real matrix the last field, the imaginary part, must be empty or 0
     table = np.frombuffer(b"".join(line[:72].ljust(72) for line in part), np.uint8)
     table = table.reshape(-1, 72)
@@ -287,7 +287,7 @@ def _error_at_line(
 
 
 def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any:
-    """Return columns, rows, values of cards in small or free fields, line by line."""
+    """Return columns, rows and values of cards in small or free fields, line by line."""
     columns, rows, values, words = list[int](), list[int](), list[float](), list[bytes]()
     column, started = 0, False
     for at, line in enumerate(part, first):

@@ -16,14 +16,14 @@ from .record_channels import RecordedChannels
 from .unit_labels import plain_label, seconds_of, unit_of
 
 _TIME = {"time", "t", "zeit", "seconds", "sec", "x_value", "x-value", "timestamp", "elapsed time"}
-#: a unit in brackets behind a name
+#: a name with its unit in brackets
 _UNIT = re.compile(r"(.*?)\s*[\[(]([^\[\]]*)[\])]")
 _RATE = re.compile(
     r"(?:sampl\w*[\s_-]*(?:rate|freq\w*)|\bfs\b)[^0-9\n]*?([0-9][0-9.,eE+]*)\s*(k?)(?:hz)?",
     re.IGNORECASE,
 )
-#: ratio of a step to the usual one above which samples are missing: rounding to two digits gives
-#: 1.5
+#: ratio of a step to the usual step above which samples are missing; rounding of the times to two
+#: digits gives ratios up to 1.5
 _GAP = 1.75
 
 
@@ -92,7 +92,7 @@ def _cells(line: str, mark: str) -> list[str]:
 
 
 def _titles(line: str, mark: str, width: int) -> list[str]:
-    """Return the cells of a line of titles, none of one that has another number of them."""
+    """Return the cells of a line of titles; empty if their number is not that of the columns."""
     cells = [cell.strip().strip('"') for cell in (line.split(mark) if mark else line.split())]
     ends = len(cells) == width + 1 and not cells[-1]
     return cells[:width] if (len(cells) == width or ends) and any(cells) else []
@@ -139,7 +139,7 @@ def _even_rate(time: FloatArray, path: Path, first: int) -> tuple[float, float]:
             f"{steps[k]:.6g} s before line {first + k + 2}. Fill the gap, or leave out the column "
             "of times and say rate=... where they are those of a clock that jitters."
         )
-    # rates are round numbers, which printed digits miss by their rounding
+    # rates are usually round numbers, but rounded times give slightly different ones
     rate, doubt = 1.0 / float(step), 10.0**-digits / float(time[-1] - time[0])
     round_ones = (round(rate, -n) for n in range(6, -1, -1))
     near = (one for one in round_ones if abs(one / rate - 1.0) <= doubt)

@@ -84,8 +84,8 @@ def from_triplets(
     twice = np.count_nonzero(np.unique(i * n + j, return_counts=True)[1] > 1)
     if twice:
         raise damaged(path, f"entries stored twice: {twice} (several steps?)")
-    # with unsorted labels the entries of one half may lie on both sides, but none has its mirror
-    # image
+    # if labels are not sorted, the entries of one triangle may lie on both sides of the diagonal,
+    # but an entry and its mirror image are never both listed
     return completed(sp.coo_array((values, (i, j)), shape=(n, n)), "a matrix")[0]
 
 

@@ -36,7 +36,7 @@ from .uff_records import (
 )
 from .uff_systems import is_permutation, turning, uff_nodes
 
-#: of dataset 164: numbers divided by them are in SI
+#: names of the factors in dataset 164: numbers divided by these factors are in SI
 _FACTORS = ("length", "force")
 _UNIVERSAL = (".uff", ".unv", ".uf")
 

@@ -17,15 +17,15 @@ from .files import ONCE, damaged, refused, spaced_numbers, unread
 from .uff_records import KINDS, datasets, derivative, rotation_units, whole_entry
 from .uff_systems import UffNodes
 
-#: of dataset 2414: lines of records 1 to 13
+#: number of lines of records 1 to 13 in dataset 2414
 _HEAD = 13
-#: data characteristics that are motions: 3 or 6 numbers of each node
+#: codes of data that are motions, each with its number of values per node, 3 or 6
 _MOTIONS = {2: 3, 3: 6}
 _AT_NODES = 1
 _COMPLEX = (5, 6)
-#: kinds of analysis
+#: codes of analysis types
 NORMAL_MODE, COMPLEX_MODES, FREQUENCY_RESPONSE = 2, (3, 7), 5
-#: kinds of results
+#: code of the result type
 DISPLACEMENT = 8
 
 
@@ -43,7 +43,7 @@ class AnalysisData(NamedTuple):
     eigenvalue: complex
     nodes: IntArray
     motions: FloatArray | ComplexArray
-    #: zero where nothing was measured, as test software does
+    #: whether test software wrote it: zeros then mean DOFs that were not measured
     measured: bool = False
 
     @property

@@ -16,7 +16,7 @@ from .coordinate_systems import BASIC, CARTESIAN, CYLINDRICAL, SPHERICAL, System
 from .files import damaged, defined_twice, parsing, refused, unread
 from .uff_records import datasets
 
-#: types of dataset 2420; those of dataset 18 are described nowhere, but for 0
+#: codes of coordinate systems in dataset 2420; of those of dataset 18 only 0 is documented
 _TYPES = {0: CARTESIAN, 1: CYLINDRICAL, 2: SPHERICAL}
 _EXPORT = "Export nodes and results in global coordinates and directions."
 

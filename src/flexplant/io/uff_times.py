@@ -16,13 +16,13 @@ from .uff_systems import is_permutation, turning, uff_nodes
 from .unit_labels import density_of
 
 _TIME, _DENSITY = 1, 9
-#: function types of records 58: what they hold, and what reads them
+#: content of dataset 58 by its function type, and the function that reads it
 _FUNCTIONS = {
     _TIME: ("time record", "read_records"),
     4: ("frequency response", "read_frf_uff"),
     _DENSITY: ("power spectral density", "read_spectra"),
 }
-#: specific data type of a force
+#: code of the data type of a force
 _FORCE = 13
 UNIVERSAL = (".uff", ".unv", ".uf")
 

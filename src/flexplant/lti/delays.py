@@ -73,6 +73,7 @@ class Delayed(Value):
         num, den : arrays
             Coefficients, the highest power first.
         delay : float [s]
+            Time by which the signal is delayed.
         """
         above = np.trim_zeros(np.atleast_1d(real_array(num, "num")), "f")
         below = np.trim_zeros(np.atleast_1d(real_array(den, "den")), "f")

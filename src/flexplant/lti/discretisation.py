@@ -27,6 +27,7 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
     sys : StateSpace
         A continuous system: a weight or a controller; for a plant use `discretized`.
     rate : float [Hz]
+        Sampling rate.
     prewarp : float [Hz], optional
         The frequency at which the response is kept.
 

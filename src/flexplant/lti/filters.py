@@ -84,6 +84,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     sys : StateSpace or control.StateSpace
         Continuous, one input, one output: a filter or a controller; for a plant use `discretized`.
     rate : float [Hz]
+        Sampling rate.
     at : float [Hz]
         Frequency at which the gain is matched; not 0 for a filter that integrates or
         differentiates.
@@ -361,6 +362,7 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     Parameters
     ----------
     delay : float [s]
+        Time by which the signal is delayed.
     order : int
         Number of states, 1 to 12; the phase is accurate up to about ``order / (6 delay)`` Hz.
 

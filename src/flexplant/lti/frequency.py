@@ -178,6 +178,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     freq : (n_freq,) array [Hz]
         Increasing, not negative.
     data : (n_out, n_in, n_freq) complex array [output unit / input unit]
+        Responses, by output, input and frequency.
     inputs, outputs : sequences of str, optional
         Names; `u1`..., `y1`... when not given.
     quantity : str, optional

@@ -41,6 +41,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
+        System whose poles determine the frequencies.
     points : int
         Largest number of points. 64 channels of 24 lightly damped modes need about 3500.
     tolerance : float

@@ -287,6 +287,7 @@ def connect(
     Parameters
     ----------
     systems : sequence of StateSpace
+        Systems to connect.
     inputs : sequence of str
         Outer inputs; each drives every block input of its name.
     outputs : sequence of str

@@ -34,6 +34,7 @@ def discretized(
     sys : StateSpace
         A continuous system.
     rate : float [Hz]
+        Sampling rate.
     delay : float [samples]
         Delay of the inputs; its integer part adds this number of states per delayed input, and a
         fraction adds one more.

@@ -36,10 +36,13 @@ class TimeResponse(Value):
     Parameters
     ----------
     time : (n_time,) array [s]
+        Instants of the samples.
     data : (n_out, n_in, n_time) array
         Signals in the units of the outputs. `lsim` drives all inputs together: n_in is then 1.
     outputs, inputs : sequences of str
+        Names of the outputs and inputs.
     units : mapping {channel: unit}, optional
+        Unit of each channel.
 
     Examples
     --------
@@ -84,6 +87,7 @@ def step(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
+        System whose response is computed.
     time : (n_time,) array [s], optional
         Equidistant instants from 0; for a sampled system its sampling instants.
     duration : float [s], optional
@@ -127,6 +131,7 @@ def impulse(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
+        System whose response is computed.
     time : (n_time,) array [s], optional
         As in `step`.
     duration : float [s], optional
@@ -178,6 +183,7 @@ def lsim(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
+        System whose response is computed.
     u : (n_in, n_time) or (n_time,) array
         Inputs in their units; a single row for one input.
     time : (n_time,) array [s]
@@ -276,6 +282,7 @@ def step_info(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
+        System whose response is computed.
     output, input : str, optional
         The channel; by default the only one.
     band : float

@@ -69,6 +69,7 @@ def solve_modes(
     Parameters
     ----------
     model : FEModel
+        Structure whose modes are computed.
     count : int, optional
         Number of modes, rigid-body modes included. When it cuts a repeated pair, one arbitrary
         shape of the pair is kept.

@@ -90,6 +90,7 @@ class StandardPlant(Partition):
         Parameters
         ----------
         rate : float [Hz]
+            Sampling rate.
         delay : float [samples]
             Delay from a measurement to the reaction of the actuators, including
             fractions. With at least one sample of delay the controller has the whole
@@ -484,6 +485,7 @@ def assemble_plant(
         The structure. The `realisation` of a plant is also accepted: the modes are then not solved
         again.
     ports : Ports
+        Disturbances, actuators, points of interest, sensors and references of the machine.
     evaluation : Modes, FEModel, ReducedModel or StandardPlant, optional
         Larger model of the same machine, on which results are checked, with the modes that `model`
         lacks. Every plant made from this one has it too, and every filter, controller, loop, score

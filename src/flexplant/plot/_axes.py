@@ -27,9 +27,9 @@ from .coinciding_curves import widen_hidden
 
 #: number of points along a line that a legend must not cover
 _DENSE = 500
-#: of ten, of the sizes that prefixes are for
+#: powers of ten for which SI prefixes are used
 _POWERS = range(-36, 19)
-#: what a unit measures
+#: quantity that is measured in a unit
 _QUANTITY = {
     "m": "displacement",
     "rad": "rotation",
@@ -52,7 +52,7 @@ def axes(ax: Axes | None, **figure: Any) -> Axes:
     return drawn
 
 
-#: largest number of lines on one axes that overlap, and that styles distinguish
+#: largest number of lines that may overlap on one axes, and largest number of lines in a legend
 TOGETHER, _LEGEND = 4, 6
 
 
@@ -433,9 +433,9 @@ def styles(
     return found
 
 
-#: range below the largest magnitude that is drawn; zeros at half the rate would extend it
+#: largest drawn range of a magnitude [dB]; zeros at half the rate would extend it
 _DEPTH = 160.0
-#: fraction of the decades that may lie below the axis, and margin below the others
+#: fraction of the decades in which a line may lie below the axis, and margin [dB] below the rest
 _SHARE, _MORE = 0.03, 15.0
 
 
@@ -539,7 +539,7 @@ def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height
 
 
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:
-    """Return 20 log10 of sizes; zero is far below all."""
+    """Return 20 log10 of magnitudes; zero gives a value far below all others."""
     return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), TINY)))
 
 
@@ -571,7 +571,7 @@ def readable(ax: Axes) -> None:
 
 
 def _depth(line: FloatArray) -> float:
-    """Return the level below which a line is over `_SHARE` of its decades."""
+    """Return the level below which a line lies in the fraction `_SHARE` of its decades."""
     decades = np.log10(line[:, 0])
     levels = np.interp(np.linspace(decades[0], decades[-1], 400), decades, line[:, 1])
     return float(np.quantile(levels, _SHARE))
@@ -595,5 +595,5 @@ def shared_reference(response: Frf) -> str:
 
 
 def reference_of(unit: str | None) -> str:
-    """Return the text of 0 dB: one of the unit of a gain."""
+    """Return the text for 0 dB: a gain of one, with its unit."""
     return "1" if unit in (None, "1") else f"1 {unit}"

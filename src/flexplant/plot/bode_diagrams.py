@@ -149,6 +149,7 @@ def singular_values(
     ----------
     systems, freq : as for `bode`
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------
@@ -202,6 +203,7 @@ def frf(
     responses : mapping {label: Frf or system}
         What to compare.
     output, input : str
+        Names of the output and the input that are drawn.
     colors : mapping {label: color}, optional
         Colours of some lines.
     unit : str, optional

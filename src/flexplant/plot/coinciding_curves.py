@@ -11,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from ..arrays import FloatArray
 
-#: distance [pixels] below which two curves look like one, and the fraction of the shorter curve
-#: that must be so near
+#: distance [pixels] below which two curves look like one, and least fraction of the shorter curve
+#: within this distance
 _NEAR, _MOST = 1.5, 0.8
-#: points along a curve that are compared, and curves in one picture that are compared at most
+#: number of points of a curve that are compared, and largest number of compared curves
 _POINTS, _CURVES = 1500, 12
-#: width [points] that a curve shows on both sides of the one above it
+#: width [points] by which a lower curve extends on both sides of the one above it
 _RIM = 1.3
 
 

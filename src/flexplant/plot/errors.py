@@ -50,6 +50,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     most : int
         Number of sources that are drawn separately, the largest first; the others form one area.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------
@@ -118,6 +119,7 @@ def spectra(
     colors : mapping {label: color}, optional
         Colours of some lines.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -196,6 +198,7 @@ def exposures(
     exposures : (k, 2) array [s], optional
         Beginning and end of each exposure, such as `SetPointProfile.exposures`.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------
@@ -259,6 +262,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     what : str
         "ma" or "msd".
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------

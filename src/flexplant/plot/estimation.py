@@ -57,6 +57,7 @@ def predictions(
     unit : str
         SI unit of the errors; a prefix is chosen.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -121,6 +122,7 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     channel : str, optional
         A POI's motion; by default the first.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -188,6 +190,7 @@ def estimate(
     deviations : float
         Half the width of the band.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------
@@ -254,7 +257,7 @@ def _draw_row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
             markersize=9, markeredgewidth=2.0)  # fmt: skip
 
 
-#: windows of the mean NIS over a record, and samples in one at least
+#: number of windows for the mean NIS of a record, and least number of samples in a window
 _WINDOWS, _SHORTEST = 60, 20
 
 
@@ -281,6 +284,7 @@ def consistency(
     level : float
         Confidence level of the bounds.
     ax : three Axes, optional
+        Three axes to draw on; by default those of a new figure.
 
     Returns
     -------

@@ -45,6 +45,7 @@ def stabilisation(
     frf : Frf, optional
         Response whose sum over all channels is drawn in the background.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Examples
     --------
@@ -89,10 +90,13 @@ def identified(
     Parameters
     ----------
     frf : Frf
+        Measured frequency responses.
     modes : IdentifiedModes
         Identified from it.
     output, input : str
+        Names of the output and the input that are drawn.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------

@@ -79,6 +79,7 @@ def nyquist(
     reach : float
         Largest real and imaginary part of the picture.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------
@@ -188,6 +189,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     zeros : bool
         Whether invariant zeros are drawn too, as circles.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -260,9 +262,9 @@ def _draw_roots(ax: Axes, roots: ComplexArray, marker: str, color: str, label: s
     ax.plot(freq[ratio < 0], ratio[ratio < 0], marker, **unstable)
 
 
-#: functions that weights limit
+#: sensitivity functions that weights can limit
 _LIMITED = ("S", "T", "KS")
-#: a frequency axis and sizes over it
+#: a frequency axis, and magnitudes at its frequencies
 _Line = tuple[FloatArray, FloatArray]
 
 
@@ -294,6 +296,7 @@ def sensitivity(
     freq : (n_freq,) array [Hz], optional
         Frequencies for pairs of plant and controller; by default a grid of each.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------

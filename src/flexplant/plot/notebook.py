@@ -32,7 +32,7 @@ from .run_pictures import response
 from .shapes import layout
 from .updating import parameters
 
-#: dots per inch of pictures
+#: resolution of pictures [dots per inch]
 _DPI = 80
 
 

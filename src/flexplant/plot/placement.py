@@ -53,6 +53,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ports : Ports, optional
         Existing sensors and actuators, and POIs, if their places are points.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -114,6 +115,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     found : ParetoCurve
         Curve from `flexplant.placement.pareto_curve`.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------

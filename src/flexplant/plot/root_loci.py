@@ -32,6 +32,7 @@ def root_locus(sys: System, gains: npt.ArrayLike | None = None, *, ax: Axes | No
     gains : (n,) array, optional
         Positive gains k; when not given 1e-3 to 1e3.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------

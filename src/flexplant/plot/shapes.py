@@ -76,6 +76,7 @@ def mode_shape(
         stiffness matrix of a model joins, or between the nodes with these numbers, such as those
         at the ends of each element in the file of the model.
     ax : Axes3D, optional
+        Axes to draw on, in three dimensions; by default those of a new figure.
 
     Raises
     ------
@@ -171,7 +172,7 @@ class _Moving:
 
 
 def _subtriangles(count: int) -> FloatArray:
-    """Return the corners (count^2, 3, 3) of equal parts of a triangle, in shares of its corners."""
+    """Return corners (count^2, 3, 3) of equal parts of a triangle, in barycentric coordinates."""
     upright = [(i, j) for i in range(count) for j in range(count - i)]
     turned = [(i, j) for i, j in upright if i + j < count - 1]
     corners = [[(i, j), (i + 1, j), (i, j + 1)] for i, j in upright]
@@ -187,17 +188,16 @@ def real_motion(motion: ComplexArray | FloatArray) -> ComplexArray | FloatArray:
     return np.asarray(motion * np.exp(-0.5j * np.angle(np.sum(motion**2))))
 
 
-#: (n_dof,) or (n, 3), real or complex
+#: a mode shape as an array (n_dof,) or (n, 3), real or complex
 Shape: TypeAlias = Any
 
-#: largest number of nodes of a picture that is drawn within seconds
+#: largest number of nodes that can be drawn within seconds
 MOST = 30_000
-#: length of edges relative to the distance between nodes above which they do not belong to the
-#: surface
+#: an edge longer than this number of distances between nodes does not belong to the surface
 _REACH = 2.5
-#: least fraction of the nodes that a surface holds; with less the nodes are those of a frame
+#: least fraction of the nodes on the surface; with fewer the structure is drawn as a frame
 _WHOLE = 0.6
-#: cosine of the angle between faces, below which their edge is one of the body
+#: cosine of the angle between two faces below which their common edge is drawn
 _EDGE = 0.8
 
 
@@ -227,8 +227,8 @@ class Surface(NamedTuple):
 
 def surface_of(dofs: DofSet, joined: Any = None) -> Surface:
     """Return the surface of a structure, by Delaunay's triangulation of its nodes, or its lines."""
-    # edges much longer than the distance between nodes are left out: holes and notches stay open
-    # where they are wider than two elements, half an element of their corners is filled
+    # edges much longer than the distance between nodes are left out, so that holes and notches
+    # wider than two elements stay open; their corners are filled by half an element
     numbers, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
     if numbers.size > MOST:
         raise ModelError(
@@ -357,6 +357,7 @@ def layout(
     marked : mapping {text: place}, optional
         Further places to name.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Raises
     ------

@@ -62,6 +62,7 @@ def localisation(
     dofs : DofSet, optional
         DOFs of the model.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -176,6 +177,7 @@ def update(
     Parameters
     ----------
     fit : UpdateResult
+        Result of `fx.update`.
     before : ReducedModel or FEModel
         The model that was updated.
     residuals : sequence of Residual
@@ -357,9 +359,11 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     Parameters
     ----------
     fit : UpdateResult
+        Result of `fx.update`.
     measured : (m,) complex array [rad/s]
         Measured eigenvalues, in the same order.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -403,7 +407,9 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     fit : UpdateResult
+        Result of `fx.update`.
     ax : Axes, optional
+        Axes to draw on; by default those of a new figure.
 
     Returns
     -------
@@ -433,6 +439,7 @@ def parameters(
     Parameters
     ----------
     fit : UpdateResult
+        Result of `fx.update`.
     truth : dict, optional
         True values, drawn as wide lines.
     axs : list of Axes, optional

@@ -383,6 +383,7 @@ class ReductionQuality(Value):
     condition : float
         Condition number of the matrix that the method inverted.
     inputs, outputs : sequence of str
+        Names of the inputs and outputs.
     route : str
         Method by which the full responses were found.
     full_error : float

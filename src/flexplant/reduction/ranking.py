@@ -37,6 +37,7 @@ class ModeRanking(Value):
     modes : (m,) array of int
         Mode numbers, from 1.
     freq : (m,) array [Hz]
+        Frequencies of the modes.
     values : (m, p, q) array [m/N]
         Modal Hankel values of each mode from each of q inputs to each of p outputs,
         ``|c b| / (4 zeta omega^2)``.
@@ -49,6 +50,7 @@ class ModeRanking(Value):
         first; two for each mode, close to its `total` when damping is low and modes are well
         separated.
     inputs, outputs : sequence of str
+        Names of the inputs and outputs.
 
     Examples
     --------

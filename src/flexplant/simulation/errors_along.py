@@ -52,6 +52,7 @@ class PathRms(Value):
     Parameters
     ----------
     time : (n_time,) array [s]
+        Instants of the samples.
     rms : (n_channels, n_time) array
         Standard deviation of each channel, in its unit.
     names : sequence of str
@@ -191,6 +192,7 @@ class PathFilters(Value):
     Parameters
     ----------
     time : (n_time,) array [s]
+        Instants of the samples.
     names : sequence of str
         Motions of POIs, such as `die:z`.
     exact, scheduled, frozen : (n_names, n_time) arrays [m or rad]

@@ -276,6 +276,7 @@ class ErrorMap(Value):
     axis, unit : str
         Direction of the error, and its SI unit.
     points : (p, 3) array [m]
+        Coordinates of the points.
     ma, msd : (p,) arrays [unit]
         Largest |MA| and MSD at each point.
     window : float [s]
@@ -325,6 +326,7 @@ def error_map(
     loop : ClosedLoop
         Loop around a sampled plant that was assembled from a structure.
     points : (p, 3) array [m]
+        Coordinates of the points.
     duration, noise, rng : as for `simulate`
     reference : signal, optional
         Reference along `axis` as for `simulate`; rest by default.

@@ -56,6 +56,7 @@ class Feedforward(Value):
     T : (nu, r) array
         Distribution of the forces of axes to actuators; the magnitudes of a column add to one.
     actuators : sequence of str
+        Names of the actuators.
     gains : (p, r, 5) array
         Gains of position, velocity, acceleration, jerk and snap; for one place, or for each of p
         places.

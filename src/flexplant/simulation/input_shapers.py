@@ -234,6 +234,7 @@ def quiet_setpoint(
     Parameters
     ----------
     distance : float [m or rad]
+        Distance of the move.
     velocity, acceleration : float [m/s, m/s^2]
         Bounds on the magnitudes.
     freq : float or (2,) array [Hz]

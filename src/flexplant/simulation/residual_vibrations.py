@@ -26,6 +26,7 @@ class ResidualVibration(Value):
     Parameters
     ----------
     channel : str
+        Name of the channel.
     freq, damping : (k,) arrays [Hz, 1]
         Modes of the closed loop, the largest amplitude first.
     amplitude : (k,) array

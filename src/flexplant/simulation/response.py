@@ -33,7 +33,9 @@ class Response(Value, Mapping[str, FloatArray]):
     time : (n_time,) array [s]
         Equidistant sampling instants.
     data : (n_channel, n_time) or (n_runs, n_channel, n_time) array
+        Samples of the channels, for one or several runs.
     names : sequence of str
+        Names of the channels.
     units : mapping {channel: unit}, optional
         SI units of the channels that have a known one.
     seed : int or tuple of int, optional

@@ -177,6 +177,7 @@ class WaferStage(Value):
         *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
             Observers and controllers that run on the machine.
         duration : float [s]
+            Duration of the run.
         reference : SetPointProfile, array or mapping, optional
         rng : int or Generator, optional
             Seed of the noise.

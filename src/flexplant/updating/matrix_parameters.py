@@ -83,6 +83,7 @@ class MatrixParameter(_GivenParameter):
     Parameters
     ----------
     name : str
+        Name of the parameter.
     dM, dD, dK : (k, k) or (n, n) array or sparse matrix, optional
         Symmetric matrices in the DOFs of the model or of the full structure.
     unit : str
@@ -232,6 +233,7 @@ class ModeDamping(Parameter):
     mode : int
         Number from 1, rigid-body modes included, of the undamped model that is updated.
     name : str, optional
+        Name of the parameter.
     bounds, prior : as for `AddedMass`
 
     Examples

@@ -55,6 +55,7 @@ class Sensitivities(Value):
     S : (m, q) complex array [rad/s per unit]
         ``S_ab = d lambda_a / d p_b``.
     parameters : sequence of q str
+        Names of the parameters.
     """
 
     modes: tuple[int, ...]

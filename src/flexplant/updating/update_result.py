@@ -133,8 +133,11 @@ class UpdateResult(Value):
     Parameters
     ----------
     parameters : sequence of q str
+        Names of the parameters.
     units : sequence of q str
+        Units of the parameters.
     values : (q,) array
+        Values of the parameters.
     covariance : (q, q) array or None
         Covariance of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], for any weights. Without:

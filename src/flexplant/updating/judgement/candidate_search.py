@@ -205,6 +205,7 @@ class Localisation(Value):
     Parameters
     ----------
     candidates : sequence of c str
+        Names of the candidates.
     values : (c,) array
         Value of each candidate if it were the only change; NaN if the fit failed.
     score : (c,) array

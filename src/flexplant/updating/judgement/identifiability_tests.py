@@ -26,6 +26,7 @@ class IdentifiabilityReport(Value):
     Parameters
     ----------
     parameters : sequence of q str
+        Names of the parameters.
     singular_values : (q,) array
         Singular values of the sensitivities, with each column scaled to length one: sqrt(q) to
         zero.
