@@ -24,9 +24,9 @@ class Verified(Value):
     figure : float
         The figure that was found.
     route : str
-        How it was computed; empty: by the method that gave the answer.
+        Method by which it was computed; empty if it is the method that gave the answer.
     limit : float, optional
-        The figure must be below this limit. None: the figure informs, nothing is required of it.
+        The figure must be below this limit. Without a limit the figure is only information.
     at_least : bool
         The figure must be above the limit instead.
 

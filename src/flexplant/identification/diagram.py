@@ -95,13 +95,13 @@ class StabilisationDiagram(Value):
     tracks : (n,) int array
         Number of the track of a pole; a pole that continues over the orders keeps its number.
     shapes, participation : (n_out, n), (n_in, n) complex array
-        Shapes and participation vectors of unit length; exchanged where there are fewer outputs
-        than inputs.
+        Shapes and participation vectors of unit length. With fewer outputs than inputs, `shapes`
+        holds the participation vectors and `participation` the shapes.
     band : (2,) array [Hz]
         Band of the listed poles.
     highest : (n,) int array
-        Highest model order of the part of the band in which a pole lies; a part with few lines has
-        fewer orders.
+        Highest model order at which a pole could be found. The band is analysed in parts, and a
+        part with few lines has a lower highest order.
     """
 
     orders: IntArray

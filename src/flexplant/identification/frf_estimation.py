@@ -148,10 +148,10 @@ def estimate_frf(
     Returns
     -------
     Frf
-        With `coherence` (multiple, the same for all inputs), `variance` E|error|^2 of every entry
-        and `correlation` of the errors of different outputs; these three are None for a single
-        period, which has no information on noise. It also stores the `resolution`, and the `window`
-        and `overlap` of segments.
+        Responses with `coherence` (multiple, the same for all inputs), `variance` E|error|^2 of
+        every entry and `correlation` of the errors of different outputs; these three are None for a
+        single period, which has no information on noise. It also stores the `resolution`, and the
+        `window` and `overlap` of segments.
 
     Warns
     -----

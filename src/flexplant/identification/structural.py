@@ -323,11 +323,11 @@ def shape_deviations(
 ) -> FloatArray:
     r"""Return the principal standard deviations of shapes from `structural_modes`.
 
-    The error n of a mode's identified shape and participation gives its shape at the places the
-    error :math:`A n`. A takes the mean where a place was both driven and measured, and expands over
-    a model's modes where they are given. For circular noise the real part has the covariance
-    :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are kept and
-    scaled so that the sum of all variances is preserved.
+    The error n of a mode's identified shape and participation causes the error :math:`A n` of the
+    mode shape. The matrix A takes the mean at places that were both driven and measured, and
+    expands over the modes of a model if they are given. For circular noise the real part has the
+    covariance :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are
+    kept and scaled so that the sum of all variances is preserved.
 
     Parameters
     ----------

@@ -40,14 +40,14 @@ class SpillOver(Value):
     Parameters
     ----------
     stability : float
-        Spectral radius of the sampled closed loop there, below 1 when stable; for a continuous loop
-        the largest real part [rad/s], below 0.
+        Spectral radius of the sampled closed loop on that plant, below 1 when stable; for a
+        continuous loop the largest real part [rad/s], below 0 when stable.
     sampled : bool
         Whether the loop is sampled.
     modulus_margin : float
-        Modulus margin there, broken at u; 0 when unstable.
+        Modulus margin on that plant, with the loop opened at u; 0 when unstable.
     without : float
-        Modulus margin on the plant itself, without these modes; 0 when unstable there.
+        Modulus margin on the plant without the truncated modes; 0 when unstable.
     peak_freq : float [Hz]
         Frequency at which |S| at u is largest with these modes; NaN when unstable.
     states : int

@@ -117,9 +117,10 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     reason : str
         Reason why it is not known.
     narrowest, near : float [Hz]
-        For a measured plant: the loop is stable if the plant has no hidden mode with a half-power
-        width below `narrowest`; `near` is the frequency of such a mode. 0 where the lines show all
-        modes, and for a model.
+        Only for a measured plant: a mode that is narrower than the distance of the measured
+        frequencies may be hidden between them. The loop is stable if no hidden mode has a
+        half-power width below `narrowest`; `near` is the frequency of such a mode. Both are 0 if
+        the frequencies are close enough to show all modes, and for a model.
     scaled_margin : float
         Modulus margin of all loops together with scaled axes, ``1 / max min_D sigma_max(D S D^-1)``
         (from the upper bound of mu with an uncertainty for each axis), to 2 %. It does not depend

@@ -291,11 +291,12 @@ def modulus_margin(loop: Loop) -> float:
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`. Stability is judged first. A model has poles. For a measured plant
-        unstable poles are counted as by `report_loops`, with a free motion for each direction with
-        slope 2 at its lowest lines and without unstable poles of the plant; the peak includes its
-        lines and the visible modes between them. Where the actuators have several units (N and N m)
-        it is the margin with scaled axes, `LoopReport.scaled_margin`.
+        As for `loop_gain`. Stability is judged first: for a model by its poles, and for a measured
+        plant by a Nyquist count as in `report_loops`. The count assumes that the plant has no
+        unstable poles, and that a direction whose response falls with the square of the frequency
+        at its lowest lines is a free motion. The peak of a measured plant includes its lines and
+        the visible modes between them. Where the actuators have several units (N and N m) it is the
+        margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------

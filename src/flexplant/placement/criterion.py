@@ -114,7 +114,7 @@ class OnBoth(Scorer):
 class Criterion(Value):
     """A function from a plant to a number, smaller is better; the base class of criteria.
 
-    A new criterion defines `__call__`, and where it can `check` and a `scorer` that is faster.
+    A new criterion defines `__call__`. It may also define `check`, and a faster `scorer`.
 
     Examples
     --------
@@ -133,10 +133,10 @@ class Criterion(Value):
         """Return the criterion on a plant."""
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Raise AssumptionError for what no choice among the candidates can repair."""
+        """Raise AssumptionError if no choice among the candidates satisfies the assumptions."""
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the scores of choices among candidates; what they share is computed once.
+        """Return an object that scores many choices; common results are computed once.
 
         The plant is sampled and assembled from a structure, the candidates are sensors, actuators
         or both.
@@ -144,11 +144,11 @@ class Criterion(Value):
         return OnPlant(plant, sides_of(candidates), tuple(candidates), self)
 
     def unit(self, plant: StandardPlant) -> str:
-        """Return the unit of its square root where it is a mean square of a motion; else ""."""
+        """Return the unit of the root of a value that is a mean square of a motion; else ""."""
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the interval of the ratio of its root to that of another plant, by machine.
+        """Return the interval of the ratio of the error to that of another plant, over machines.
 
         It is empty where the plant's machines are not known, or the criterion has no such root.
         """

@@ -228,14 +228,15 @@ class ModalGramian(Criterion):
 
 @dataclass(frozen=True, eq=False)
 class ModalObservability(ModalGramian):
-    """Minus a measure of the observability Gramian of the elastic modes, which sensors see.
+    """Negative measure of the observability Gramian of the elastic modes, for sensors.
 
     See `ModalGramian`. One row per sensor, in units of its noise where it has any.
 
     Parameters
     ----------
     measure : {"trace", "log det", "least"}
-        Sum of the eigenvalues, sum of their logarithms, or the least one.
+        Measure of the Gramian: the sum of its eigenvalues, the sum of their logarithms, or the
+        least eigenvalue.
 
     References
     ----------

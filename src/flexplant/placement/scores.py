@@ -353,17 +353,17 @@ class SensorMap(Value):
     Parameters
     ----------
     points : (n, 3) array [m]
-        Where the sensor was tried.
+        Points at which the sensor was tried.
     values : (n,) array
-        Scores, infinite where even with it a rigid-body mode is missed.
+        Scores with the sensor at each point; infinite if a rigid-body mode is still not observed.
     without : float
         The score of the plant's own sensors alone (infinite when they do not suffice).
     criterion : str
-        What was scored.
+        Name of the criterion.
     excluded : sequence of Rectangle or Disc
-        Zones in which nothing was tried.
+        Zones in which no sensor was tried.
     unit : str
-        Unit of the square roots of the values, where they are mean squares of a motion.
+        Unit of the square root of a value, if the values are mean squares of a motion.
     """
 
     points: FloatArray
@@ -414,19 +414,19 @@ def sensor_map(
     plant, criterion, executor, progress
         As for `score_sensors`; the plant's own sensors stay.
     points : (n, 3) array [m]
-        On the structure.
+        Points on the structure.
     asd : float [m/sqrt(Hz), ...]
         Noise of the new sensor, as in `Sensor`.
     direction, quantity : str
         Direction and quantity that it measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`: points at which a further sensor violates one are left out,
-        as are points on a POI unless OffPoi(-1) is among the constraints.
+        As for `place_sensors`. Points at which a further sensor violates a constraint are left out;
+        so are points on a POI, unless OffPoi(-1) is among the constraints.
 
     Returns
     -------
     SensorMap
-        In the order of the points that are not left out.
+        Scores in the order of the points that are not left out.
 
     Raises
     ------

@@ -58,14 +58,14 @@ _NO_MODES = ModalRealisation(
 
 @dataclass(frozen=True, eq=False)
 class PlantChannel(Value):
-    """A channel of foreign matrices, as a port: a row of C or a column of B without a place.
+    """A channel of imported state-space matrices as a port: a row of C or a column of B.
 
     Parameters
     ----------
     name : str
         Name of the channel.
     home : {"y", "u"}
-        Whether it is a sensor or an actuator.
+        Whether the channel is a sensor ("y") or an actuator ("u").
 
     Examples
     --------

@@ -69,8 +69,8 @@ class ModalDamping(Damping):
         mode.
     rigid : float [1/s]
         Decay rate of the velocity of rigid-body motions in ``FEModel.with_damping``.
-        `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose rigid-body
-        modes are at 0, refuses it.
+        `assemble_plant` accepts such a model, with dense matrices. `solve_modes` refuses it, since
+        it computes undamped rigid-body modes only.
 
     Examples
     --------
@@ -176,8 +176,8 @@ class ModalDamping(Damping):
 class Rayleigh(Damping):
     """Damping ``D = alpha M + beta K``: ratio ``alpha / (2 omega) + beta omega / 2``.
 
-    Rigid-body modes are left undamped unless stated: a free structure dissipates
-    nothing in them.
+    Rigid-body modes are undamped by default, since a free structure does not dissipate energy in
+    them.
 
     Parameters
     ----------
@@ -187,8 +187,8 @@ class Rayleigh(Damping):
         Factor of the stiffness-proportional damping.
     rigid : bool
         Whether alpha damps rigid-body motions too in ``FEModel.with_damping``; D is then exactly
-        ``alpha M + beta K``. `assemble_plant` takes such a model as it is, in dense form;
-        `solve_modes`, whose rigid-body modes are at 0, refuses it.
+        ``alpha M + beta K``. `assemble_plant` accepts such a model, with dense matrices.
+        `solve_modes` refuses it, since it computes undamped rigid-body modes only.
 
     References
     ----------

@@ -20,9 +20,9 @@ from .model import FEModel
 def slides(model: FEModel) -> dict[str, FloatArray]:
     """Return the motions without energy that are not rigid-body motions, each named by a DOF.
 
-    A drive moves a carriage on a guide, a joint or a screw, so that this motion is free. In an
-    imported model it is a zero-energy motion, which `solve_modes` refuses as a mechanism until it
-    is declared a slide.
+    A carriage on its guide, a joint or a screw moves without elastic energy; a drive controls this
+    motion. In an imported model it is a zero-energy motion, which `solve_modes` refuses as a
+    mechanism until `sliding` declares it a slide.
 
     Parameters
     ----------
@@ -32,7 +32,8 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
     Returns
     -------
     dict {label: (n,) array}
-        Each motion moves its own key's DOF by one unit, and the DOFs of the other keys not at all.
+        Motions by the label of a DOF. Each motion moves this DOF by one unit, and does not move the
+        DOFs of the other labels.
 
     Raises
     ------

@@ -189,10 +189,10 @@ def plate(
 
     The plate lies in the x-y plane with one corner at the origin and its middle plane at z = 0.
     Nodes are numbered from 1, x fastest; each has the DOFs z [m] and the rotations rx, ry [rad] of
-    the section, which are dz/dy and -dz/dx where nothing shears.
+    the section, which are dz/dy and -dz/dx without shear deformation.
 
-    Thickness and material are one number, an array (nx, ny) with one for each element, or a
-    function of the centre (x, y) of an element.
+    Thickness, density and the constants of the material may each be one number, an array (nx, ny)
+    with a number for each element, or a function of the centre (x, y) of an element.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def plate(
     youngs_modulus : float, (nx, ny) array or function [Pa]
         Young's modulus of the material.
     poisson_ratio : float, (nx, ny) array or function [-]
-        Above -1 and below 0.5.
+        Poisson's ratio, above -1 and below 0.5.
     shear_factor : float, optional
         k of the shear stiffness k G h; 5/6 for a plate whose shear stress is a parabola over the
         thickness. None: the plate does not shear, but its sections have inertia.
@@ -218,12 +218,13 @@ def plate(
     Returns
     -------
     FEModel
-        Sparse, without D, its DofSet interpolating with the element's own fields.
+        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
+        shape functions of the elements.
 
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, or there is not one for each element.
+        When a number is not physical, or an array has not one number for each element.
 
     See Also
     --------

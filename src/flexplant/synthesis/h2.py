@@ -26,11 +26,11 @@ from .structured.judges import require_finite_h2
 def design_h2(
     plant: AnyPlant | System, *, u: Sequence[str] | None = None, y: Sequence[str] | None = None
 ) -> Controller:
-    """Return the controller ``u = K y`` of least H2 norm from w to z: the rms of z for white w.
+    """Return the controller ``u = K y`` with the least H2 norm from w to z (rms of z for white w).
 
-    With X and Y of the Riccati equations of control and of estimation, F and L their gains and
-    ``R = D12' D12`` (sampled: ``+ B2' X B2``), the square of the least norm is (L0 = 0 for a
-    continuous plant)::
+    X and Y are the solutions of the Riccati equations of control and estimation, F and L their
+    gains, and ``R = D12' D12`` (sampled: ``+ B2' X B2``). For a continuous plant L0 is zero. The
+    square of the least norm is::
 
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1

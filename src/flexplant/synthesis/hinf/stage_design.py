@@ -73,9 +73,9 @@ def design_stage(
     mode is off by its uncertainty. The same holds on each of 20 machines drawn at random, and hence
     on a further one with a probability of 20/21 (95 %). The machines agree with the measurement
     (`StandardPlant.machines`) where the plant comes from a calibrated fit and no frequencies are
-    stated. Otherwise all their frequencies change at once by what is stated, their shapes with
-    them, and their dampings by 30 % unless stated. The certificate has the margin on the machines
-    of a fit as well.
+    stated. Otherwise all frequencies change simultaneously by their stated uncertainties, the
+    shapes change with them, and the damping ratios change by their stated uncertainties, or by 30 %
+    by default. The certificate has the margin on the machines of a fit as well.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def design_stage(
         slowest axis. The weights are adjusted to reach it within 1 %; without a reference they are
         those of 1.5 times the bandwidth. By default the largest possible bandwidth.
     margin : float
-        Least modulus margin, broken at u.
+        Least modulus margin, with the loop opened at u.
     poi : str, optional
         POI as for `stage_weights` and `reference_errors`.
     disturbance, effort : float

@@ -19,7 +19,7 @@ from ...store import Value
 
 @dataclass(frozen=True, eq=False)
 class BlockStructure(Uncertainty):
-    """The blocks of an M-Delta structure, as a kind of uncertainty of its nominal plant.
+    """The uncertainty of a system M whose channels are connected to blocks Delta.
 
     Parameters
     ----------
