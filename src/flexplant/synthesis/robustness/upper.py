@@ -174,7 +174,8 @@ def _descended(
         # the value is off by the square of it
         if not decrement > 1e-6:
             break
-        t = 1.0  # it lowers the value at the latest at 1 / (1 + decrement)
+        # full steps from afar lower it too, but end in scalings that hold at one frequency only
+        t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
         # shorter steps are rounding of x
         while t > 1e-10 and not (new := merit(x + t * step)) < value:  # a step of rounding
             t *= 0.5
