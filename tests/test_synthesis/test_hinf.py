@@ -293,8 +293,12 @@ def test_wrong_arguments_are_refused():
         design_hinf("plant", u=["u"], y=["y"])
     with pytest.raises(LabelError, match="'v'"):
         design_hinf(P, u=["v"], y=["y"])
-    with pytest.raises(ModelError, match="method must be"):
-        design_hinf(P, "riccati", u=["u"], y=["y"])
+    for method in ("riccati", Riccati):
+        with pytest.raises(ModelError, match="method must be"):
+            design_hinf(P, method, u=["u"], y=["y"])
+    for below in (-1.0, np.nan, "350"):
+        with pytest.raises(ModelError, match="damped_below"):
+            design_hinf(P, u=["u"], y=["y"], damped_below=below)
     plant = StandardPlant.from_statespace(P, u=["u"], y=["y"])
     with pytest.raises(ModelError, match="leave them out"):
         design_hinf(plant, u=["u"], y=["y"])

@@ -372,6 +372,23 @@ def test_robust_performance_of_an_uncertain_stiffness():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("den", [[1.0, 1e-4], [1.0, 0.0], [1.0, 0.0, 0.0]])
+@pytest.mark.parametrize(("low", "effort"), [(1e-5, 1e-4), (1e-6, 1e-3), (1e-6, 1e-4)])
+def test_weights_with_zeros_far_above_all_poles(den, low, effort):
+    """Integral action down to 1e-6 rad/s and a loop at 1e2 rad/s: nothing in between has a pole."""
+    found = design_hinf(mixed_sensitivity(tf([1.0], den), S=tf([0.5, 0.3], [1.0, low]), KS=effort))
+    s = 1j * np.geomspace(1e-3 * low, 1e6, 1000)
+    K = found.system
+    states = [np.linalg.solve(x * np.eye(K.n_states) - K.A, K.B[:, 0]) for x in s]
+    k = np.array(states) @ K.C[0] + K.D[0, 0]
+    S = 1.0 / (1.0 + k / np.polyval(den, s))
+    gains = np.hypot(np.abs((0.5 * s + 0.3) / (s + low) * S), np.abs(effort * k * S))
+    # S is 1 at infinite frequency, where its weight is 0.5: no gamma is smaller
+    assert 0.5 <= found.gamma < 0.53
+    assert gains.max() <= 1.001 * found.gamma
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["two lags", "double integrator", "distillation", "RHP zero"])
 def test_linear_matrix_inequalities(kind):
     assert judged(kind, 0, Lmi()).word == "right"

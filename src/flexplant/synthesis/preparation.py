@@ -1,4 +1,4 @@
-"""Plants made ready for synthesis: posed, scaled, and whether any controller stabilises them.
+"""Plants made ready for synthesis: scaled, and whether any controller stabilises them.
 
 Equations of machines in SI units (1e-9 m/N together with rates of 1e4 Hz) cannot be solved
 directly. A sampled plant is mapped to continuous time (bilinear, norms are kept), time is scaled to

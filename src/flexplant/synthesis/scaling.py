@@ -18,8 +18,8 @@ POINT = complex(np.exp(0.25j * np.pi))
 #: effort or noise that is smaller, relative to the plant's own response at the loop's speed, has no
 #: effect there: this amount is added where it is missing
 FELT = 1e-3
-#: relative to the fastest pole: where the search for the loop's speed ends. A double integrator has
-#: lost 14 digits there
+#: where the search for the loop's speed ends, relative to the fastest pole, or to the fastest zero
+#: where nothing settles before. A double integrator has lost 14 digits there
 _FAR = 1e7
 #: the same of a sampled plant [half the rate in rad/s, as mapped]: a third of the rate, since all
 #: answers are distorted above it
@@ -71,9 +71,44 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     sizes = np.abs(poles)[np.abs(poles) > error]
     if not sizes.size:
         return 1.0
-    start = _START * float(sizes.min())
-    far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
-    omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
+    start, fastest = _START * float(sizes.min()), float(sizes.max())
+    far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * fastest
+    found = _crossover(g, m1, p1, _points(start, far), fastest)
+    if found is None and not dt:
+        # the zeros of weights can lie far above all poles, and the crossover above these zeros
+        corner = _largest_corner(g, m1, p1)
+        if corner > fastest:
+            found = _crossover(g, m1, p1, _points(start, _FAR * corner), fastest)
+    return float(np.exp(np.mean(np.log(sizes)))) if found is None else found
+
+
+def _points(start: float, far: float) -> FloatArray:
+    """Return the frequencies [rad/s] of the search for the loop's speed."""
+    return np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
+
+
+def _largest_corner(g: StateSpace, m1: int, p1: int) -> float:
+    """Return a bound [rad/s] on the corners of the answers from u to z, and from w to y."""
+    # an answer is `m_k s^-(k+1) + m_(k+1) s^-(k+2) + ...` at high frequency: with its first Markov
+    # parameter m_k that is not rounding, its largest corner is about the largest
+    # `|m_(k+j) / m_k|^(1/j)`
+    unit, corner = float(np.linalg.norm(g.A)), 0.0
+    A = g.A / unit
+    for B, C in ((g.B[:, m1:], g.C[:p1]), (g.B[:, :m1], g.C[p1:])):
+        terms, moved, bound = [], B, np.abs(B)
+        for _ in range(len(A)):
+            found = np.abs(C @ moved)
+            terms.append(np.where(found > SAME * (np.abs(C) @ bound), found, 0.0).ravel())
+            moved, bound = A @ moved, np.abs(A) @ bound
+        for one in np.transpose(terms):
+            first, later = np.flatnonzero(one)[:1], np.flatnonzero(one)[1:]
+            ratios = (one[later] / one[first]) ** (1.0 / (later - first))
+            corner = max(corner, unit * float(np.max(ratios, initial=0.0)))
+    return corner
+
+
+def _crossover(g: StateSpace, m1: int, p1: int, omega: FloatArray, least: float) -> float | None:
+    """Return the frequency at which an answer first settles; None where no answer settles."""
     G = responses(g, omega / (2.0 * np.pi))
     # above the fastest pole and the last corner of all answers only gains grow
     plain = np.diff(_log_sizes(G - g.D[:, :, None], m1, p1)) * _POINTS
@@ -90,9 +125,7 @@ def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
     settled &= np.logical_or.accumulate(falls, axis=1)
     settled &= lowest > sizes_of[:, [last]] + np.log(SAME)
     found = [omega[np.argmax(one)] for one in settled if one.any()]
-    if not found:
-        return float(np.exp(np.mean(np.log(sizes))))
-    return float(min(*found, max(omega[last], sizes.max())))
+    return float(min(*found, max(omega[last], least))) if found else None
 
 
 def _log_sizes(G: ComplexArray, m1: int, p1: int) -> FloatArray:

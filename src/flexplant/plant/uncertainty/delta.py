@@ -22,6 +22,7 @@ class Delta(Value):
     range. Therefore [A B; C D] must be affine or linear fractional in the amount. The row of a
     sensor that moves is taken as linear between the ends:
     ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind with other channels overrides `opened`.
+    A change of M, D or K moves the modes, which is not affine: it is a parameter for `Parameters`.
 
     Parameters
     ----------

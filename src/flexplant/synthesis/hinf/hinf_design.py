@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...arrays import positive
 from ...certificates import Certificate, Verified
 from ...errors import CertificateError, ModelError, SolverError, counted, short
 from ...lti.interconnection import lft
@@ -125,12 +126,13 @@ def design_hinf(
     True
     """
     method = Riccati() if method is None else method
-    if not hasattr(method, "solve"):
+    if isinstance(method, type) or not hasattr(method, "solve"):
         raise ModelError(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     if progress is not None and isinstance(method, Riccati):
         method = method.replace(progress=progress)
+    positive(damped_below, "damped_below", zero=True)
     design, what = HinfDesign(method), "H-infinity synthesis"
     if isinstance(plant, Mapping):
         if uncertain is not None:

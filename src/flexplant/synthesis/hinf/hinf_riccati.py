@@ -58,9 +58,9 @@ class Riccati(Value):
     The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
     boundary. If a rank is missing, a little noise on each sensor and a little effort of each
     actuator are added, at most 1e-3 of the plant's own signals at the speed of its loop. If w or z
-    misses such a mode, or one that decays by less than 1e-4 of that speed, a little of w is added
-    at the actuators and a little of the sensors to z. The loop is verified without these additions.
-    The notes state what was added and what it costs in gamma.
+    misses such a mode, or one that decays by less than 1e-6 of that speed (1e-2 where several lie
+    together), a little of w is added at the actuators and a little of the sensors to z. The loop is
+    verified without these additions. The notes state what was added and what it costs in gamma.
 
     Parameters
     ----------

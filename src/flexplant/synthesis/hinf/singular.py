@@ -25,13 +25,13 @@ _RANK = 0.5
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
 LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
-#: gamma falls by so much from level to level where its infimum is zero
+#: where the infimum of gamma is zero, gamma falls at least to this fraction from level to level
 _FALL = 0.5
-#: and by so much in all
+#: and at least to this fraction from the first level to the last
 _SMALL = 2e-2
 #: a gamma that grows by less from one level to the next has settled, by more it is rounding
 _SETTLED = 1.2
-#: a fastest pole that grows so much when the level is a tenth has no limit
+#: a fastest pole that grows by more than this factor when the level is a tenth has no limit
 _GROWTH = 3.0
 
 
