@@ -9,7 +9,7 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.loop import in_axes, report_loops
-from flexplant.loop.broken import scaled_size
+from flexplant.loop.broken import peaking_size, scaled_size
 from flexplant.loop.report import loop_margins
 from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
 from flexplant.lti.interconnection import loop_poles
@@ -191,6 +191,24 @@ def test_the_scaling_of_axes_is_optimal():
         scaled = one * np.exp(logs[:, :, None] - logs[:, None])
         least = np.linalg.norm(scaled, 2, axis=(1, 2)).min()
         assert 0.98 * least < scaled_size(one[None])[0] < 1.025 * least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [2, 4])
+def test_the_largest_scaled_size_is_found_by_its_bounds(n):
+    """Against all points: coupled, nearly decoupled, one-way and mixed units; elsewhere below."""
+    rng = np.random.default_rng(n)
+    for coupling in (0.0, 1e-9, 1e-3, 1.0):
+        off = rng.standard_normal((20, n, n)) + 1j * rng.standard_normal((20, n, n))
+        own = rng.uniform(0.5, 2.0, (20, n)) * np.exp(1j * rng.uniform(-3.0, 3.0, (20, n)))
+        S = coupling * off + own[:, None] * np.eye(n)
+        S[::4] = np.triu(S[::4])
+        units = 10.0 ** rng.uniform(-1.5, 1.5, n)
+        every, found = scaled_size(S), peaking_size(units[:, None] * S / units)
+        assert found.max() == pytest.approx(every.max(), rel=1e-6)
+        assert peaking_size(S).max() == pytest.approx(every.max(), rel=1e-12)
+        assert peaking_size(S).argmax() == every.argmax()
+        assert np.all(found <= every * (1.0 + 1e-6))
 
 
 def body_with_modes(rng, axes):

@@ -207,18 +207,41 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     return size
 
 
+def least_scaled(S: ComplexArray) -> FloatArray:
+    """Return a lower bound of `scaled_size` of S (k, n, n): no scaling changes the diagonal."""
+    return np.asarray(np.abs(np.einsum("fii->fi", S)).max(axis=1))
+
+
+def peaking_size(S: ComplexArray) -> FloatArray:
+    """Return `scaled_size` of S (k, n, n), n > 1, where it may be the largest, else a lower bound.
+
+    With the two largest entries a and d of the diagonal and the Frobenius norm e of the rest, which
+    each step of the scaling lowers, it is at most the norm of [[a, e], [e, d + e]].
+    """
+    n, size = S.shape[-1], least_scaled(S)
+    rest = _d_scaled(S, _log_scaling(S, 2))
+    second = np.sort(np.abs(np.einsum("fii->fi", S)), axis=1)[:, -2]
+    rest[:, range(n), range(n)] = 0.0
+    e = np.linalg.norm(rest, axis=(1, 2))
+    high = 0.5 * (size + second + e) + np.hypot(0.5 * (size - second - e), e)
+    may = high > (1.0 + RANK) * size.max(initial=0.0)
+    if may.any():
+        size[may] = scaled_size(S[may])
+    return size
+
+
 def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
     return np.asarray(S * np.exp(log[:, :, None] - log[:, None, :]))
 
 
-def _log_scaling(S: ComplexArray) -> FloatArray:
+def _log_scaling(S: ComplexArray, steps: int = MOST_STEPS) -> FloatArray:
     """Return log D (k, n) of the least Frobenius norm: rows and columns have equal size."""
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
     power[:, range(n), range(n)] = 0.0
     # a coupling of 1e-12 of the whole is rounding; all sums are squares
     least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + TINY
-    for _ in range(MOST_STEPS if n > 1 else 0):
+    for _ in range(steps if n > 1 else 0):
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
             # it acts on others, and no loop acts on it

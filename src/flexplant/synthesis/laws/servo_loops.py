@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import ComplexArray, FloatArray
 from ...errors import LabelError, warn
 from ...loop.blocks import as_block
-from ...loop.broken import inverted, largest_sensitivity
+from ...loop.broken import inverted, least_scaled, peaking_size, sensitivity_size
 from ...lti.blocks_of_states import Matrices
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.response_solvers import responses
@@ -231,8 +231,17 @@ class ServoLoop:
         return len({self.plant.units.get(name) for name in self.plant.u}) > 1
 
     def _sizes(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> FloatArray:
-        """Return sigma_max(S_u) at some points; of an unstable loop too, so check that."""
-        return largest_sensitivity(self.gain(T, at, some), self._mixed)
+        """Return sigma_max(S_u) at some points, a lower bound where it is not the largest.
+
+        It says nothing of stability, so check that.
+        """
+        L = self.gain(T, at, some)
+        return peaking_size(inverted(L)) if self._mixed else sensitivity_size(L)
+
+    def _at_least(self, T: FloatArray, at: ComplexArray, some: Any) -> float:
+        """Return a lower bound of the largest sigma_max(S_u)."""
+        L = self.gain(T, at, some)
+        return float((least_scaled(inverted(L)) if self._mixed else sensitivity_size(L)).max())
 
     @cached_property
     def swept(self) -> Callable[[ServoLaw], tuple[ComplexArray, FloatArray]]:
@@ -261,27 +270,32 @@ class ServoLoop:
         narrow, *wider = _WIDTHS
         best = self._lowest(law, at, size, [self._inverse(mode, narrow) for mode in modes])
         shallow = replace(best[0], depth=max(best[0].depth, Notch(1.0).depth))  # takes less phase
-        best = min(best, self._lowest(law, at, size, [shallow]), key=lambda one: one[1])
+        best = self._lowest(law, at, size, [shallow] if shallow != best[0] else [], best)
         for width in wider:
             if best[1] <= _BELOW_TARGET * TARGET:
                 break
             other = replace(best[0], depth=best[0].depth * best[0].width / width, width=width)
-            best = min(best, self._lowest(law, at, size, [other]), key=lambda one: one[1])
+            best = self._lowest(law, at, size, [other], best)
         return best
 
     def _lowest(
-        self, law: ServoLaw, at: ComplexArray, size: FloatArray, notches: Sequence[Notch]
+        self,
+        law: ServoLaw,
+        at: ComplexArray,
+        size: FloatArray,
+        notches: Sequence[Notch],
+        best: tuple[Notch, float] | None = None,
     ) -> tuple[Notch, float]:
-        """Return the notch with the lowest peak, and that peak."""
+        """Return the notch with the lowest peak, and that peak, if it is lower than the best."""
         T, high = law.driven.T, np.flatnonzero(size >= _HIGH * size.max())
         tried = [at * law.changed_by(notch, self.freq) for notch in notches]
-        least = np.array([self._sizes(T, one, high).max() for one in tried])
-        best, lower = 0, np.inf
+        least = np.array([self._at_least(T, one, high) for one in tried])
+        best = best or (notches[0], np.inf)
         for i in np.argsort(least, kind="stable").tolist():
-            if least[i] < lower:  # else too high already where the loop is high without it
+            if least[i] < best[1]:  # else too high already where the loop is high without it
                 found = float(self._sizes(T, tried[i]).max())
-                best, lower = (i, found) if found < lower else (best, lower)
-        return notches[best], lower
+                best = (notches[i], found) if found < best[1] else best
+        return best
 
     @cached_property
     def _near(self) -> list[slice]:
