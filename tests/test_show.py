@@ -66,8 +66,9 @@ def test_a_certificate_is_a_table_of_figures_with_limits_and_goes_through_a_file
     assert [one.holds for one in (kept, broken, free)] == [True, False, None]
     found = Certificate((kept, free))
     assert found.holds and not (found | Certificate((broken,))).holds
-    assert dict(found | {"claim": 3.0}) == {"norm": 1.0, "claim": 3.0}
-    assert dict({"first": 0.0} | found) == {"first": 0.0, "norm": 1.0, "claim": 2.0}
+    assert dict(found.extended(Verified("claim", 3.0))) == {"norm": 1.0, "claim": 3.0}
+    with pytest.raises(TypeError):
+        found | {"claim": 3.0}  # a figure without its route
     with pytest.raises(KeyError, match="margin"):
         found["margin"]
     assert repr(found | Certificate((broken,))).splitlines() == [

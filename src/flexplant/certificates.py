@@ -102,7 +102,7 @@ class Certificate(Value, Mapping[str, float]):
 
     def __or__(self, other: Certificate) -> Certificate:
         """Return the checks of both; those of the other replace checks of the same thing."""
-        return self.extended(*other.checks)
+        return self.extended(*other.checks) if isinstance(other, Certificate) else NotImplemented
 
     def extended(self, *checks: Verified) -> Certificate:
         """Return the certificate with further checks; they replace checks of the same thing."""
