@@ -93,7 +93,7 @@ class Certificate(Value, Mapping[str, float]):
         return {check.what: check.figure for check in self.checks}[what]
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over what was checked."""
+        """Iterate over the names of the checks."""
         return (check.what for check in self.checks)
 
     def __len__(self) -> int:
@@ -101,11 +101,11 @@ class Certificate(Value, Mapping[str, float]):
         return len(self.checks)
 
     def __or__(self, other: Certificate) -> Certificate:
-        """Return the checks of both; those of the other replace checks of the same thing."""
+        """Return the checks of both; those of `other` replace checks of the same name."""
         return self.extended(*other.checks) if isinstance(other, Certificate) else NotImplemented
 
     def extended(self, *checks: Verified) -> Certificate:
-        """Return the certificate with further checks; they replace checks of the same thing."""
+        """Return the certificate with further checks, which replace those of the same name."""
         return Certificate((*self.checks, *checks))
 
     def __repr__(self) -> str:

@@ -52,9 +52,9 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         Value.registry[cls.__name__] = cls
 
     def __post_init__(self) -> None:
-        """Check each field by what it declares, and make it read-only.
+        """Check each field by the rule in its declaration, and make it read-only.
 
-        What concerns several fields follows in the kind's own method, after this one.
+        Rules for several fields together are checked after this, in the method of the class.
         """
         values = self._fields()
         for field in fields(self):  # type: ignore[arg-type]
@@ -77,9 +77,10 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
-        """Return the kind with its fields and their units.
+        """Return the name of the class with its fields and their units.
 
-        None, what is empty, and words and flags that are the default are left out.
+        Fields that are None or empty are left out, and so are strings and bools that have their
+        default value.
         """
         shown = ", ".join(f"{name}={text}" for name, text in self._stated().items())
         return f"{type(self).__name__}({shown})"

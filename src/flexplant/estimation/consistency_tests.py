@@ -171,24 +171,27 @@ def consistency(
 ) -> ConsistencyReport:
     """Return whether a record agrees with the model of its estimator, with the likely causes.
 
-    With a correct model the whitened innovations are white noise of unit variance. Five tests share
-    the level (each at ``level^(1/5)``): the mean of their squares (NIS, chi-square), their
-    correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett), their
-    largest one and their mean. The likely causes follow from the failed tests:
+    With a correct model the whitened innovations are white noise of unit variance. There are five
+    tests of the innovations: their mean square (normalised innovation squared, NIS; chi-square),
+    their correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett),
+    their largest value and their mean. Each test has the level ``level^(1/5)``, so that a correct
+    model passes all five with the probability `level`. The likely causes follow from the failed
+    tests:
 
     - single samples of a sensor that noise cannot explain, and whose effect on the filter is that
       of one sample: *outliers*;
-    - a mean that exceeds the density at the lowest lines: the *offset* of a sensor.
+    - a mean that is larger than the spectrum at the lowest frequencies explains: the *offset* of a
+      sensor.
 
-    The effect of these is removed, and the rest has one more cause:
+    Outliers and offsets are removed. One cause is then given for the remaining innovations:
 
-    - coloured as on the evaluation model, if there is one: the plant is correct and its
-      *truncation*, or the *folding* of modes above half the rate, is visible;
+    - coloured with the spectrum that the evaluation model predicts, if there is one: the plant is
+      correct, and the cause is its *truncation*, or the *folding* of modes above half the rate;
     - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
     - coloured, but explained by other levels of process and sensor noise (two levels, fitted to
       the spectrum): the *noise ratio*;
-    - another peak, which the change of a neighbouring mode explains better than an additional
-      mode: the *frequency* or damping of that mode. Frequency and damping of all such modes are
+    - another peak, and a change of a neighbouring mode explains it better than an additional mode
+      does: the *frequency* or damping of that mode. Frequency and damping of all such modes are
       fitted to the record by maximum likelihood, including the commands, so that a closed loop
       does not bias them (`moved`);
     - any other peak: *truncation*, if it lies above all modes or a truncated mode is known there;
@@ -198,20 +201,22 @@ def consistency(
     Parameters
     ----------
     observer : KalmanEstimator or ClosedLoop
-        Estimator of the estimate; or a loop that ran on the machine: the record is judged by the
-        Kalman filter of its plant.
+        Estimator that is tested. For a ClosedLoop that ran on the machine, it is the Kalman filter
+        of the plant of this loop.
     estimate : Estimate, Response or mapping {channel: (N,) array}
-        Result of `observer.estimate(records)`, where gated samples count as missing; or the records
-        themselves: all sensors and commands.
+        Result of `observer.estimate(records)`, or the records of all sensors and commands. Samples
+        that the gate of `estimate` rejected count as missing.
     truth : mapping {channel: (N,) array}, optional
-        True motions at POIs, from a simulation or a reference instrument, for the NEES; its
-        interval takes the correlation of the errors over time into account.
+        True motions at POIs, from a simulation or a reference instrument. They are used for the
+        normalised estimation error squared (NEES), whose interval takes the correlation of the
+        errors over time into account.
     level : float
         Probability with which a correct model passes.
 
     Returns
     -------
     ConsistencyReport
+        Verdict, likely causes, and the result of each test.
 
     Raises
     ------

@@ -34,29 +34,33 @@ class KalmanEstimator(PoiFilter):
         hat[k] = C1 x[k|k-1] + D12 u[k] + L_z (y[k] - C2 x[k|k-1] - D22 u[k])
         x[k+1|k] = A x[k|k] + B2 u[k]
 
-    L_z is C1 L if no truncated modes are known.
+    L is the gain of the state and L_z that of the estimates ``hat`` of the POI motions z. L_z is
+    ``C1 L`` if no truncated modes are known. A, B2, C1, D12, C2 and D22 are the matrices of the
+    plant from u to z and y.
 
     Parameters
     ----------
     system : StateSpace
-        From the sensors and the applied u to the estimates `die:hat`, `die:rx:hat`, ...; states
-        x[k|k-1].
+        Filter from the sensors and the applied u to the estimates `die:hat`, `die:rx:hat`, ... Its
+        state is x[k|k-1].
     plant : StandardPlant
         Plant of the design.
     gain : (n, ny) array
-        Gain L of each sensor.
+        Gain L, one column for each sensor.
     covariance : (n, n) array
         Covariance of the error of x[k|k], after the measurement, on the filter's model.
     certificate : Certificate
+        Checks of the filter, such as the spectral radius of its error.
     variances : (nz,) array [m^2 or rad^2]
         Predicted variances of the errors at the POIs, on the plant with truncated modes if these
         are known.
     left_out : LeftOut, optional
         Truncated modes, as noise and static compliance.
     tried : tuple of str
-        Methods of the gain in the order in which they were tried, the last one gave it: first the
-        Riccati equation of the covariance and, where this has too few digits, Newton's steps in
-        square roots. A method that failed stands with its reason.
+        Methods by which the gain was computed, in the order in which they were tried. The last one
+        succeeded; the reason is given for each one that failed. The Riccati equation of the
+        covariance is tried first. If it is not accurate enough, Newton steps in square roots
+        follow.
 
     Examples
     --------
@@ -97,12 +101,12 @@ class KalmanEstimator(PoiFilter):
 
     @property
     def predictor_gain(self) -> FloatArray:
-        """K (n, ny), of ``x[k+1|k] = A x[k|k-1] + B2 u[k] + K e[k]`` with the innovation e."""
+        """Gain K (n, ny) in ``x[k+1|k] = A x[k|k-1] + B2 u[k] + K e[k]``; e is the innovation."""
         return self.system.B[:, : len(self.sensors)]
 
     @cached_property
     def predicted_covariance(self) -> FloatArray:
-        """Of the error of x[k|k-1] (n, n), before the measurement, on the filter's own model."""
+        """Covariance (n, n) of the error of x[k|k-1], before the measurement, on its model."""
         model, moved = self.model, self.model.A @ self.gain
         P = model.A @ self.covariance @ model.A.T + model.Q
         if np.any(model.S):
@@ -123,11 +127,11 @@ class KalmanEstimator(PoiFilter):
     ) -> Estimate:
         """Return the motions at the POIs from recorded measurements and commands.
 
-        The filter is time-varying until its gain is stationary, and in and after gaps, where the
-        available sensors are used; then it runs in blocks of samples. It counts as stationary when
-        the remaining change affects all later estimates and innovations by less than 1e-6 of their
-        variance. Filter and Predictor also run in blocks before, exactly; FixedLag and Smoother run
-        sample by sample until then, about a millisecond each.
+        The gain is time-varying at the start of the record, and during and after gaps, in which the
+        available sensors are used. It counts as stationary when the remaining change affects all
+        later estimates and innovations by less than 1e-6 of their variance. Filter and Predictor
+        process the record in blocks of samples at all times, without approximation. FixedLag and
+        Smoother do so when the gain is stationary; before, each sample takes about a millisecond.
 
         Parameters
         ----------
@@ -137,16 +141,16 @@ class KalmanEstimator(PoiFilter):
         lag : Predictor, Filter, FixedLag or Smoother, optional
             Type of the estimates; Filter() by default.
         start : (n,) array, optional
-            The state x[0|-1] of the stationary filter: zeros for a machine at rest, or the `state`
-            of the estimate before. None: damped modes are in stationary motion due to the
-            disturbances, rigid-body motions and undamped modes are unknown (diffuse prior), and u
-            was 0 before the record.
+            Initial state x[0|-1] of the stationary filter: zeros for a machine at rest, or the
+            `state` of the estimate of the preceding record. None: damped modes are in stationary
+            motion due to the disturbances, rigid-body motions and undamped modes are unknown
+            (diffuse prior), and u was 0 before the record.
         path : (N, 3) array [m] or mapping {name: (N, 3) array}, optional
             Position of a moving POI at each sample; by name for several POIs.
         gate : float, optional
-            Number of deviations above which an innovation is an outlier: such a sample of a sensor
-            is treated as missing. 5 or 6 leave out almost nothing by chance (6e-7 or 2e-9 of all).
-            The estimate lists them (`gated`). None: all samples count.
+            Number of standard deviations above which an innovation is an outlier. Such a sample of
+            a sensor is treated as missing. With 5 or 6, only a fraction of 6e-7 or 2e-9 of correct
+            samples is rejected. The estimate lists them (`gated`). None: all samples count.
 
         Returns
         -------
@@ -163,8 +167,8 @@ class KalmanEstimator(PoiFilter):
             When `records` hold no channels, infinite values, or times of another rate, `lag` has a
             wrong type, or `gate` is not positive.
         SolverError
-            When sensors are so quiet that covariances have too few digits; the filter itself still
-            runs, by `system` or `step`.
+            When the sensor noise is so small that covariances cannot be computed accurately. The
+            filter itself can still be used, by `system` or `step`.
 
         Warns
         -----
@@ -254,13 +258,14 @@ class KalmanEstimator(PoiFilter):
     def report(self, lags: npt.ArrayLike = LAGS) -> LagReport:
         """Return the rms errors at the POIs by lag, with the static relation; prints as a table.
 
-        Predictor, filter, some lags and the smoother, all stationary: it shows the gain from a
-        later estimate. `fx.plot.lag_report` draws it.
+        The rows are the static relation, predictor, filter, fixed lags and smoother, all
+        stationary. They show how much the error falls if the estimate may be later.
+        `fx.plot.lag_report` draws them.
 
         Parameters
         ----------
         lags : (k,) array [s]
-            Rounded to samples; those below half a sample are left out.
+            Lags, rounded to whole samples. Lags below half a sample are left out.
 
         Raises
         ------
@@ -283,10 +288,10 @@ class KalmanEstimator(PoiFilter):
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
 
-        Call `update(y)` and then `predict(u)`; y without references, u all actuators, as 1-D
-        arrays or as columns; `batch_filter(ys, us, update_first=True)` does so for a record. Its
-        `rts_smoother` takes no u: it is right for u = 0;
-        `estimate(records, Smoother())` is right for any.
+        At each sample, call `update(y)` and then `predict(u)`. y holds the sensors without
+        references, u all actuators, as 1-D arrays or columns.
+        `batch_filter(ys, us, update_first=True)` processes a record. `rts_smoother` has no argument
+        u and is therefore correct only for u = 0; use `estimate(records, Smoother())` for other u.
         """
         return filterpy_twin(self.model, self.predicted_covariance)
 

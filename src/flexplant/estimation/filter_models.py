@@ -31,7 +31,7 @@ LEFT_OUT = "truncated modes"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FilterModel(Value):
-    """The model of a filter.
+    """The plant model and the noise covariances of a Kalman filter.
 
     ::
 
@@ -44,14 +44,15 @@ class FilterModel(Value):
     A, B, C1, D1, C2, D2 : arrays
         Model from the commands u to the motions z at the POIs and to the sensors y.
     G : (n, r) array
-        Effect of noises xi of unit variance on x in one sample: of disturbances.
+        Gain from xi, white noises of unit variance, to the state x of the next sample. It
+        represents the disturbances.
     H : (ny, r) array
-        Their effect on the sensors: their own noise, that of truncated modes, and of disturbances
-        that are held over each sample.
+        Gain from xi to the sensors. It represents sensor noise, truncated modes as noise, and
+        disturbances that are constant during each sample.
     V : (nz, nz) array
-        Covariance of the motions of truncated modes at the POIs.
+        Covariance of n, the motion of truncated modes at the POIs.
     N : (nz, ny) array
-        Covariance between these and the noise of the sensors.
+        Covariance between n and the noise of the sensors.
     dt : float [s]
         Sampling time.
     channels, sensors, commands : tuples of str
@@ -109,17 +110,17 @@ class FilterModel(Value):
         )
 
     def innovation(self, P: FloatArray) -> FloatArray:
-        """Return the covariance ``C2 P C2' + R`` of the innovations, P that of x[k|k-1]."""
+        """Return the covariance ``C2 P C2' + R`` of the innovations; P is that of x[k|k-1]."""
         return np.asarray(self.C2 @ P @ self.C2.T + self.R)
 
     def updated(self, P: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return the covariance of x[k|k] in Joseph's form, which is valid for any gain L."""
+        """Return the covariance of x[k|k] for any gain L (Joseph's form); P is that of x[k|k-1]."""
         left = np.eye(P.shape[0]) - gain @ self.C2
         updated = left @ P @ left.T + gain @ self.R @ gain.T
         return np.asarray(0.5 * (updated + updated.T))
 
     def driven(self, gain: FloatArray) -> FloatArray:
-        """Return ``(G - K H)(G - K H)'``, what one sample adds with a predictor gain K."""
+        """Return the noise covariance ``(G - K H)(G - K H)'`` of a sample, K the predictor gain."""
         entering = self.G - gain @ self.H
         return entering @ entering.T
 

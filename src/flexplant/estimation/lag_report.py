@@ -229,12 +229,12 @@ Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StaticEstimator(PoiEstimator):
-    """The least-squares estimate of the motions at the POIs near rest, a matrix of gains.
+    """Least-squares estimate of the POI motions at low frequencies by a constant gain matrix.
 
     Parameters
     ----------
     system : StateSpace
-        From the displacement sensors to `die:hat`, ...; no states.
+        Static system from the displacement sensors to the estimates `die:hat`, ...
     plant : StandardPlant
         Plant whose static motions it uses.
     """
@@ -255,10 +255,10 @@ class StaticEstimator(PoiEstimator):
         """Return the predicted rms of the error at sample instants, with u = 0.
 
         It includes the deformation by disturbances (also of known truncated modes) and the sensor
-        noise; free motions have no error. `channel` and `on`, a plant, are as for
-        `KalmanEstimator.rms`; `on` None is its own with the truncated modes. AssumptionError also
-        when the plant is continuous (a sample of white sensor noise has no variance then),
-        SolverError when an elastic mode is not damped.
+        noise; free motions have no error. `channel` and the plant `on` are as for
+        `KalmanEstimator.rms`; without `on`, it is the evaluation plant if there is one.
+        AssumptionError is raised for a continuous plant, since continuous white sensor noise has an
+        infinite variance. SolverError is raised when an elastic mode is not damped.
         """
         row = row_of(poi_channels(self.plant), channel)
         require_sampled(self.plant, "an rms is of samples")

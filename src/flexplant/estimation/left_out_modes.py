@@ -53,10 +53,10 @@ class LeftOut(Value):
     cross : (nz, ny) array
         Covariance N_t between POIs and sensors.
     plant : StandardPlant
-        Plant with the static compliance of the truncated modes as response to u. Attachment vectors
-        that represent them are excited by u only.
+        Plant whose response to u includes the static compliance of the truncated modes. If
+        attachment vectors represent this compliance, only u excites them.
     whole : StandardPlant
-        Plant with the modes, from which the same follows for another POI.
+        Plant that includes the truncated modes. It is used to compute these values for other POIs.
 
     Examples
     --------

@@ -44,8 +44,8 @@ class PoleSelection(Value):
     poles : (m,) complex array [rad/s]
         Poles with positive imaginary parts.
     participation : (n_in, m) complex array
-        Participation of each input (or output, where those are fewer) in each pole; independent
-        columns distinguish repeated poles.
+        Participation factor of each input in each pole; of each output, if there are fewer outputs
+        than inputs. Repeated poles have linearly independent columns.
 
     Examples
     --------

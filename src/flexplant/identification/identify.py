@@ -142,23 +142,24 @@ def identify_modes(
     ----------
     frf : Frf, or list of Frf
         Measured FRF, or several runs with the same channels between which the machine may have
-        drifted (a mean of the runs would have broader resonances). Poles are then means over the
-        runs, with deviations from their differences. Where the FRF has a variance, it weights the
-        errors and gives the covariance of the poles, together with the correlation between outputs
-        and between neighbouring lines (from the window) where these are known. Without a variance,
-        both follow from the residual of the fit, averaged over 41 lines.
+        drifted (a mean of the runs would have broader resonances). For several runs, each pole is
+        the mean over the runs, and its standard deviation follows from the differences between the
+        runs. If the FRF has a variance, it weights the errors and gives the covariance of the
+        poles. Correlations between outputs and between neighbouring lines (from the window) are
+        included if they are known. Without a variance, the weights and the covariance follow from
+        the residual of the fit, averaged over 41 lines.
     band : (low, high) [Hz], optional
         Frequency band of the fit and of the reported modes; all lines by default.
     orders : iterable of int, optional
-        Model orders of the stabilisation diagram, with the same default.
+        Model orders of the stabilisation diagram; by default those of `stabilisation_diagram`.
     start : PoleSelection, optional
         Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
     lower : int
         Number of residual terms of rigid-body modes and modes below the band.
     upper : int, optional
-        Number of residual terms of modes above the band. None: 3, and up to 25 where the data
-        require more. Too few terms bias the poles, by up to a standard deviation before the misfit
-        shows it.
+        Number of residual terms of modes above the band. None: 3, and up to 25 if the data require
+        more. Too few terms bias the poles. A bias of up to one standard deviation is not visible in
+        the misfit.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
         sampled plant. Modes above half the rate then appear folded, as broad modes with several per
@@ -173,13 +174,14 @@ def identify_modes(
         Groups of outputs (or inputs) that were measured together, when a sensor (or a hammer) was
         moved: poles may differ between groups. None: every channel is a separate group.
     refine : bool, optional
-        Whether to refine the poles by maximum likelihood. None: yes where this is useful and takes
-        at most one or two minutes (number of values of the FRF times the square of poles times
-        references below 5e7 for each step, 5e10 in total). It is not useful where each output has
-        its own poles. False gives the first result, in about a second.
+        Whether to refine the poles by maximum likelihood. None: yes if this is useful and takes at
+        most one or two minutes. It is not useful if each output has its own poles. The cost of a
+        step is estimated as ``n (m r)^2`` with n values of the FRF, m poles and r references; the
+        limits are 5e7 for each step and 5e10 in total. False: the result without refinement, in
+        about a second.
     most : int
-        Largest number of poles of the fit, the strongest ones; others of the diagram are in
-        `rejected`.
+        Largest number of poles of the fit. The strongest poles of the diagram are used; `rejected`
+        lists the others.
     max_iterations : int
         Largest number of iterations of the fit.
     progress : bool, optional
@@ -189,16 +191,17 @@ def identify_modes(
     Returns
     -------
     IdentifiedModes
-        `MeasuredModes` sorted by frequency, without mode numbers (see `numbered`). The covariance
-        is enlarged by the misfit where the misfit exceeds one.
+        `MeasuredModes` sorted by frequency, without mode numbers (see `numbered`). If the misfit
+        (ratio of the residual to the noise) exceeds one, the covariance is multiplied by it.
 
     Warns
     -----
     FlexplantWarning
         When the residual of a group of lines exceeds the noise, because a mode was missed or two
-        were merged. When a resonance is narrower than half the distance of the lines (Hann-windowed
-        segments), or than about four lines where the fit does not include the window. When the FRF
-        uses the convention exp(-i omega t), so that its conjugate is used.
+        were merged. When a resonance is too narrow for the distance between lines: less than half
+        of it if the fit includes the window (Hann-windowed segments), otherwise less than about
+        four times it. When the FRF uses the convention exp(-i omega t), so that its conjugate is
+        used.
 
     Raises
     ------

@@ -21,16 +21,16 @@ ROUNDING = 1e-28
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Periodic(Value):
-    """Averages over periods of a multisine (or any periodic signal).
+    """Estimation of FRFs by averages over the periods of a multisine (or any periodic signal).
 
     Parameters
     ----------
     period : float [s]
         Period, an integer number of samples; its inverse is the resolution.
     discard : int
-        Number of periods at the start that are dropped, while transients decay.
+        Number of periods at the start that are not used, because transients still decay in them.
     band : (low, high) [Hz], optional
-        Band of the lines that are used; by default all excited lines.
+        Band of the frequencies (lines) that are used; by default all excited lines.
 
     References
     ----------

@@ -43,8 +43,8 @@ class DelayedLoop(Value):
     Raises
     ------
     ModelError
-        When neither has a delay, or when their product is improper (differentiates), which no real
-        loop is.
+        When neither has a delay, or when their product is improper (differentiates) and therefore
+        cannot be realised.
 
     References
     ----------
@@ -188,7 +188,7 @@ class DelayedLoop(Value):
         return np.asarray(np.linalg.det(np.eye(L.shape[1]) + L))
 
     def response(self, which: Literal["S", "T", "L", "KS"], freq: npt.ArrayLike) -> ComplexArray:
-        """Return S, T and L at y, or -K S, (p, m, n) at frequencies [Hz], exactly."""
+        """Return the exact response (p, m, n) at frequencies [Hz]: S, T or L at y, or -K S."""
         one_of(which, "which", ("S", "T", "L", "KS"))
         s = 2j * np.pi * np.atleast_1d(real_array(freq, "freq"))
         K, G = (np.moveaxis(part.at(s), 2, 0) for part in (self.controller, self.plant))
@@ -258,7 +258,7 @@ class DelayedLoop(Value):
         Parameters
         ----------
         reference : function of the time [s]
-            The same for all channels; smooth between multiples of the delay.
+            Reference of all channels. It must be smooth between multiples of the delay.
         time : (n,) array [s]
             Instants, growing from 0 or later.
         """

@@ -157,8 +157,8 @@ def schedule_loops(
         When the machine at rest half way between two places is not stable with the interpolated
         controller.
     LabelError
-        When the position is unknown, or there are several and none is named. When channels differ
-        between positions.
+        When the position is unknown, `position` is missing although the plant has several, or
+        channels differ between positions.
     ModelError
         When a place is out of range, or designs differ in their states.
 

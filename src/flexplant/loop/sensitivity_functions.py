@@ -293,10 +293,10 @@ def modulus_margin(loop: Loop) -> float:
     loop : ClosedLoop, or (plant, controller)
         As for `loop_gain`. Stability is judged first: for a model by its poles, and for a measured
         plant by a Nyquist count as in `report_loops`. The count assumes that the plant has no
-        unstable poles, and that a direction whose response falls with the square of the frequency
-        at its lowest lines is a free motion. The peak of a measured plant includes its lines and
-        the visible modes between them. Where the actuators have several units (N and N m) it is the
-        margin with scaled axes, `LoopReport.scaled_margin`.
+        unstable poles. If a response is proportional to 1/f^2 at the lowest frequencies, the motion
+        counts as a free rigid-body motion. For a measured plant, S is evaluated at its frequencies,
+        and between them at the modes that are visible in the data. If the actuators have several
+        units (N and N m), the result is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------

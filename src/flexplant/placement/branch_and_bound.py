@@ -29,14 +29,15 @@ _MANY = 24
 class Exchange(Search):
     """Greedy choice, then exchanges of one candidate at a time; again from other starts.
 
-    Each start ends where no single exchange helps. Where the criterion has a lower bound, only
-    the exchanges that it does not exclude are scored.
+    Each start ends when no exchange of one candidate lowers the score. If the criterion has a lower
+    bound, exchanges that the bound shows to be worse are not scored.
 
     Parameters
     ----------
     starts : int
-        Number of starts: one is greedy, the others are random. Where the criterion has a
-        relaxation, the choice of the largest relaxed weights is one more start.
+        Number of starts: one is greedy, the others are random. If the criterion has a convex
+        relaxation, one more start chooses the candidates with the largest weights in the relaxed
+        problem.
 
     Examples
     --------
@@ -245,28 +246,29 @@ _PART = "It is a part of the value, below 1: try 0.05."
 class BranchAndBound(Search):
     """Branch and bound with convex relaxations: the optimum with a proof, or a gap.
 
-    The candidates are divided into groups of similar ones, and a branch holds the choices with a
-    given number from each group. A branch is discarded when none of its choices can be better than
-    the best one found; in small branches each choice is checked by its lower bound. The search
-    starts as `Exchange`.
+    The candidates are divided into groups of similar candidates. A branch is the set of all choices
+    that take a given number of candidates from each group. A branch is discarded when its lower
+    bound shows that it contains no better choice than the best one found. In small branches the
+    lower bound of each choice is checked. The search starts from the result of `Exchange`.
 
     Parameters
     ----------
     gap : float
-        Relative gap at which the search ends: no choice is better by more than this
-        fraction of the value (for a variance, the rms is better by at most about half of
-        it). 0 finds the optimum.
+        Relative gap at which the search ends: no choice is better by more than this fraction of the
+        value. If the value is a variance, the relative gap of the rms is about half of it. 0 finds
+        the optimum.
     branches : int
-        Largest number of branches to open; the search then ends with the gap that was reached and a
-        warning; 0 leaves the exchanges at the start and the bound of the relaxation.
+        Largest number of branches to open. When it is reached, the search ends with a warning and
+        reports its gap. With 0, the result is that of the exchanges, with the lower bound of the
+        relaxation.
     starts : int
-        Starts of the exchanges, as in `Exchange`.
+        Number of starts of the exchanges, as in `Exchange`.
 
     Notes
     -----
-    It needs a criterion whose relaxation is convex: `PoiVariance` of the plant's own modes (sum),
-    `PoiLqr`, `ClosedLoopH2` of one kind of device, all of ports without a filter or delay of their
-    own; `ModeInformation` and log det of Gramians.
+    The relaxation of the criterion must be convex. This holds for `ModeInformation`, for log det of
+    Gramians, and, if no sensor or actuator has its own filter or delay, for `PoiVariance` of the
+    plant's own modes (sum), `PoiLqr` and `ClosedLoopH2` of sensors only or actuators only.
 
     Examples
     --------

@@ -98,8 +98,8 @@ class PoiLqr(MotionAndEffort):
         Axes of each of them; all when not given, a rotation with the factor 1 m.
         Together they must see every rigid-body mode.
     effort : float [m/N]
-        The motion of the POI that one newton of one actuator is worth. Small: the disturbance is
-        rejected as well as the structure and the delay allow.
+        Weight of the actuator forces: POI motion that costs as much as a force of 1 N. With a small
+        value the disturbance is rejected as well as the structure and the delay allow.
 
     Examples
     --------
@@ -165,22 +165,23 @@ class PoiLqr(MotionAndEffort):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoopH2(MotionAndEffort):
-    """Smallest mean square of POI motion and effort in closed loop, with the estimate (LQG).
+    """Smallest mean square of POI motion and effort in closed loop with an LQG controller.
 
-    The cost of LQG: ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising
-    controllers of y, the square of an H2 norm. With S and F of the control Riccati equation, W the
-    process noise and P the covariance of the estimate (on which u acts)::
+    The cost is ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising controllers from
+    y to u, with the factor f_a of each POI motion z_a. It is the square of an H2 norm. With the
+    solution S and the state feedback gain F of the control Riccati equation, the process noise W,
+    the covariance P of the estimation error and the input matrix B::
 
         J = tr(S W) + tr(F' (effort^2 I + B' S B) F P)
 
-    More sensors or actuators never make it larger. It is never below `PoiLqr`, which assumes
-    that the state is known, nor below `PoiVariance`, which assumes unlimited control.
+    More sensors or actuators never increase the cost. It is at least `PoiLqr`, which assumes that
+    the state is known, and at least `PoiVariance`, which assumes unlimited control.
 
     Parameters
     ----------
     poi, axes : as for `PoiLqr`
     effort : float [m/N]
-        The motion of the POI that one newton of one actuator is worth.
+        Weight of the actuator forces: POI motion that costs as much as a force of 1 N.
 
     Examples
     --------
@@ -192,7 +193,8 @@ class ClosedLoopH2(MotionAndEffort):
     def __call__(self, plant: StandardPlant) -> float:
         """Return the cost [m^2] on a sampled plant.
 
-        By the formula, checked against the stationary covariance of the loop of filter and gain.
+        The cost follows from the formula. It is checked against the stationary covariance of the
+        closed loop of Kalman filter and state feedback.
         """
         self.check(plant, ())
         plant.check().require(("stabilisable", "detectable"), "a stationary controller")
@@ -215,7 +217,7 @@ class ClosedLoopH2(MotionAndEffort):
         return confirmed(cost, found)
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Raise AssumptionError when a rigid-body mode is missed or a candidate fits no filter."""
+        """Raise AssumptionError when a rigid-body mode is missed or a filter does not exist."""
         super().check(plant, candidates)
         seeing = [port for port in candidates if side_of(port) == "y"]
         if candidates and not seeing:  # the plant's own are those of the loop
@@ -225,12 +227,12 @@ class ClosedLoopH2(MotionAndEffort):
         PoiVariance(self.poi).check(plant, seeing)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the cost as a function of the candidates alone; all else is computed once.
+        """Return the function from a choice of candidates to its cost.
 
-        With a delay of d whole samples the control acts on the state predicted d samples
-        ahead, and the motion in these samples is added to the cost. With a fractional
-        delay, or ports with filters or delays, the plant is assembled again for each
-        choice.
+        The parts that all choices share are computed once. With a delay of d whole samples the
+        control acts on the state predicted d samples ahead, and the motion in these samples is
+        added to the cost. With a fractional delay, or ports with filters or delays, the plant is
+        assembled again for each choice.
         """
         if plant.delay % 1.0 or not plain(plant, candidates):
             return super().scorer(plant, candidates)

@@ -205,7 +205,7 @@ class JointGroups(Constraint):
         self._set(groups=listed)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return x_i - x_j = 0 within each group."""
+        """Return ``x_i - x_j = 0`` within each group, with x_i = 1 for a chosen candidate."""
         pairs = []
         for group in self.groups:
             at = places.index(group, "candidate of a group")

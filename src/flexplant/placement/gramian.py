@@ -230,7 +230,8 @@ class ModalGramian(Criterion):
 class ModalObservability(ModalGramian):
     """Negative measure of the observability Gramian of the elastic modes, for sensors.
 
-    See `ModalGramian`. One row per sensor, in units of its noise where it has any.
+    It is negative because criteria are minimised. The signal of each sensor is divided by its noise
+    density, if it has noise. `ModalGramian` defines the Gramian.
 
     Parameters
     ----------

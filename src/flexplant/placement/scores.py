@@ -50,9 +50,9 @@ class Scores(Value):
         Remark that the scores do not include truncated modes; empty where the plant has an
         evaluation model.
     interval : str
-        Ratio of the error of the best layout to that of the next one on 95 % of the plant's
-        machines, or the reason why this interval does not exist; empty where no machines
-        are known.
+        Interval that contains, for 95 % of the uncertain plant's sampled machines, the error of the
+        best layout divided by that of the next one; or the reason why it does not exist. Empty
+        where the plant has no sampled machines.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -83,7 +83,7 @@ class Scores(Value):
         return self.layouts[0]
 
     def table(self, count: int = 10) -> str:
-        """Return a text with the best layouts, one per line."""
+        """Return a text with the `count` best layouts, one per line."""
         lines = []
         for i, value in enumerate(self.values[: whole(count, "count")]):
             why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
@@ -420,8 +420,8 @@ def sensor_map(
     direction, quantity : str
         Direction and quantity that it measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`. Points at which a further sensor violates a constraint are left out;
-        so are points on a POI, unless OffPoi(-1) is among the constraints.
+        As for `place_sensors`. Points at which a further sensor violates a constraint are left out.
+        Points on a POI are left out as well, unless OffPoi(-1) is one of the constraints.
 
     Returns
     -------

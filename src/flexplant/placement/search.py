@@ -61,14 +61,14 @@ def place_sensors(
 ) -> Placement:
     """Return the best choice of `count` sensors among candidates.
 
-    A choice must see every rigid-body mode before it is scored at all. The score of the answer is
-    confirmed by `design_kalman` (for `PoiVariance`).
+    Only choices that observe every rigid-body mode are scored. For `PoiVariance`, the score of the
+    result is confirmed by `design_kalman`.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, assembled from a structure. Its own sensors are used where they are candidates;
-        the answer names those that are not (`Placement.left_out`).
+        Sampled plant that was assembled from a structure. Its own sensors are used only if they are
+        candidates; `Placement.left_out` names the others.
     candidates : sequence of Sensor
         Candidates, each chosen at most once; a name means a sensor of the plant.
     count : int
@@ -85,11 +85,11 @@ def place_sensors(
         Exchange, BranchAndBound, Exhaustive, Screened or RowSelection. By default every
         subset is tried if there are at most 1500, otherwise `Exchange()`.
     executor : concurrent.futures.Executor, optional
-        Works on starts, chunks of subsets or branches; the result is the same to the bit. When a
-        process of a pool dies, its part is done once more.
+        Executor that processes starts, groups of subsets or branches in parallel. The result is
+        identical to that without it. When a process of a pool dies, its work is repeated.
     checkpoint : path, optional
-        A file that keeps each part of the work as it comes. With a file that exists the search goes
-        on where it was stopped, also after being killed.
+        File to which each finished part of the work is saved. If the file exists, the search
+        continues where it was stopped, also after the process was killed.
     progress : bool, optional
         Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
         two seconds.
@@ -99,17 +99,17 @@ def place_sensors(
     Returns
     -------
     Placement
-        With a lower bound for every choice of as many candidates.
+        The best choice, and a lower bound on the score of all choices of this size.
 
     Raises
     ------
     AssumptionError
-        When even all candidates miss a rigid-body mode, which is named, or the criterion has no
-        meaning on this plant.
+        When all candidates together do not observe a rigid-body mode, which the message names, or
+        the criterion does not apply to this plant.
     InfeasibleError
         When no choice of this size has a finite score.
     CertificateError
-        When the score is not confirmed by the other route.
+        When the second calculation does not confirm the score.
 
     Examples
     --------
@@ -151,7 +151,7 @@ def place_actuators(
     Returns
     -------
     Placement
-        With a lower bound for every choice of as many candidates.
+        The best choice, and a lower bound on the score of all choices of this size.
 
     Raises
     ------

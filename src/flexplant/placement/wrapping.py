@@ -54,11 +54,13 @@ class Share(Scorer):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOutModes(Criterion):
-    """Share of the truncated modes of the plant in what devices measure or excite.
+    """Response of chosen devices to truncated modes, relative to that to the modes of the plant.
 
-    ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the elastic truncated modes, over the same
-    sum for those of the plant: squared H2 norms of the modes. A controller that is fast there
-    excites the former by spill-over.
+    It is the sum ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the chosen sensors or
+    actuators i and the elastic truncated modes k, divided by the same sum over the elastic modes of
+    the plant. phi_ik is the mode shape at the device, zeta_k the damping ratio and omega_k the
+    frequency. Each term is the squared H2 norm of a mode. A controller with a high gain at the
+    frequencies of truncated modes excites them (spill-over).
 
     Parameters
     ----------
@@ -83,12 +85,12 @@ class LeftOutModes(Criterion):
     of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
 
     def __call__(self, plant: StandardPlant) -> float:
-        """Return the share of the plant's own sensors or actuators."""
+        """Return the ratio of the plant's own sensors or actuators."""
         own = getattr(plant.assembled.ports, SIDES[self.of])
         return float(self.scorer(plant, own).value(range(len(own))))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the share of choices among candidates of this kind; others do not count."""
+        """Return the ratio of choices among candidates of the kind `of`; others do not count."""
         own = [side_of(port) == SIDES[self.of] for port in candidates]
         counts = np.array(own, dtype=np.float64)
         whole = plant.evaluation_plant

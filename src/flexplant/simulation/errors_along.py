@@ -88,9 +88,11 @@ def rms_along(
 ) -> PathRms:
     """Return the standard deviation of every channel of a loop whose machine moves.
 
-    ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` of plant and controller together, with the matrices
-    of each sample of the moving machine: the exact effect of the white noises of the plant. The
-    controller, including its observer, does not change, or follows its schedule.
+    The covariance P of the states of plant and controller is computed sample by sample,
+    ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'``. A is the system matrix of the closed loop at the
+    position of the sample, and G the gain from white noises of unit variance to the states. The
+    result is exact. The controller with its observer is constant for a ClosedLoop, and scheduled
+    for a ScheduledLoop.
 
     Parameters
     ----------
@@ -107,13 +109,16 @@ def rms_along(
     Returns
     -------
     PathRms
+        Standard deviations by channel and time.
 
     Raises
     ------
     AssumptionError
-        When the loop is not stable: at the beginning, or over the trajectory that repeats.
+        When the loop is not stable at the beginning, or not over a period of a repeated trajectory.
     ModelError
-        When nothing moves, or a moving port has dynamics. References
+        When no position moves, or a moving port has a filter or latency or is not a displacement.
+
+    References
     ----------
     [BittantiColaneri2009]_ (periodic Lyapunov equations).
 
@@ -240,30 +245,39 @@ def filters_along(
     repeats: bool = False,
     positions: int = 9,
 ) -> PathFilters:
-    """Return the errors of three Kalman filters along a trajectory of a machine's positions.
+    """Return the errors of three Kalman filters along a trajectory of a moving machine.
 
-    ``P+ = A (I - M C) P (I - M C)' A' + A M R M' A' + Q`` with the matrices of each sample; M is
-    the gain of the recursion, or a steady one.
+    The gain of the exact filter is that of the Riccati recursion at each sample. The scheduled
+    filter interpolates steady gains of some positions. The frozen filter always has the steady gain
+    of the position of `plant`.
+
+    The covariance P of the error before a measurement becomes
+    ``P+ = A (I - M C) P (I - M C)' A' + A M R M' A' + Q`` one sample later, with the gain M of the
+    filter, the covariances Q of the process noise and R of the sensor noise, and A and C of the
+    plant at the position of the sample.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant with moving ports.
     moving, duration, repeats
-        As for `rms_along`; a repeated trajectory has a periodic Riccati equation.
+        As for `rms_along`. The exact filter of a repeated trajectory is the solution of a periodic
+        Riccati equation.
     positions : int
-        Number of places along the trajectory whose steady gains are scheduled.
+        Number of positions along the trajectory whose steady gains the scheduled filter uses.
 
     Returns
     -------
     PathFilters
+        Standard deviations of the errors of the exact, the scheduled and the frozen filter.
 
     Raises
     ------
     AssumptionError
         When no steady filter exists: a rigid-body mode is not excited or not seen.
     ModelError
-        When nothing moves, a moving port has dynamics, or two positions move.
+        When no position or more than one moves, or a moving port has a filter or latency or is not
+        a displacement.
     SolverError
         When the errors along a repeated trajectory do not converge.
 
@@ -421,21 +435,22 @@ def _constant(value: float, time: FloatArray) -> FloatArray:
 def estimate_along(
     plant: StandardPlant, records: Mapping[str, Any], *, moving: Mapping[str, Any]
 ) -> dict[str, FloatArray]:
-    """Return the estimates of the exact filter of a moving machine from a record.
+    """Return the estimates of the exact filter (time-varying Kalman filter) of a moving machine.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant with moving ports.
     records : mapping {name: (n_time,) array}
-        Sensors y and commands u, by name; a `Response` serves.
+        Records of the sensors y and commands u, by name, or a `Response` of `simulate`.
     moving : mapping {position: path}
         Positions of the machine, as for `simulate`.
 
     Returns
     -------
     dict {str: (n_time,) array}
-        Estimates `die:z` of every motion of the POIs, y of the same sample included.
+        Estimates of every motion of the POIs, such as `die:z`. The estimate of a sample uses the
+        measurement y of this sample.
 
     Raises
     ------

@@ -23,7 +23,7 @@ _LINES = 100
 
 @dataclass(frozen=True, eq=False, repr=False)
 class InputShaper(Value):
-    """A few impulses whose responses cancel in the modes for which they are designed.
+    """Sequence of impulses that leaves no vibration of the modes for which it is designed.
 
     A command is replaced by ``sum_i a_i command(t - t_i)``, with ``sum_i a_i = 1``; made by
     `input_shaper`.
@@ -64,6 +64,7 @@ class InputShaper(Value):
         Returns
         -------
         (k,) array
+            Amplitude ratios: 0 without remaining vibration, 1 as without the shaper.
         """
         omega = 2.0 * np.pi * np.atleast_1d(positive_array(freq, "freq"))
         zeta = np.broadcast_to(real_array(damping, "damping"), omega.shape)
@@ -73,9 +74,10 @@ class InputShaper(Value):
         return np.asarray(np.abs(turns @ self.amplitudes))
 
     def shaped(self, move: SetPointProfile) -> SetPointProfile:
-        """Return a move through the shaper: the same distance, later by `duration`.
+        """Return the shaped move, which has the same distance and takes longer by `duration`.
 
-        It is exact at any time: each impulse moves the phases of the set-point by its own time.
+        The shaped move is the exact sum of moves that start at the times of the impulses,
+        multiplied by their amplitudes. It is not sampled.
         """
         delays = self.times / move.tick
         edges = np.unique(np.concatenate([move.edges + late for late in delays]))

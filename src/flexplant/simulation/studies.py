@@ -342,7 +342,8 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     Parameters
     ----------
     designs : mapping {name: KalmanEstimator or StaticEstimator}
-        Each estimate gets the name of its design in front: `updated|die:hat`.
+        Estimators by the name of the design. The name precedes the channel of each estimate:
+        `updated|die:hat` for a design "updated".
 
     Returns
     -------

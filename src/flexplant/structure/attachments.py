@@ -94,13 +94,13 @@ class Spring(Value):
     Parameters
     ----------
     at : str, (3,) array [m] or mapping
-        One end.
+        One end: a DOF label, a point, or a mapping of DOF labels to weights.
     stiffness : float [N/m or N m/rad]
         Stiffness of the spring. It is negative where magnets attract, as in reluctance actuators:
         the force grows with the displacement. Modes and plants take a negative stiffness that moves
         the structure as a rigid body; one that bends it is refused when the modes are solved.
     direction : str
-        Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. Not used for a DOF label.
     to : place, optional
         The other end; by default the ground.
 
@@ -132,14 +132,15 @@ class Damper(Value):
     Parameters
     ----------
     at : str, (3,) array [m] or mapping
-        One end.
+        One end: a DOF label, a point, or a mapping of DOF labels to weights.
     rate : float [N s/m or N m s/rad]
         Force per velocity, not negative.
     direction : str
-        Direction of the motion at a point: x, y, z, rx, ry, rz. Labels contain a direction.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. Not used for a DOF label.
     to : place, optional
-        The other end; by default the ground. A grounded damper slows rigid-body motions down:
-        hold the structure by springs too, or modes and plants refuse it.
+        The other end; by default the ground. A damper to the ground also damps rigid-body motions.
+        `solve_modes` refuses a model with damped rigid-body motions, so hold such a structure by
+        springs as well. `assemble_plant` accepts it, with dense matrices.
 
     Examples
     --------

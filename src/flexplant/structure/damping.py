@@ -55,22 +55,22 @@ _OTHERS = checked(between, low=0.0, high=1.0, hint="1 % is 0.01. Check per cent.
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalDamping(Damping):
-    """A damping ratio for all modes, or one for each: Z in equation (5) of the paper.
+    """Modal damping: one damping ratio for all modes, or one for each mode.
 
     Rigid-body modes are undamped unless stated: a free structure dissipates nothing in them.
 
     Parameters
     ----------
     ratio : float or (k,) array [-]
-        Damping ratio in [0, 1). An array has one entry for each mode, rigid-body modes included,
-        whose entries are not used.
+        Damping ratio in [0, 1). An array has one entry for each mode, also for rigid-body modes.
+        The entries of rigid-body modes are not used.
     others : float [-], optional
         Damping ratio of all modes beyond the array; without it there must be one entry for each
         mode.
     rigid : float [1/s]
-        Decay rate of the velocity of rigid-body motions in ``FEModel.with_damping``.
-        `assemble_plant` accepts such a model, with dense matrices. `solve_modes` refuses it, since
-        it computes undamped rigid-body modes only.
+        Decay rate c of rigid-body motions, whose velocity decays as ``exp(-c t)``. Only
+        ``FEModel.with_damping`` uses it. `assemble_plant` accepts such a model, with dense
+        matrices. `solve_modes` refuses it, since it computes undamped rigid-body modes only.
 
     Examples
     --------

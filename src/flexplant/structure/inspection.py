@@ -32,7 +32,8 @@ class ModelCheck(Value):
     Parameters
     ----------
     lines : tuple of (verdict, subject, finding, next step)
-        Verdicts are "ok", "note" (worth a look) and "fail" (the model is missing or wrong).
+        Verdicts are "ok", "note" (the finding deserves attention) and "fail" (data are missing or
+        wrong).
     mass : (3,) array [kg]
         Mass in translation along x, y, z; NaN for a direction without a DOF.
     center : (3,) array [m]
@@ -44,9 +45,10 @@ class ModelCheck(Value):
     grounded : tuple of str
         Directions in which the structure is held.
     n_rigid : int
-        Number of independent free rigid-body motions, combinations included.
+        Number of independent rigid-body motions in which the structure is free, combinations of
+        directions included.
     n_zero : int
-        Number of motions without energy in K.
+        Number of independent motions q without elastic energy, ``K q = 0``.
     mechanisms : tuple of tuple of str
         For each zero-energy motion that is not a rigid-body motion, the DOFs that move most.
     massless, stiffless : tuple of str
@@ -83,7 +85,7 @@ class ModelCheck(Value):
 
     @property
     def ok(self) -> bool:
-        """Whether no line failed; there may be notes."""
+        """Whether no line has the verdict "fail". Notes are allowed."""
         return not self.of("fail")
 
     def of(self, verdict: str) -> tuple[str, ...]:

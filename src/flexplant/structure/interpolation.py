@@ -82,7 +82,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScatteredShape(Interpolation):
-    """Radial basis functions between the nodes of a model; made by `interpolated`.
+    """Interpolation by radial basis functions between the nodes of a model; made by `interpolated`.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ class ScatteredShape(Interpolation):
     directions : sequence of n str
         Direction of each DOF.
     margin : float [m]
-        Largest distance of a point outside of the hull of the nodes.
+        Largest allowed distance of a point from the convex hull of the nodes. 0: points must lie
+        inside it.
 
     Examples
     --------
@@ -108,12 +109,13 @@ class ScatteredShape(Interpolation):
     margin: float = field(default=0.0, metadata=checked(positive, zero=True, unit="m"))
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion `direction` at a point.
+        """Return the weights (n,) of the DOFs: their sum ``weights @ q`` is the motion at a point.
 
         Raises
         ------
         LabelError
-            When the point is outside the hull of the nodes, or the motion is not known there.
+            When the point is too far outside the convex hull of the nodes, or no node has a DOF
+            from which the motion in this direction follows.
         """
         return np.asarray(self.rows(real_array(xyz, "xyz", (3,))[None], direction)[0])
 

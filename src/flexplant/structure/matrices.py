@@ -45,8 +45,8 @@ class FEMatrices(Value):
     dofs : DofSet, optional
         DOFs of the rows. None: not known yet; `with_dofs` adds them.
     digits : int, optional
-        Significant decimal digits of the entries of K: as printed in a text, 7 when K is given in
-        single precision. None: double precision.
+        Number of significant decimal digits of the entries of K: those printed in a text file, or 7
+        for single precision. None: double precision.
     source : str, optional
         Origin of the matrices, for display.
     constrained : sequence of str
@@ -55,7 +55,8 @@ class FEMatrices(Value):
         Whether the coordinates in `dofs` are known. False: the file has no coordinates and they are
         zero.
     notes : sequence of str
-        Actions of the reader, such as a completed triangle or dropped empty rows.
+        Changes that were made when the file was read, such as a completed triangle or dropped empty
+        rows.
     loss_factor : float
         Loss factor eta of a complex K; the mean over the rows where it differs over the structure.
 
@@ -153,20 +154,20 @@ class FEMatrices(Value):
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The DOFs without any mass: labels, or rows (from 1) without names."""
+        """The DOFs without mass: their labels, or row numbers from 1 where the DOFs are unknown."""
         if self.M is None:
             return ()
         return self.names(np.flatnonzero(empty_rows(self.M)))
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
-        """Return the labels of some rows (from 0), or 'row 1', 'row 2', ... without names."""
+        """Return the labels of rows (from 0); 'row 1', 'row 2', ... where the DOFs are unknown."""
         if self.dofs is None:
             return tuple(f"row {row + 1}" for row in rows.tolist())
         labels = self.dofs.labels
         return tuple(labels[row] for row in rows.tolist())
 
     def with_dofs(self, dofs: DofSet | str | Path) -> FEMatrices:
-        """Return the same matrices, their rows named by other DOFs.
+        """Return the same matrices with new DOFs for their rows.
 
         Parameters
         ----------
@@ -199,7 +200,8 @@ class FEMatrices(Value):
         Parameters
         ----------
         labels : sequence of str
-            DOFs to hold, such as those a penalty holds already.
+            Labels of the DOFs to hold, for example DOFs that a stiff spring (penalty) holds in the
+            file.
         """
         dofs = self._named_dofs
         held = name_list(labels, "DOFs to hold")
@@ -208,10 +210,11 @@ class FEMatrices(Value):
         return self._kept(np.flatnonzero(keep))
 
     def trimmed(self) -> FEMatrices:
-        """Return the same without rows that a solver left for held DOFs; their names stay listed.
+        """Return the matrices without the rows of held DOFs; `constrained` keeps their labels.
 
-        Such a row is empty in every matrix, or has no mass and only a diagonal entry in K. Its DOF
-        stays at rest, so that dropping it changes nothing.
+        Some solvers write such rows. They are empty in every matrix, or have no mass and only a
+        diagonal entry in K. The DOF stays at rest, so that the result does not change when it is
+        dropped.
         """
         held = held_rows(self.K, self.M, self.D)
         if not held.any() or held.all():
@@ -280,8 +283,8 @@ class FEMatrices(Value):
             When a node does not exist.
         ModelError
             When cosines are not orthogonal, or a node has only some of its three directions. The
-            other ones are then held along local axes, and no DOFs in global directions describe
-            this.
+            missing directions are held along local axes, which DOFs in global directions cannot
+            describe.
 
         Examples
         --------
@@ -298,20 +301,19 @@ class FEMatrices(Value):
         return self.replace(**turned)
 
     def frequencies(self, count: int = 10) -> FloatArray:
-        """Return the lowest natural frequencies (k,) [Hz], motions without energy at exactly 0.
+        """Return the lowest natural frequencies (k,) [Hz]; zero-energy motions are at exactly 0.
 
-        Neither names nor places of the rows are needed, which `model` and `solve_modes` require.
+        The DOFs and their coordinates may be unknown, unlike for `model` and `solve_modes`.
 
         Parameters
         ----------
         count : int
-            Number of frequencies, those at zero included; 60 at most, and fewer where the matrices
-            have fewer.
+            Number of frequencies, including those at zero; at most 60. Small matrices have fewer.
 
         Raises
         ------
         ModelError
-            When M is missing, a matrix is not symmetric, or K has motions of negative energy.
+            When M is missing, a matrix is not symmetric, or K is not positive semidefinite.
         SolverError
             When residuals, or a Sturm count of the frequencies below, do not confirm the answer.
 
@@ -349,14 +351,14 @@ class FEMatrices(Value):
         ------
         ModelError
             When M is missing or singular, the DOFs are not known, coordinates are missing and
-            needed (the structure is free), there are massless DOFs to refuse, or `free` is True and
-            the structure is held.
+            needed because the structure can move freely, DOFs have no mass and `massless` is
+            "refuse", or `free` is True and the structure is held by its stiffness.
 
         Warns
         -----
         FlexplantWarning
-            When few digits (a text, or single precision) endanger the first elastic eigenvalue, or
-            hold rigid-body motions.
+            When K has so few digits (text or single precision) that its rounding makes the first
+            elastic eigenvalue inaccurate or holds rigid-body motions.
         """
         one_of(massless, "massless", ("refuse", "condense"))
         if self.M is None:
@@ -413,11 +415,11 @@ class FEMatrices(Value):
         return model
 
     def freed(self) -> FEMatrices:
-        """Return the same with those rigid-body motions free that only lost digits of K hold.
+        """Return the matrices with the rigid-body motions free that only rounding of K holds.
 
-        ``K' = P^T K P`` with ``P = I - R R^T M``: the elastic modes are M-orthogonal to the
-        rigid-body motions R and do not change. Use it for text files and single precision; K
-        becomes a full matrix.
+        The new stiffness is ``K' = P^T K P`` with ``P = I - R R^T M``, where R holds the rigid-body
+        motions. The elastic modes are M-orthogonal to R and do not change. Use this method for
+        matrices from text files or in single precision. K becomes a full matrix.
 
         Raises
         ------

@@ -233,7 +233,7 @@ class BlockShape(GridShape):
     present : (nz, ny, nx) array of bool, optional
         True for each element that exists; by default all exist.
     poisson_ratio : float
-        Poisson's ratio, which curves a bent element in the transverse direction.
+        Poisson's ratio. A bent element also curves in the transverse direction in proportion to it.
 
     Examples
     --------
@@ -252,11 +252,12 @@ class BlockShape(GridShape):
         return self.elements, self.present, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion of the material at a point.
+        """Return the weights (n,) of the DOFs: ``weights @ q`` is the motion at a point.
 
-        The bending modes inside an element follow its corners. Rotations rx, ry, rz are half the
-        curl of the displacements. They change by a small step between two elements; there, those of
-        the element on the side of larger coordinates are returned.
+        The internal bending modes of an element are computed from the displacements of its corners.
+        Rotations rx, ry, rz are half the curl of the displacements. They jump slightly between two
+        elements. On a boundary, the rotations in the element with the larger coordinates are
+        returned.
         """
         require_known("motion", [direction], _BLOCK_MOTIONS, "a solid")
         point = real_array(xyz, "xyz", (3,))

@@ -347,8 +347,8 @@ def solid_block(
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, an array has not one number for each element, or the holes
-        divide the block into separate pieces.
+        When a number is not physical, the size of an array differs from the number of elements, or
+        the holes divide the block into separate pieces.
 
     Examples
     --------

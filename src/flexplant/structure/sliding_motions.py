@@ -18,7 +18,7 @@ from .model import FEModel
 
 
 def slides(model: FEModel) -> dict[str, FloatArray]:
-    """Return the motions without energy that are not rigid-body motions, each named by a DOF.
+    """Return the zero-energy motions that are not rigid-body motions, each named by a DOF.
 
     A carriage on its guide, a joint or a screw moves without elastic energy; a drive controls this
     motion. In an imported model it is a zero-energy motion, which `solve_modes` refuses as a

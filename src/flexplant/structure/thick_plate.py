@@ -182,10 +182,11 @@ def plate(
     """Return a free rectangular plate in bending, with shear and rotary inertia (Mindlin).
 
     ``rho h z'' = div(k G h (grad z - t))``, ``rho h^3 / 12 t'' = div m(t) + k G h (grad z - t)``
-    with the slopes t of the section and the moments m of their gradient [Mindlin1951]_. Four-node
-    elements with quadratic slopes and constant shear along each edge [Katili1993]_: they do not
-    lock, and become those of a discrete Kirchhoff plate where it is thin; stiffness and consistent
-    mass are integrated exactly. Errors fall with the square of the element size.
+    with the deflection z, the slopes t of the section, the bending moments m(t), the thickness h,
+    the density rho, the shear modulus G and the shear factor k [Mindlin1951]_. The elements have
+    four nodes, quadratic slopes and constant shear along each edge [Katili1993]_. They do not lock;
+    for a thin plate they become discrete Kirchhoff elements. Stiffness and consistent mass are
+    integrated exactly. Errors fall with the square of the element size.
 
     The plate lies in the x-y plane with one corner at the origin and its middle plane at z = 0.
     Nodes are numbered from 1, x fastest; each has the DOFs z [m] and the rotations rx, ry [rad] of
@@ -201,8 +202,9 @@ def plate(
     thickness : float, (nx, ny) array or function [m]
         Thickness, symmetric about the middle plane.
     elements : (2,) array of int
-        Number of elements nx, ny. Elements smaller than the thickness show how a free edge twists:
-        larger ones make the lowest frequency of a plate of 0.6 x 0.6 x 0.027 m up to 1 % too high.
+        Number of elements nx, ny. Near a free edge the twist changes over about one thickness.
+        Elements larger than this make the lowest frequency of a plate of 0.6 x 0.6 x 0.027 m up to
+        1 % too high.
     density : float, (nx, ny) array or function [kg/m^3]
         Density of the material.
     youngs_modulus : float, (nx, ny) array or function [Pa]
@@ -224,7 +226,7 @@ def plate(
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, or an array has not one number for each element.
+        When a number is not physical, or the size of an array differs from the number of elements.
 
     See Also
     --------

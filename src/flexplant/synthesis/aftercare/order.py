@@ -79,8 +79,9 @@ def reduce_controller(
 ) -> Controller:
     """Return a controller of fewer states that keeps the closed loop, or raise an error.
 
-    With a normalised right coprime factorisation ``K = N M^-1``, ``[N; M]`` is truncated in states
-    balanced with the weight through which its error enters the loop::
+    The method is weighted balanced truncation of ``[N; M]``, where ``K = N M^-1`` is a normalised
+    right coprime factorisation of the controller and P is the plant. The errors dN and dM of the
+    factors enter the closed loop through the weight W::
 
         W [dN; dM],   W = (M - P N)^-1 [P, -I]
 
@@ -96,7 +97,8 @@ def reduce_controller(
     controller : StateSpace or Controller
         Controller from y to u; its integrators and unstable poles are kept.
     order : int, optional
-        Number of states of the result; by default the smallest that keeps the loop.
+        Largest number of states of the result, which may have fewer. By default the smallest number
+        with which the loop stays stable and the loss is allowed.
     loss : float
         Allowed relative loss of the modulus margin, or growth of gamma.
 
@@ -108,7 +110,8 @@ def reduce_controller(
     Raises
     ------
     CertificateError
-        When the controller as given is not stable in its loop, or that of the order degrades it.
+        When the loop with the given controller is not stable, or the loop with the reduced one is
+        unstable or loses too much margin.
     ModelError
         When an order is not below that of the controller.
     SolverError

@@ -57,32 +57,36 @@ def design_hinf(
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant or mapping {position: StandardPlant}
-        Usually weighted; continuous or sampled. For a moving machine, a mapping by position
-        (``{x: plant.at(x=x) for x in places}``): one controller for all positions is designed on
-        the mean plant, with channels that tolerate the motion; `gamma` is then the worst norm, and
-        the certificate has those of all positions and half way between. A StateSpace (also of
-        python-control) serves with the channels of a StandardPlant, or with u and y.
+        Usually weighted; continuous or sampled. For a moving machine, a mapping by position,
+        ``{x: plant.at(x=x) for x in places}``. One controller for all positions is then designed on
+        the mean plant; additional channels of w and z represent the change with position. `gamma`
+        is the largest norm of all positions. The certificate contains the norms at each position
+        and half way between them. A StateSpace (also of python-control) is accepted if its channels
+        are named as in a StandardPlant, or if u and y are given.
     method : Riccati or Lmi, optional
-        By default `Riccati()`, which adds a little noise and effort where D12 or D21 is
-        singular, and a little disturbance where w or z misses an undamped mode. `Lmi()` finds
-        gamma by a semidefinite program and serves up to 20 states.
+        Method of the synthesis. By default `Riccati()`. If D12 or D21 does not have full rank, it
+        adds a small weight of u or a small sensor noise. If w does not excite or z does not observe
+        an undamped mode, it adds a small disturbance. `Lmi()` finds gamma by a semidefinite program
+        and is suitable for up to 20 states.
     bandwidth : float [Hz], optional
         Bandwidth for a stage without weights: those of `stage_weights` are used, and the POI must
         have one reference. `design_stage` finds the largest possible bandwidth.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
-        Uncertainty of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: the design
-        tolerates its frequencies. Not needed where the plant itself is uncertain. Each mode gets a
-        channel through which a change of its frequency acts. The channel includes the scaling G of
-        real mu, and its size is found in a first design. `gamma` then includes these channels
-        (above 1 is not a failure). `certificate` has ``all frequencies at once``: below 1, no
-        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` gives the
-        allowed error of each.
+        Uncertainty of the plant before it was weighted, such as
+        ``plant.uncertain(frequency=0.005)``. The loop shall remain stable for all its modal
+        frequencies. Not needed if `plant` is an UncertainPlant. Each mode gets an additional
+        channel through which a change of its frequency acts. The channel includes the G scaling of
+        the real structured singular value mu, and its size is found in a first design. `gamma` then
+        includes these channels; a value above 1 is not a failure. The check
+        ``all frequencies at once`` of `certificate` is below 1 if no plant of the uncertainty has a
+        closed-loop pole at a frequency of the grid. ``ClosedLoop.mode_tolerances`` gives the
+        allowed error of each frequency.
     damped_below : float [Hz]
-        Frequency below which uncertain modes that actuators drive are damped, not only tolerated:
-        their channel then covers errors of 1 % and of their shapes. `design_stage` uses 3.5 times
-        the bandwidth.
+        Frequency below which the controller actively damps uncertain modes that actuators excite.
+        Their channels then represent frequency errors of 1 % and errors of their mode shapes.
+        `design_stage` uses 3.5 times the bandwidth.
     progress : bool, optional
         Whether to show a progress bar of the method's steps. None: on a terminal or in a
         notebook, for work of more than two seconds.
@@ -99,7 +103,7 @@ def design_hinf(
     AssumptionError
         When an assumption of the method fails; the message names it in physical terms.
     InfeasibleError, SolverError
-        When no stabilising controller was found, or gamma has the infimum zero.
+        When no stabilising controller was found, or gamma can be made arbitrarily small.
     CertificateError
         When the closed loop exceeds the claimed norm, or its norm is not finite.
     ModelError

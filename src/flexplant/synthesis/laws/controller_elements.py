@@ -183,7 +183,7 @@ class Integrator(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        The corner w, its zero.
+        Corner frequency w, the zero of the integrator.
 
     Examples
     --------

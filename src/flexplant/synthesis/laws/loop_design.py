@@ -26,16 +26,19 @@ from .law import Axes, Law, LawElement, axes_controller, connected
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DesignedLoops(Value):
-    """A decoupled controller ``u = -before diag(laws) after y`` and its loops, axis by axis.
+    """A decoupled controller ``u = -before diag(laws) after y`` and a report of its loops.
+
+    The matrix `after` transforms y to motions of the axes, and the matrix `before` transforms the
+    commands of the axes to u, as in `design_loops`.
 
     Parameters
     ----------
     system : StateSpace
-        From y (and references) to u: what `close_loop` and `frequency_response` take.
+        Controller from y (and references) to u, for `close_loop` and `frequency_response`.
     laws : mapping {axis: Law}
-        Error to command of each axis, positive for negative feedback.
+        Law of each axis from error to command. A positive gain means negative feedback.
     report : LoopReport
-        Crossovers and margins of each axis with the others closed, and stability.
+        Stability, and crossover and margins of each axis while the loops of the others are closed.
     left_out : SpillOver, optional
         Stability and margins on the plant with the truncated modes, where these are known.
     notes : sequence of str

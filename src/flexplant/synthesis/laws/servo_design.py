@@ -220,8 +220,8 @@ def servo_bandwidth(
     at the plant's input; the observer still receives u. A bandwidth that keeps the peak on this
     grid is accepted on three conditions: the closed loop is stable, every axis with a reference has
     |S| of at most 0.3 at a twentieth of the bandwidth, and `modulus_margin` keeps the peak.
-    Truncated modes are included if known. Bandwidths are tried in steps of 9 %, from the top down,
-    then between the first success and the step above it.
+    Truncated modes are included if known. Bandwidths are tried downwards in steps of 9 % until one
+    is accepted. Those between it and the step before are tried next.
 
     Parameters
     ----------

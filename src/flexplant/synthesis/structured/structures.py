@@ -84,7 +84,7 @@ class ControllerStructure(Protocol):
     """Structure of a controller for `design_structured`, which it makes ready for a plant."""
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the structure made ready for a plant."""
+        """Return the controllers of this structure for a plant and its prepared matrices."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -130,7 +130,7 @@ class FixedOrder(Value):
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> _Entries:
-        """Return the structure made ready for a plant."""
+        """Return the controllers of this structure for a plant and its prepared matrices."""
         nu, ny = len(plant.u), len(plant.y)
         pattern = np.full((nu, ny), self.direct) if self.pattern is None else self.pattern
         if pattern.shape != (nu, ny):
@@ -250,7 +250,7 @@ class ObserverGains(Value):
     """
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the structure made ready for a plant."""
+        """Return the controllers of this structure for a plant and its prepared matrices."""
         p, n, root = prepared, prepared.A.shape[0], np.sqrt(prepared.speed)
         first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
         gain = -filter_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
@@ -315,7 +315,7 @@ class Parametrised:
         return f"Parametrised({counted(self.start.size, 'parameter')})"
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the structure made ready for a plant."""
+        """Return the controllers of this structure for a plant and its prepared matrices."""
         unit = np.where(self.start != 0, np.abs(self.start), 1.0)
 
         def matrices(theta: FloatArray) -> Matrices:
@@ -336,20 +336,20 @@ _HIGHEST, _FASTER = 0.98, 10.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TunedLaws(Value):
-    """A decoupled controller ``u = -before diag(laws) after y`` whose numbers are free.
+    """A decoupled controller ``u = -before diag(laws) after y`` whose parameters are optimised.
 
-    Each number that is not zero moves by a factor and keeps its sign: gains, corners, centres of
-    notches. No corner moves above half the rate, or above ten times the fastest pole of a
-    continuous plant; a corner that was given above this limit does not rise further. The search
-    begins with the given laws.
+    The search starts with the given laws. It multiplies each free parameter (gain, corner
+    frequency, centre of a notch) by a positive factor, so that signs do not change and zeros stay
+    zero. Corner frequencies are limited to half the sampling rate, or for a continuous plant to ten
+    times its fastest pole. A corner frequency that is given above this limit is not increased.
 
     Parameters
     ----------
     laws : as for `design_loops`
     before, after : as for `design_loops`, optional
     free : sequence of str
-        Names of the free numbers of the elements, among p, i, d, pole, freq, ratio, width, damping
-        and depth; by default all but the depth.
+        Names of the parameters that the search changes, among p, i, d, pole, freq, ratio, width,
+        damping and depth; by default all except depth.
 
     Examples
     --------
@@ -368,7 +368,7 @@ class TunedLaws(Value):
         require_known("number of an element", self.free, _NUMBERS)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the structure made ready for a plant."""
+        """Return the controllers of this structure for a plant and its prepared matrices."""
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)
         before = np.zeros((len(plant.u), len(axes.names)))
