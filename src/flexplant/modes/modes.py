@@ -37,7 +37,7 @@ _RATIO = 1.2
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshError(Value):
-    """Relative errors of the frequencies of a mesh, from a finer one.
+    """Relative errors of the frequencies of a mesh, estimated from a finer mesh.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ class MeshError(Value):
     freq : (m,) array [Hz]
         Frequencies of the coarse mesh.
     limit : (m,) array [Hz]
-        Extrapolated frequencies of an infinitely fine mesh, ``f_fine + (f_fine - f_coarse) / (r^p -
-        1)``.
+        Frequencies extrapolated to an infinitely fine mesh,
+        ``f_fine + (f_fine - f_coarse) / (r^p - 1)`` with the order of convergence p.
     ratio : float
-        Ratio r of the element sizes.
+        Ratio r of the element sizes: coarse over fine, above 1.
     partners : (m,) array of int
-        Positions, from 0, of the same modes in the finer mesh.
+        Positions, counted from 0, of the same modes in the finer mesh.
 
     Examples
     --------
@@ -72,7 +72,7 @@ class MeshError(Value):
 
     @property
     def error(self) -> FloatArray:
-        """Frequency of the mesh over that of the limit, less 1 (m,)."""
+        """Relative errors (m,) of the coarse mesh: ``freq / limit - 1``."""
         return np.asarray(self.freq / self.limit - 1.0)
 
     def __repr__(self) -> str:
@@ -227,49 +227,52 @@ class Modes(Placed, Value):
     """The first k modes of a structure, mass-normalised (paper, eq. (2), (3) and (5)).
 
     ``q = phi p`` with ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Modes are numbered from 1,
-    rigid-body modes included: mode 4 of a free plate is its first elastic one.
+    rigid-body modes included: mode 4 of a free plate is its first elastic mode.
 
-    Springs of negative stiffness (magnets) make rigid-body modes unstable. Those follow the modes
-    at 0, with negative frequencies as finite-element programs print them: omega = -3 rad/s stands
-    for ``Omega^2 = -9 1/s^2`` and the real poles ``|omega| (-zeta +- sqrt(zeta^2 + 1))``.
+    Springs of negative stiffness (magnets) make rigid-body modes unstable. The unstable modes stand
+    after the modes at 0. Their frequencies are negative, as finite-element programs print them:
+    omega = -3 rad/s stands for ``Omega^2 = -9 1/s^2``. Such a mode has the two real poles
+    ``|omega| (-zeta +- sqrt(zeta^2 + 1))``.
 
-    Residual attachment vectors extend the basis: what a unit force at a chosen place moves
-    statically beyond the k modes. They are made M-orthogonal to the modes and diagonal among each
-    other, so that (5) holds for the basis `[phi, vectors]` too, with `vector_omega` as frequencies.
+    Residual attachment vectors extend the basis. Such a vector is the static displacement under a
+    unit force at a chosen place, less the part that the k modes describe. The vectors are made
+    M-orthogonal to the modes and to each other, and K is diagonal in them. Equation (5) therefore
+    holds for the basis `[phi, vectors]` too, with `vector_omega` as frequencies.
 
     Parameters
     ----------
     omega : (k,) array [rad/s]
-        Undamped frequencies; exactly 0 for the rigid-body modes, which come first, then negative
-        ones of unstable modes.
+        Undamped frequencies: first the rigid-body modes, at exactly 0, then the unstable modes,
+        with negative values, then the elastic modes.
     zeta : (k,) array [-]
-        Damping ratios: damping rates over ``2 |omega|``.
+        Damping ratios: entries of ``2 Z Omega`` divided by ``2 |omega|``.
     phi : (n, k) array [1/sqrt(kg)]
-        Shapes. Complex for a structure whose damping is not proportional, then normalised to
-        ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``; of an unstable mode as in `NormalForm`,
-        the shapes of its two poles are ``Re phi +- Im phi``.
+        Mode shapes. They are complex where the damping is not proportional; a shape with the pole
+        lambda then has ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``. The two real poles of an
+        unstable mode have the shapes ``Re phi +- Im phi``, scaled as in `NormalForm`.
     dofs : DofSet
-        The n rows.
+        DOFs of the n rows.
     n_rigid : int
-        Number of rigid-body modes.
+        Number of rigid-body modes at 0.
     vectors, vector_omega, vector_zeta : (n, m), (m,), (m,) arrays
-        Residual attachment vectors.
+        Residual attachment vectors, with their frequencies [rad/s] and damping ratios.
     vector_dofs : sequence of m str
-        Places of the vectors. All vectors share all places, since they are mixed to become
-        diagonal.
+        Places of the forces of the vectors. Each vector is a combination of the displacements of
+        all these places, since the combinations make K diagonal.
     residual : (k,) array
-        ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode (rigid-body ones: 0), as
+        ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, 0 for rigid-body modes, as
         `solve_modes` found it; empty where it is not known.
     rounding : (k,) array
-        ``eps |phi|^T |K| |phi| / (2 omega^2)`` of each mode (rigid-body ones: 0): the relative
-        error of its frequency when the entries of K are rounded to double precision, which no
-        solver can undo; empty where it is not known.
+        Relative error of each frequency that rounding of K's entries to double precision can cause,
+        with any solver: ``eps |phi|^T |K| |phi| / (2 omega^2)`` with the machine precision eps, 0
+        for rigid-body modes; empty where it is not known.
     certificate : Certificate
         Checks made by `solve_modes`: `orthonormality` (largest entry of phi^T M phi - I),
         `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
-        `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
-        rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free), and
-        for a large model the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
+        `rigid_rounding` [Hz] (the suspension frequency below which a suspension cannot be told from
+        rounding of K's entries, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``), and for a large model
+        `counted` and `found`: the numbers of modes below the frequency `shift` [Hz] that the signs
+        of a factorisation count (Sturm) and that the solver found.
     notes : sequence of str
         Remarks on modes read from a file: assumptions, changes and missing items.
     calibration : MeasuredModes, optional
@@ -379,7 +382,7 @@ class Modes(Placed, Value):
 
     @property
     def n_unstable(self) -> int:
-        """Number of unstable modes, which stand between those at 0 and the elastic ones."""
+        """Number of unstable modes, which stand between the modes at 0 and the elastic modes."""
         return int(np.count_nonzero(self.omega < 0))
 
     @property
@@ -394,9 +397,9 @@ class Modes(Placed, Value):
 
     @property
     def poles(self) -> ComplexArray:
-        """Poles (k,) [rad/s] in the upper half plane; rigid-body ones exactly 0.
+        """Poles (k,) [rad/s] in the upper half plane; those of rigid-body modes are exactly 0.
 
-        ``-zeta omega + i omega sqrt(1 - zeta^2)``; of an unstable mode the one that grows.
+        ``-zeta omega + i omega sqrt(1 - zeta^2)``; for an unstable mode, its positive real pole.
         """
         return pole_pairs(self.omega, self.zeta)[0]
 
@@ -427,7 +430,7 @@ class Modes(Placed, Value):
         return np.concatenate([self.zeta, self.vector_zeta])
 
     def select(self, columns: Sequence[int] | IntArray) -> Modes:
-        """Return some of the modes, by position from 0, without the attachment vectors.
+        """Return some of the modes, without the attachment vectors; `columns` count from 0.
 
         Raises
         ------
@@ -458,8 +461,8 @@ class Modes(Placed, Value):
         Raises
         ------
         ModelError, LabelError
-            When it has no numbers, a number is not that of an elastic mode, or the modes are
-            complex.
+            When `measured` has no numbers, a number is not that of an elastic mode, or the modes
+            are complex.
         """
         require_real(self, "a pole is not of one of them alone (a reduced model can be calibrated)")
         known = range(self.n_rigid + self.n_unstable + 1, self.n_modes + 1)
@@ -478,9 +481,9 @@ class Modes(Placed, Value):
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
         """Return the frequency errors of the mesh by Richardson extrapolation.
 
-        Errors fall with the size of the elements to the power `order`; a frequency of the limit is
-        ``f_fine + (f_fine - f) / (r^order - 1)``. It does not show errors that both meshes share
-        (missing shear or mass, wrong material).
+        Errors fall with the size of the elements to the power `order`. With the ratio r of element
+        sizes, an infinitely fine mesh has the frequency ``f_fine + (f_fine - f) / (r^order - 1)``.
+        Errors that both meshes share (missing shear or mass, wrong material) do not show.
 
         Parameters
         ----------
@@ -498,18 +501,19 @@ class Modes(Placed, Value):
         return mesh_error(self, instance(finer, Modes, "finer", hint), order)
 
     def extrapolated(self, coarser: Modes, *, order: float = 2.0) -> Modes:
-        """Return the modes with the frequencies that this mesh and a coarser one point to.
+        """Return the modes with frequencies extrapolated from this mesh and a coarser one.
 
         Richardson's rule, as in `mesh_error`: ``f + (f - f_coarse) / (r^order - 1)`` with the ratio
-        r of element sizes. A mode without a partner in the coarser mesh, one of several of one
-        frequency for example, is corrected by the share that its neighbours in frequency are.
-        Shapes, damping ratios and rigid-body modes stay as they are.
+        r of element sizes. A mode may have no partner in the coarser mesh, for example when several
+        modes have one frequency. The relative correction of its neighbours in frequency is then
+        interpolated.
+        Mode shapes, damping ratios and rigid-body modes stay as they are.
 
         Parameters
         ----------
         coarser : Modes
-            Modes of the same structure with larger elements, 1.5 or 2 times as large, say, and
-            a few more modes than are needed, among which the highest find a partner.
+            Modes of the same structure with larger elements, for example 1.5 or 2 times as large.
+            Solve a few more modes here than are needed, so that the highest find a partner.
         order : float
             Order of convergence; 2 for plates and for bricks of eight nodes.
 
@@ -539,11 +543,11 @@ class Modes(Placed, Value):
 
     @property
     def orthonormal_basis(self) -> FloatArray:
-        """M-orthonormal real shapes B (n, b) that span those of the modes.
+        """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
-        Complex modes give M on their span by how they answer at once: ``B B' = sum Re(phi phi'
-        lambda / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes and
-        ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` for unstable ones.
+        For complex modes, M is not needed: ``B B'`` is the initial acceleration per force of the
+        modes, ``sum Re(phi phi' lambda / (i Im lambda))``. A rigid-body mode adds ``phi_r phi_r'``,
+        an unstable mode ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` (see `NormalForm`).
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
@@ -563,14 +567,20 @@ class Modes(Placed, Value):
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return loads (n, r) with the modal forces of ``M motions``, motions the shapes make."""
+        """Return loads (n, r) with the modal forces of ``M motions``, for motions (n, r).
+
+        The motions must be combinations of the shapes.
+        """
         # any load with these modal forces will do: B' f = c, where motions = B c
         basis = self.orthonormal_basis
         share = np.linalg.lstsq(basis, motions, rcond=None)[0]
         return np.asarray(np.linalg.lstsq(basis.T, share, rcond=None)[0])
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the relative parts (6,) of the rigid-body motions that the shapes cannot make."""
+        """Return the fraction (6,) of each rigid-body motion that the shapes cannot make.
+
+        Rotations turn about the point `about` [m].
+        """
         wanted, basis = self.rigid_motions(about), self.orthonormal_basis
         return relative_miss(basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0], wanted)
 

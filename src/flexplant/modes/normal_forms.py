@@ -29,21 +29,25 @@ class NormalForm(Value):
     Parameters
     ----------
     poles : (k,) complex array [rad/s]
-        Poles in the upper half plane, sorted by magnitude: rigid-body poles (exactly 0) first, then
-        the growing poles s1 > 0 of unstable pairs (s1, s2), then the others.
+        Poles in the upper half plane, sorted by magnitude in each of three groups: first the
+        rigid-body poles (exactly 0), then the positive real poles of unstable modes, then the
+        others. A spring of negative stiffness gives an unstable mode a pair of real poles: s1 > 0,
+        which grows and stands here, and s2 < 0, which decays and stands in `decaying`.
     phi : (n, k) array
-        Normalised to ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``: mass-normalised and real when
-        D is proportional, complex else. Rigid-body shapes are real and M-orthonormal. The shapes
-        of an unstable pair are ``v1 = Re phi + Im phi`` and ``v2 = Re phi - Im phi``, with
+        Mode shapes with ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``, where lambda is the pole.
+        They are real and mass-normalised when D is proportional, and complex otherwise. Rigid-body
+        shapes are real and M-orthonormal. The poles s1 and s2 of an unstable mode have the shapes
+        ``v1 = Re phi + Im phi`` and ``v2 = Re phi - Im phi``, with
         ``v1^T (2 s1 M + D) v1 = s1 - s2 = -v2^T (2 s2 M + D) v2``.
     n_rigid : int
-        How many rigid-body modes there are.
+        Number of rigid-body modes.
     decaying : (u,) array [1/s]
-        The decaying poles s2 < 0 of the unstable pairs.
+        Decaying poles s2 < 0 of the unstable modes.
     overdamped : (m,) array [1/s]
-        Negative real poles of motions that do not oscillate, by magnitude. They are not modes.
+        Negative real poles of motions that do not oscillate, sorted by magnitude. They are not
+        modes.
     overdamped_phi : (n, m) array
-        Their shapes, of any length.
+        Shapes of the overdamped motions, without a normalisation.
 
     Examples
     --------
@@ -76,21 +80,21 @@ class NormalForm(Value):
 
     @property
     def omega(self) -> FloatArray:
-        """Undamped frequencies (k,) [rad/s]; ``-sqrt(-s1 s2)`` of an unstable pair."""
+        """Undamped frequencies (k,) [rad/s]; ``-sqrt(-s1 s2)`` for an unstable mode."""
         omega, unstable = np.abs(self.poles), self._unstable
         omega[unstable] = -np.sqrt(-self.decaying * self.poles[unstable].real)
         return omega
 
     @property
     def zeta(self) -> FloatArray:
-        """Damping ratios (k,): ``-(s1 + s2) / (2 |omega|)`` of an unstable pair."""
+        """Damping ratios (k,); ``-(s1 + s2) / (2 |omega|)`` for an unstable mode."""
         omega, rate = np.abs(self.omega), -self.poles.real
         rate[self._unstable] = 0.5 * (rate[self._unstable] - self.decaying)
         rate[: self.n_rigid] = 0.0
         return np.asarray(rate / divisor(omega))
 
     def overdamped_below(self, rate: float) -> str:
-        """Return a note of the real poles up to a rate [1/s], "" without such poles."""
+        """Return a note on the overdamped poles of magnitude up to `rate` [1/s], or ""."""
         slow = self.overdamped[np.abs(self.overdamped) <= rate]
         if not slow.size:
             return ""
@@ -116,19 +120,22 @@ def normal_form(
     *,
     lowest: int | None = None,
 ) -> NormalForm:
-    """Return poles and shapes of a second-order model; rigid-body motions are deflated.
+    """Return poles and shapes of a second-order model whose rigid-body motions are known.
 
     Parameters
     ----------
     M, D, K : (n, n) arrays or sparse matrices
-        Symmetric; M positive definite; D None for no damping.
+        Symmetric matrices of mass, damping and stiffness. M is positive definite. D may be None,
+        for no damping.
     rigid : (n, r) array
         Independent vectors with ``K rigid = 0`` (up to rounding); (n, 0) for a held structure.
     motions : function, optional
-        Gives the M-orthonormal rigid-body motions (n, m), held or not: K may be negative for them.
+        Function without arguments that returns the M-orthonormal rigid-body motions (n, m) of the
+        geometry, including those that springs hold. K may have negative eigenvalues only for these
+        motions.
     lowest : int, optional
         Largest number of oscillating elastic modes. Overdamped motions are then listed separately
-        (`overdamped`). None: all modes, and overdamped motions raise an error.
+        (`overdamped`). None: all modes are returned, and overdamped motions raise an error.
 
     Returns
     -------
@@ -138,10 +145,10 @@ def normal_form(
     Raises
     ------
     ModelError
-        When M is not positive definite, an elastic mode has no stiffness or a negative one or is
-        overdamped, or D drags a rigid-body motion.
+        When M is not positive definite, when the stiffness of an elastic mode is zero or negative,
+        when an elastic mode is overdamped, or when D damps a rigid-body motion.
     SolverError
-        When the eigenvalues found fail their check.
+        When the check of the eigenvalues fails.
 
     Notes
     -----

@@ -71,47 +71,49 @@ def solve_modes(
     model : FEModel
         Structure whose modes are computed.
     count : int, optional
-        Number of modes, rigid-body modes included. When it cuts a repeated pair, one arbitrary
-        shape of the pair is kept.
+        Number of modes, rigid-body modes included. When only one of two modes with the same
+        frequency is within this number, its shape is an arbitrary combination of the two.
     below : float [Hz], optional
         Highest frequency of the modes that are kept. Without `count` and `below`, all modes of a
-        small model.
+        small model are returned.
     damping : ModalDamping or Rayleigh, optional
         Damping used in place of the model's D. None: the model's D, or no damping without D.
-        ``ModalDamping(solve_modes(model, count=9).zeta, others=0.005)`` keeps the ratios that D
-        gives the first modes, those on isolators for example.
+        ``ModalDamping(solve_modes(model, count=9).zeta, others=0.005)`` keeps the damping ratios
+        that D gives the first nine modes, for example those of a machine on isolators.
     compliance_at : place or sequence of places
-        DOF labels, points (motion z) or mappings at which the static compliance of the truncated
-        modes is kept, by residual attachment vectors.
+        Places where the static compliance of the truncated modes is kept: DOF labels, points
+        (motion z) or mappings of DOF labels to weights. Each place adds a residual attachment
+        vector (see `Modes`).
     compliance_damping : Damping or float, optional
-        Damping of the attachment vectors; None: damped like the modes.
+        Damping of the attachment vectors. None: the damping of the modes.
     factor : Cholmod, optional
-        Solver of a large sparse model in place of the library's own.
+        Sparse factorisation that replaces the library's own for a large model.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. None: a bar is shown on a terminal or in a notebook, for
+        work of more than two seconds.
 
     Returns
     -------
     Modes
-        Complex where the model's own D is not proportional. Checked: residuals, M-orthonormality,
-        and that no mode was left out. Each undamped frequency has a relative error of at most 1e-8
-        or its `rounding`, whichever is larger: soft suspensions next to stiff elements, fine meshes
-        and stiff grounding springs included. Springs of negative stiffness give unstable modes,
-        with negative frequencies (see `Modes`).
+        Modes with complex shapes where the model's own D is not proportional. Three checks are
+        made: the residuals, the M-orthonormality, and that no mode is missing. Each undamped
+        frequency has a relative error of at most 1e-8 or its `rounding`, whichever is larger. This
+        also holds for soft suspensions next to stiff elements, fine meshes and stiff springs to
+        ground. Springs of negative stiffness give unstable modes, with negative frequencies (see
+        `Modes`).
 
     Raises
     ------
     ModelError
-        When the request does not fit the model, K is indefinite in a motion that bends the
-        structure, or a motion without energy is not a rigid-body motion.
+        When the request does not fit the model, when K is negative for a motion that deforms the
+        structure, or when a motion without elastic energy is not a rigid-body motion.
     SolverError
-        When the answer fails its check.
+        When a check of the modes fails.
 
     Warns
     -----
     FlexplantWarning
-        When overdamped motions have real poles among the modes; modes cannot express them.
+        When overdamped motions have real poles among the modes. The modes do not include them.
 
     References
     ----------

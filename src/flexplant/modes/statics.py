@@ -286,14 +286,16 @@ def attachment_vectors(
 def static_response(model: Any, loads: FloatArray) -> FloatArray:
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
-    ``K u = f - M R R^T f``: the load minus the inertia of the rigid-body acceleration it causes. A
-    large model is solved with its factor. A small one is held at the r DOFs that distinguish
-    rigid-body motions best, which carry no force in equilibrium.
+    The equation is ``K u = f - M R R^T f``, with the M-orthonormal rigid-body motions R (n, r). Its
+    right-hand side is the load minus the inertia forces of the rigid-body acceleration that the
+    load causes, so it is in equilibrium. A large model is solved with its sparse factorisation. A
+    small model is held at r DOFs that prevent its rigid-body motions; no force acts at these
+    supports, since the load is in equilibrium.
 
     Parameters
     ----------
     model : FEModel
-        Model, or any object with M, K and rigid_body.
+        Model, or any object with the attributes M, K and rigid_body.
     loads : (n, m) array
         Forces on the DOFs [N, N m], a column for each case.
 

@@ -1,9 +1,10 @@
 """Model reduction: fewer degrees of freedom, same input-output behaviour, with error bounds.
 
-A `ReducedModel` has small M, D and K in physical DOFs and the expansion T of the whole structure.
+A `ReducedModel` has small M, D and K, in physical DOFs where the method keeps them, and the matrix
+T that expands its motion to the whole structure.
 
-- `reduce(modes, DesiredDofs(labels))`: the method of the paper; chosen DOFs, exact modes.
-- `select_dofs(modes, count)`: DOFs at which the modes are well distinguished.
+- `reduce(modes, DesiredDofs(labels))`: the method of the paper, with chosen DOFs and exact modes.
+- `select_dofs(modes, count)`: DOFs whose motions distinguish the modes well.
 - other methods: `ModalTruncation`, `ModalBalanced`, `Guyan`, `Irs`, `Serep`, `CraigBampton`,
   `Rubin`, `MacNeal`, `Krylov`; a new method is a class with one function.
 - `ReducedModel.quality(model, band=, inputs=, outputs=)`: frequencies, shapes, responses, bound.

@@ -105,8 +105,9 @@ class DofPartition:
 class Guyan(ReductionMethod):
     """Static condensation to a few DOFs: ``T = [I; -Kss^-1 Ksm]``.
 
-    Exact at 0 Hz for loads on the kept DOFs and for rigid-body motions; every frequency is at or
-    above the true one (Rayleigh-Ritz) and never falls below it when DOFs are added.
+    Here m marks the kept DOFs (masters) and s the condensed ones (slaves). The model is exact at
+    0 Hz for loads on the kept DOFs, and for rigid-body motions. Every frequency is at or above the
+    true frequency (Rayleigh-Ritz). It approaches the true frequency from above when DOFs are added.
 
     Parameters
     ----------
@@ -148,13 +149,15 @@ class Guyan(ReductionMethod):
 class Irs(ReductionMethod):
     """Improved reduced system: static condensation with the inertia of the condensed DOFs.
 
-    ``T_1 = T_s + S M T_s M_s^-1 K_s``, ``S = diag(0, Kss^-1)`` (one iteration is the IRS of
-    O'Callahan); in further iterations T replaces T_s in the second term and converges to SEREP,
-    which has the lowest k modes exactly.
+    ``T_1 = T_s + S M T_s M_s^-1 K_s`` with ``S = diag(0, Kss^-1)`` and the expansion T_s and the
+    matrices M_s, K_s of `Guyan`. One iteration is the IRS of O'Callahan. In further iterations the
+    previous T, with its reduced mass and stiffness, replaces T_s, M_s and K_s in the second term.
+    They converge to `Serep`, which has the lowest k modes exactly.
 
     Parameters
     ----------
-    dofs, damping : as for `Guyan`
+    dofs, damping
+        Kept DOFs, and damping of the reduced model, as for `Guyan`.
     iterations : int
         Largest number of iterations.
     tolerance : float
@@ -162,8 +165,8 @@ class Irs(ReductionMethod):
 
     Notes
     -----
-    Each mode converges like the ratio of its omega^2 to the lowest one of the structure with
-    the kept DOFs held.
+    The error of a mode falls in each iteration by about the ratio of its omega^2 to the lowest
+    omega^2 of the structure with the kept DOFs held.
 
     References
     ----------
@@ -233,20 +236,23 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Serep(ReductionMethod):
-    """System equivalent reduction (SEREP): chosen modes, exactly, in the same number of DOFs.
+    """System equivalent reduction (SEREP): k chosen modes are exact in a model of k DOFs.
 
-    ``T = phi phi_kk^-1`` like `DesiredDofs` (paper, eq. (6) to (8)), but the modes are solved here
-    and the matrices are ``T^T M T``, ``T^T K T`` and, for any D, ``T^T D T``.
+    ``T = phi phi_kk^-1`` as in `DesiredDofs` (paper, eq. (6) to (8)), where phi_kk holds the rows
+    of phi at the kept DOFs. In contrast to `DesiredDofs` the modes are solved by this method, and
+    the matrices are ``T^T M T``, ``T^T K T`` and, for any D, ``T^T D T``.
 
     Parameters
     ----------
-    dofs, damping : as for `Guyan`
+    dofs, damping
+        Kept DOFs, and damping of the reduced model, as for `Guyan`.
     modes : sequence of int, optional
-        Mode numbers from 1, as many as DOFs, with all rigid-body modes. None: the lowest modes.
+        Mode numbers, counted from 1: one for each DOF, all rigid-body modes among them. None: the
+        lowest modes.
 
     Notes
     -----
-    With fewer modes than DOFs M* would be singular, which is refused.
+    Fewer modes than DOFs are refused, since M* would be singular.
 
     References
     ----------
@@ -307,9 +313,11 @@ def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:
 class CraigBampton(ReductionMethod):
     """Static shapes of the boundary and modes of the interior with the boundary held.
 
-    ``T = [I 0; -Kii^-1 Kib phi_i]``: coordinates are the boundary DOFs, then one per
-    fixed-interface mode ("fixed mode 1", ...). Every frequency is at or above the true one
-    (Rayleigh-Ritz) and never rises when modes are added; rigid-body motions are exact.
+    ``T = [I 0; -Kii^-1 Kib phi_i]``, where b marks the boundary DOFs, i marks the interior DOFs,
+    and phi_i are the modes with the boundary held (fixed-interface modes). The coordinates are the
+    boundary DOFs, then one for each of these modes ("fixed mode 1", ...). Every frequency is at or
+    above the true frequency (Rayleigh-Ritz) and does not rise when modes are added. Rigid-body
+    motions are exact.
 
     Parameters
     ----------
@@ -455,11 +463,12 @@ class _FreeInterface(ReductionMethod):
 class Rubin(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, with its inertia.
 
-    The span is that of the modes and their residual attachment vectors; coordinates are the
-    boundary DOFs, then the modal ones ("mode 1", ...). The modes are exact, the response to loads
-    on the boundary is exact up to order omega^2, and all other frequencies are above the true ones.
-    For a free structure the flexibility holds for loads in equilibrium with its inertia (inertia
-    relief).
+    The motions are combinations of the modes of the structure with a free boundary and of residual
+    attachment vectors: the static displacements under a unit force at each boundary DOF, less the
+    part that the modes describe. The coordinates are the boundary DOFs, then the modal coordinates
+    ("mode 1", ...). The modes are exact. The response to loads on the boundary is exact up to order
+    omega^2. All other frequencies are above the true ones. For a free structure the residual
+    flexibility holds for loads in equilibrium with its inertia (inertia relief).
 
     Parameters
     ----------
@@ -490,14 +499,16 @@ class Rubin(_FreeInterface):
 class MacNeal(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, without inertia.
 
-    Like `Rubin`, but the truncated part responds statically: the boundary coordinates have no mass
-    (rows of M* are zero), and the poles are only those of the modes. Exact at 0 Hz for loads on the
-    boundary. A plant of this model has a feedthrough; coupling and updating give the boundary mass.
+    This method differs from `Rubin` in the truncated part of the response, which is static. The
+    boundary coordinates have no mass (their rows of M* are zero), and the poles are only those of
+    the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model has a
+    feedthrough. The boundary can receive mass by coupling or by an update.
 
     Parameters
     ----------
     boundary, modes, damping
-        As for `Rubin`; the damping applies to the modes only, None: their part of D.
+        Kept DOFs, number of free modes, and damping, as for `Rubin`. The damping applies to the
+        modes only. None: the part of D that acts on the modes.
 
     References
     ----------

@@ -26,7 +26,10 @@ _REFRESH = 64
 
 
 class SelectionCriterion(Value):
-    """The base class of criteria for the choice of rows of a basis.
+    """The base class of criteria by which `select_dofs` chooses DOFs.
+
+    Modes and attachment vectors are the k columns of a matrix, which has a row for each DOF. A
+    criterion chooses rows of this matrix.
 
     Examples
     --------
@@ -37,18 +40,22 @@ class SelectionCriterion(Value):
 
     @abstractmethod
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return which rows of the pool (p, k) to take in addition to the required ones (q, k)."""
+        """Return the positions of the rows of `pool` (p, k) that are chosen.
+
+        They are chosen in addition to the rows `required` (q, k); `count` is their number.
+        """
 
     @abstractmethod
     def values(self, rows: Rows) -> FloatArray:
-        """Return the value of the criterion at each of the chosen rows, in their order."""
+        """Return the value of the criterion for each of the chosen rows, in their order."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PivotedQr(SelectionCriterion):
-    """QR with column pivoting: each next DOF is the one least explained by the previous ones.
+    """QR with column pivoting: each DOF is the one that the previous DOFs explain least.
 
-    The value of a DOF is the length of its row that previous rows do not explain.
+    The row of a DOF holds its motion in each mode. The value of a DOF is the length of the part of
+    its row that is orthogonal to all previous rows.
 
     References
     ----------
@@ -81,10 +88,11 @@ class PivotedQr(SelectionCriterion):
 class EffectiveIndependence(SelectionCriterion):
     """Effective independence: drop the DOF that adds least to the information on the modes.
 
-    The search starts with all candidates. Their information is ``Q = phi^H phi``, in which row i
-    has the share ``E_i = phi_i Q^-1 phi_i^H`` from 0 to 1 (at 1, a mode is lost without the row).
-    The row with the lowest share is dropped, Q^-1 is updated by a rank-one downdate, and so on.
-    Fewer DOFs than modes are chosen by `PivotedQr` from the last k.
+    The search starts with all candidates. Their information on the modes is ``Q = phi^H phi``. Row
+    i of phi has the share ``E_i = phi_i Q^-1 phi_i^H`` in it, from 0 to 1. At 1, the other rows
+    cannot distinguish all modes. The row with the lowest share is dropped, Q^-1 is updated, and
+    this is repeated. When fewer DOFs than modes are wanted, dropping stops at the number of modes,
+    and `PivotedQr` chooses from the rows that are left.
 
     References
     ----------
@@ -120,7 +128,7 @@ class EffectiveIndependence(SelectionCriterion):
         return [int(i) for i in left]
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return the share E_i of each row in the information of all."""
+        """Return the share E_i of each row in the information of all chosen rows."""
         vectors, size, _ = la.svd(rows, full_matrices=False)
         return np.asarray(np.sum(np.abs(vectors[:, size > ROUNDING * size[0]]) ** 2, axis=1))
 
@@ -144,9 +152,10 @@ def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Greedy(SelectionCriterion):
-    """Each next DOF is the one that leaves the largest smallest singular value of phi_kk.
+    """Choice of one DOF after the other, each for the largest smallest singular value of phi_kk.
 
-    The value of a DOF is that singular value when the DOF was taken.
+    phi_kk holds the rows of the modes at the chosen DOFs. The value of a DOF is the smallest
+    singular value directly after this DOF was chosen.
 
     Examples
     --------
@@ -170,7 +179,7 @@ class Greedy(SelectionCriterion):
         return found
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return the smallest singular value of each row with those before it."""
+        """Return, for each row, the smallest singular value of this row and those before it."""
         return np.array([la.svdvals(rows[: i + 1])[-1] for i in range(rows.shape[0])])
 
 
@@ -195,7 +204,7 @@ def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DofSelection(Value):
-    """Selected DOFs for `DesiredDofs`, `Guyan` or as a boundary.
+    """DOFs that `select_dofs` chose, for use by `DesiredDofs`, `Guyan` or as a boundary.
 
     Parameters
     ----------
@@ -242,14 +251,18 @@ def select_dofs(
     criterion: SelectionCriterion | None = None,
     limit: float = 1e12,
 ) -> DofSelection:
-    """Return DOFs at which modes and attachment vectors are well distinguished.
+    """Return DOFs whose motions distinguish modes and attachment vectors well.
+
+    phi_kk holds the rows of modes and attachment vectors at the chosen DOFs. A low condition number
+    of this matrix is good, since `DesiredDofs` inverts it.
 
     Parameters
     ----------
     modes : Modes
         Modes, real or complex, with their attachment vectors.
     count : int
-        Number of DOFs, at most modes plus vectors; `reduce` needs exactly as many.
+        Number of DOFs, at most the number of modes plus that of attachment vectors. `DesiredDofs`
+        keeps all modes only when it is equal to this sum.
     candidates : iterable of str, optional
         Labels to choose from; None: all displacements (no rotations).
     required : iterable of str
@@ -262,7 +275,7 @@ def select_dofs(
     Raises
     ------
     ModelError
-        When `count` is not a whole number, or no candidates distinguish them.
+        When `count` is not a whole number, or no choice of candidates distinguishes the modes.
 
     Examples
     --------

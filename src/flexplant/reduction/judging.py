@@ -346,51 +346,57 @@ class ReductionQuality(Value):
     modes : (m,) array of int
         Numbers of the full model's modes that are compared.
     full_freq, freq : (m,) arrays [Hz]
-        Frequencies of these modes, and of the reduced modes paired with them, one to one, by shape
-        and frequency; NaN without a partner with a MAC of 0.5.
+        Frequencies of these modes, and of the reduced modes that are paired with them one to one,
+        by shape and frequency. NaN where no reduced mode has a MAC of at least 0.5.
     freq_error : (m,) array
-        Relative error; 0 for rigid-body modes, NaN without a partner.
+        Relative error of each frequency; 0 for rigid-body modes, NaN without a partner.
     mac : (m,) array
-        MAC of each full mode with the reduced one: mass-weighted for an FEModel. For repeated
-        modes, whose shapes are an arbitrary basis of a subspace, the squared cosines of the angles
-        between the two subspaces.
+        Modal assurance criterion (MAC) of each full mode and its reduced mode, with the mass matrix
+        as weight for an FEModel: 1 for equal shapes, 0 for orthogonal ones. The shapes of repeated
+        modes are an arbitrary basis of a subspace. For them, these are the squared cosines of the
+        angles between the two subspaces.
     group : (m,) array of int
-        Number of the first mode whose shape cannot be distinguished from that of the mode. When one
-        of several repeated modes has no partner, it is not known which one.
+        Number of the first mode whose shape cannot be distinguished from the shape of this mode.
+        When one of several repeated modes has no partner, it is not known which one.
     check_freq : (f,) array [Hz]
-        Frequencies of the comparison of responses.
+        Frequencies at which the responses are compared.
     frf_error : (p, q) array
-        Largest error over the band relative to the largest response of the channel, outputs by
-        inputs.
+        Largest error of each channel over the band, relative to the largest response of the
+        channel. Rows are outputs, and columns are inputs.
     silent : (p, q) array of bool
-        Channels of the full model that consist of rounding: below 1e-9 of the geometric mean of the
-        largest responses of the input and of the output to forces on themselves. Their errors are
-        relative to this mean; the printed worst channel is not silent.
+        True for channels of the full model that consist of rounding. Their response is below 1e-9
+        of a reference: the geometric mean of the largest responses of the input and of the output
+        to forces at their own places. Errors of these channels are relative to this reference. The
+        printed worst channel is not one of them.
     resonance_error : (p, q) array
         Largest error at a resonance of either model, relative to the largest response of any
-        channel of both models there; NaN without a resonance in the band, and for silent channels.
+        channel of both models at this frequency. NaN without a resonance in the band, and for
+        silent channels.
     antiresonance_error : (p, q) array
-        Largest error at an antiresonance of either model, relative to the larger response of both
-        there: 1 where only one model has the antiresonance. NaN without an antiresonance. For
-        silent channels relative to the mean of `silent`.
+        Largest error at an antiresonance of either model, relative to the larger response of the
+        two models there. It is 1 where only one model has the antiresonance, and NaN without an
+        antiresonance. For silent channels it is relative to the reference of `silent`.
     static_error : (p, q) array
-        Error of the elastic static compliance relative to sqrt(G_ii G_jj); where this is rounding,
-        relative to the responses of both places at the upper end of the band.
+        Error of the elastic static compliance G_ij, relative to sqrt(G_ii G_jj). Where this root
+        is only rounding, the error is relative to the responses of both places at the upper end of
+        the band.
     true_error : float [m/N]
-        Largest singular value of the error at the check frequencies.
+        Largest singular value of the error of the response at the check frequencies.
     orthogonality : float
-        Departure of the expanded reduced modes from M-orthonormality; NaN against Modes.
+        Departure of the expanded reduced modes from M-orthonormality. NaN where the full structure
+        is given by Modes.
     condition : float
         Condition number of the matrix that the method inverted.
     inputs, outputs : sequence of str
         Names of the inputs and outputs.
     route : str
-        Method by which the full responses were found.
+        Method by which the full responses were computed.
     full_error : float
-        Difference between these and direct solutions with the full matrices, relative to the peak;
-        NaN against Modes.
+        Difference between these responses and direct solutions with the full matrices, relative to
+        the peak. NaN where the full structure is given by Modes.
     bound : ErrorBound, optional
-        A-priori bound of the method, when it holds for these channels.
+        Bound of the error that the reduction method gives without computing responses, when it
+        holds for these channels.
     bounded : bool
         Whether the bound covers all compared modes. The bound of a reduction of some modes does not
         hold for the other modes of the model.
@@ -437,7 +443,7 @@ class ReductionQuality(Value):
 
     @property
     def band_bound(self) -> float | None:
-        """The a-priori bound [m/N] for frequencies up to the last one checked, if there is one."""
+        """The bound [m/N] for frequencies up to the highest checked one; None without a bound."""
         if self.bound is None:
             return None
         top = float(self.check_freq[-1])
@@ -445,9 +451,10 @@ class ReductionQuality(Value):
 
     @property
     def holds(self) -> bool:
-        """Whether the true error at the check frequencies is within the bound, if there is one.
+        """Whether the true error at the check frequencies is within the bound.
 
-        A bound that does not cover all modes that were compared does not count (`bounded`).
+        It is also True without a bound, and when the bound does not cover all modes that were
+        compared (see `bounded`).
         """
         limit = self.band_bound if self.bounded else None
         return limit is None or self.true_error <= limit * (1 + SAME)

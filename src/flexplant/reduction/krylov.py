@@ -27,28 +27,31 @@ from .reduced import ReducedModel
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Krylov(ReductionMethod):
-    """Second-order rational Krylov reduction: moments of the response at given frequencies.
+    """Second-order rational Krylov reduction: it matches the response at given frequencies.
 
-    At each frequency f the response X = (s^2 M + s D + K)^-1 B, s = 2 pi i f, and its first
-    `moments` - 1 derivatives span the basis, as real vectors, orthonormal in M, after the
-    rigid-body motions. M* is the unit matrix and the coordinates are "krylov 1", ... From the
-    inputs to any place, `moments` Taylor coefficients at each s agree with the full model, and
-    twice this number between inputs (a Galerkin projection of symmetric matrices keeps both sides).
-    Without D the coefficients are those in s^2. Frequencies are above the true ones
-    (Rayleigh-Ritz).
+    The response to the inputs is X(s) = (s^2 M + s D + K)^-1 B with s = 2 pi i f. At each given
+    frequency f, X and its first `moments` - 1 derivatives with respect to s are computed. Their
+    real and imaginary parts, together with the rigid-body motions, span the basis T. T is
+    orthonormal in M, so that M* is the unit matrix. The coordinates are "krylov 1", ...
+
+    A moment is a coefficient of the Taylor series of the response at s. From the inputs to any
+    place, the first `moments` coefficients agree with those of the full model. Between the inputs,
+    twice this number agree, since the matrices are symmetric. Without D, the series is one in s^2.
+    All frequencies of the reduced model are above the true ones (Rayleigh-Ritz).
 
     Parameters
     ----------
     inputs : place or sequence of places
         Places of loads: DOF labels, points (z) or mappings.
     freq : float or sequence of float [Hz]
-        Expansion points, which must not be resonances of an undamped model; 0 is the static
-        response (for a free structure: to loads in equilibrium with its inertia).
+        Frequencies at which the response is matched. A resonance of an undamped model is refused. 0
+        matches the static response (for a free structure, the response to loads in equilibrium with
+        its inertia).
     moments : int
         Number of moments at each frequency.
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model's modes, with a basis of the undamped structure. None: the
-        model's D, also in the basis.
+        Damping of the reduced model's modes; the basis is then that of the undamped structure.
+        None: the model's D, which also acts on the basis.
 
     References
     ----------

@@ -121,21 +121,23 @@ def projected_model(
     Parameters
     ----------
     model : FEModel
+        Full structure.
     T : (n, k) array
         Columns that span the kept motions, including the rigid-body motions.
     dofs : DofSet
-        The k DOFs of the coordinates; empty where the coordinates are not physical.
+        DOFs of the k coordinates; empty where the coordinates are not DOFs.
     method : str
-        Name of the method, for messages and reprs.
+        Name of the method, which messages and the printed model show.
     coordinates : sequence of str
-        Names of coordinates that are not physical.
+        Names of the coordinates, where these are not all DOFs.
     damping : Damping, optional
-        Replaces the D of the model.
+        Damping of the reduced model in place of the model's D.
     condition, condition_of : float, str
-        Condition number of the inverted matrix, and the name of this matrix.
+        Condition number of the matrix that your method inverts, and the name of this matrix.
     bound : ErrorBound, optional
+        Bound of the error between channels, where your method has one.
     singular : str
-        Advice for the error where the columns depend on each other.
+        Advice that the error message gives when the columns of T depend on each other.
     static_at : sequence of str
         Labels whose static response is exact in the span of T.
 
@@ -146,7 +148,7 @@ def projected_model(
     Raises
     ------
     ModelError
-        When the columns of T depend on each other, or do not hold the rigid-body motions.
+        When the columns of T depend on each other, or do not contain the rigid-body motions.
 
     Examples
     --------
@@ -204,7 +206,9 @@ _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ReductionMethod(Value):
-    """The base class of methods from a structure to a reduced model.
+    """The base class of reduction methods, which make a reduced model of a structure.
+
+    Your own method is a class with the function `ReductionMethod.reduced`.
 
     Parameters
     ----------
@@ -234,10 +238,10 @@ class DesiredDofs(ReductionMethod):
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
-        Labels of the kept DOFs, as many as modes plus attachment vectors. With fewer labels than
-        modes and no attachment vectors, the same number of lowest modes is kept, and the model
-        stores the others as `truncated`. For an FEModel the number of solved modes is that of the
-        labels minus that of the places in `static_at`.
+        Labels of the kept DOFs. Their number is that of the modes plus that of the attachment
+        vectors. Without attachment vectors it may be smaller. The same number of lowest modes is
+        then kept, and the model stores the other modes as `truncated`. For an FEModel, the number
+        of modes that are solved is that of the labels minus that of the places in `static_at`.
     static_at : place or sequence of places
         Places where attachment vectors keep the static compliance of truncated modes, with an
         FEModel.
@@ -373,7 +377,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     Returns
     -------
     ReducedModel
-        Its rigid-body motions are exact with every method. `.quality(...)` judges it.
+        Reduced model. Its rigid-body motions are exact with every method. `ReducedModel.quality`
+        gives its errors.
 
     Raises
     ------

@@ -30,7 +30,9 @@ def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeRanking(Value):
-    """Which elastic modes matter to which channels.
+    """Which elastic modes matter to which channels, as `rank_modes` finds them.
+
+    b holds the displacements of a mode at the inputs, and c those at the outputs.
 
     Parameters
     ----------
@@ -46,9 +48,9 @@ class ModeRanking(Value):
     peak : (m,) array [m/N]
         Largest singular value of the response of each mode over all frequencies.
     exact : (2 m,) array [m/N]
-        Hankel singular values of all elastic modes together, by Lyapunov equations, the largest
-        first; two for each mode, close to its `total` when damping is low and modes are well
-        separated.
+        Hankel singular values of the model of all elastic modes together, from Lyapunov equations,
+        the largest first. Each mode has two. They are close to its `total` when damping is low and
+        the modes are well separated.
     inputs, outputs : sequence of str
         Names of the inputs and outputs.
 
@@ -101,22 +103,23 @@ def rank_modes(
 ) -> ModeRanking:
     """Return which elastic modes matter to which channels, by Hankel values.
 
-    The two Hankel values of a single lightly damped mode are about
-    ``||c|| ||b|| / (4 zeta omega^2)`` with its forces b and displacements c at the channels. They
-    are nearly the same in a sum of modes whose distance is large compared with their damping.
+    The two Hankel singular values of a single lightly damped mode are about
+    ``||c|| ||b|| / (4 zeta omega^2)``. Here b holds the modal forces of unit forces at the inputs,
+    and c holds the displacements of the mode at the outputs. The values are nearly the same in a
+    model of many modes, when the frequencies differ by much more than the widths of the resonances.
 
     Parameters
     ----------
     modes : Modes
         Real and damped modes; attachment vectors are ignored.
     inputs, outputs : place or sequence of places
-        Places of forces and displacements: DOF labels, points (z) or mappings; no outputs: the
-        inputs.
+        Places of forces and displacements: DOF labels, points (z) or mappings. Without outputs,
+        they are the inputs.
 
     Raises
     ------
     ModelError
-        When the modes are complex or an elastic one is undamped.
+        When the modes are complex, or an elastic mode is undamped.
 
     References
     ----------
@@ -194,15 +197,16 @@ class ErrorBound(Value):
     Parameters
     ----------
     value : float [m/N]
-        Upper bound, over all frequencies, of the largest singular value of the full minus the
-        reduced response (displacement per force) between the channels.
+        Upper bound of the error over all frequencies. The error is the largest singular value of
+        the difference of the full and the reduced response (displacement per force) between the
+        channels.
     inputs, outputs : sequence of str
         Channels for which the bound holds.
     rule : str
         Rule from which the bound follows.
     terms : (k, 3) array, optional
-        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode;
-        they give the bound below a frequency.
+        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode,
+        with its displacements b at the inputs and c at the outputs. `ErrorBound.below` uses them.
     static : float [m/N], optional
         Exact error at 0 Hz.
     covers : int, optional
@@ -239,9 +243,10 @@ class ErrorBound(Value):
     def below(self, freq: float) -> float:
         """Return the bound [m/N] for all frequencies up to `freq` [Hz].
 
-        Modes above the band are far from their peaks: the sum over the neglected modes of the
-        largest ``g_i |h_i(w)|`` there, or, where smaller, the static error plus the sum of the
-        largest ``g_i |h_i(w) - h_i(0)|``. It is at most `value`.
+        A neglected mode i has the gain g_i and the response g_i h_i(w), which is far below its peak
+        when the mode lies above `freq`. The bound is the smallest of three values: `value`, the sum
+        of the largest ``g_i |h_i(w)|`` up to `freq`, and the static error plus the sum of the
+        largest ``g_i |h_i(w) - h_i(0)|``. The second value needs `terms`, the third also `static`.
         """
         top = 2 * np.pi * positive(freq, "freq")
         if self.terms is None:

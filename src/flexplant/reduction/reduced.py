@@ -43,45 +43,49 @@ class ReducedModel(Value):
     Parameters
     ----------
     M, D, K : (k, k) arrays
-        The paper's M*, D*, K* of equation (8).
+        Reduced matrices of mass, damping and stiffness: M*, D*, K* of equation (8) of the paper.
     T : (n, k) array
-        Expansion to the full structure, equations (4) and (7).
+        Expansion matrix, which gives the motion of the full structure (equations (4) and (7)).
     dofs : DofSet
-        The physical DOFs that are coordinates of the reduced model: all k of them (`DesiredDofs`,
-        `Guyan`), the first ones (`CraigBampton`) or none (`ModalTruncation`).
+        Physical DOFs that are coordinates of the reduced model. With `DesiredDofs` and `Guyan` all
+        k coordinates are such DOFs. With `CraigBampton` only the first coordinates are such DOFs.
+        With `ModalTruncation` this set is empty.
     full_dofs : DofSet
         The n DOFs of the full structure, with its shape functions.
     rigid_body : (k, r) array
-        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. An eigenvalue solver for (K*,
-        M*) would give frequencies of rounding size, some imaginary.
+        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. They are stored, since an
+        eigenvalue solver for (K*, M*) would give their frequencies as small numbers of rounding
+        size, some of them imaginary.
     method : str
         Name of the reduction method.
     condition : float
-        Condition number of the inverted matrix: phi_kk, or the scaled M*.
+        Condition number of the matrix that the method inverts: phi_kk (the rows of the modes at the
+        kept DOFs), or the scaled M*.
     coordinates : sequence of k str
-        Names of all coordinates: the labels of `dofs` first, then generalised ones such as
-        "mode 7". Empty: the labels of `dofs`.
+        Names of all coordinates: first the labels of `dofs`, then names of coordinates that are not
+        DOFs, such as "mode 7". Empty: the labels of `dofs`.
     condition_of : str
-        Name of the matrix of `condition`.
+        Name of the matrix whose condition number is `condition`.
     bound : ErrorBound, optional
         Bound of the error between channels, where the method has one.
     truncated : Modes, optional
-        Modes over `full_dofs` that `reduce` knew and left out, M-orthogonal to the kept ones. They
-        do not change when M, D or K change (an update); the modes of the changed full structure are
-        then more accurate.
+        Modes of the full structure, with the rows `full_dofs`, that were solved but left out by
+        `reduce`. They are M-orthogonal to the kept modes. They stay the same when an update changes
+        M, D or K; newly solved modes of the changed full structure are then more accurate.
     n_vectors : int
-        Number of shapes that are attachment vectors. The same number of modes of the model are not
-        modes of the structure; they represent the compliance of the truncated modes.
+        Number of columns of the basis that are residual attachment vectors (see `Modes`). The same
+        number of modes of this model are not modes of the structure: they represent the static
+        compliance of the truncated modes.
     static_at : sequence of str
         Places whose static compliance is exact.
     joint_motions : (k, m) array, optional
-        Motions of the components of a joined machine that its rigid joints allow.
+        Rigid motions of the components of a joined machine, as far as its joints allow them.
     joining : Value, optional
         Record of how a machine was joined, with its checks; None after an update.
     calibration : MeasuredModes, optional
         The measured poles that `calibrated` put in.
     machines : Machines, optional
-        Uncertainty of the machine that an update leaves.
+        Uncertainty of the machine that remains after an update.
 
     References
     ----------
@@ -168,15 +172,15 @@ class ReducedModel(Value):
         return moved
 
     def row(self, at: Place, direction: str = "z") -> FloatArray:
-        """Return the row (k,) that gives the motion at a place of the full structure.
+        """Return the row (k,) whose product with the coordinates is the motion at a place.
 
-        Its transpose is the reduced load f* of a unit force there.
+        Its transpose is the load on the coordinates of a unit force at this place.
 
         Parameters
         ----------
         at : str, (3,) array [m] or mapping
-            A DOF label, a point, or {label: weight}: any of the full structure, not only of the
-            desired DOFs.
+            A DOF label, a point, or {label: weight}. It may be any place of the full structure, not
+            only one of the kept DOFs.
         direction : str
             Direction of the motion at a point.
         """
@@ -191,7 +195,10 @@ class ReducedModel(Value):
         return np.asarray(self.M @ motions)
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
+        """Return the fraction (6,) of each rigid-body motion that T cannot make.
+
+        Rotations turn about the point `about` [m].
+        """
         wanted = rigid_motions(self.full_dofs, real_array(about, "about", (3,)))
         return relative_miss(self.T @ self.rigid_motions(about), wanted)
 
@@ -218,7 +225,7 @@ class ReducedModel(Value):
 
     @property
     def body_motions(self) -> FloatArray:
-        """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
+        """The M-orthonormal rigid-body motions (k, r) that T can make, whether held or free."""
         if self.joint_motions is not None:
             return orthonormalised(self.M, self.joint_motions, dependent="drop")
         made = self.missed_motions() < NEGLIGIBLE
@@ -232,9 +239,11 @@ class ReducedModel(Value):
     def condensed(self) -> tuple[ReducedModel, FloatArray, FloatArray]:
         """Return the model without its massless coordinates, and their flexibility.
 
-        These follow without delay: ``q_k = S q_c + G T^T f``, exactly. Returns the model in the c
-        coordinates with mass, S (k, c), and G (k, k) [m/N], the immediate displacement per load on
-        the coordinates; the model itself and zero when all coordinates have mass.
+        Massless coordinates follow the others and the loads without delay:
+        ``q_k = S q_c + G T^T f``, exactly. The method returns three things: the model in the c
+        coordinates with mass, the matrix S (k, c), and the flexibility G (k, k) [m/N], which is the
+        immediate displacement per load on the coordinates. When all coordinates have mass, the
+        model does not change and G is zero.
 
         Raises
         ------
@@ -262,8 +271,9 @@ class ReducedModel(Value):
     def calibrated(self, measured: Any) -> ReducedModel:
         """Return the model with the measured poles of some modes; the shapes stay.
 
-        ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, D* likewise. Truncated modes stay as
-        they are, rigid-body modes at 0.
+        The new stiffness is ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, with the measured
+        frequencies omega_m; D* changes in the same way. Truncated modes do not change, and
+        rigid-body modes stay at 0.
 
         Parameters
         ----------
@@ -273,8 +283,8 @@ class ReducedModel(Value):
         Raises
         ------
         ModelError, LabelError
-            When it has no numbers, a number is not that of an elastic mode, or the model has
-            massless coordinates or unstable modes (magnets).
+            When `measured` has no numbers, a number is not that of an elastic mode, or the model
+            has massless coordinates or unstable modes (magnets).
         SolverError
             When damping couples the modes too much.
         """
@@ -292,8 +302,9 @@ class ReducedModel(Value):
         """Return the model with the truncated modes as further coordinates.
 
         ``M = diag(M*, I)``, ``D = diag(D*, 2 Z Omega)``, ``K = diag(K*, Omega^2)``,
-        ``T = [T, phi]``: a combination of (5) and (8). Static coordinates ("static 1") are dropped,
-        since the truncated modes hold their compliance. Without truncated modes: the model itself.
+        ``T = [T, phi]`` with the shapes phi of the truncated modes, from equations (5) and (8) of
+        the paper. Static coordinates ("static 1", ...) are dropped, since the truncated modes
+        contain their compliance. Without truncated modes, the model itself is returned.
 
         Raises
         ------
@@ -326,11 +337,12 @@ class ReducedModel(Value):
         )
 
     def modes(self) -> Modes:
-        """Return all modes; rigid-body ones exactly at 0.
+        """Return all modes of the reduced model, with rigid-body modes at exactly 0.
 
-        Shapes are in the desired DOFs where all coordinates are DOFs, else those of the full
-        structure, ``T phi_k``. Complex where D is not proportional (after a damper was added).
-        Massless coordinates and overdamped motions give no modes.
+        The rows of the shapes are the kept DOFs where all coordinates are DOFs. Otherwise they are
+        the DOFs of the full structure, ``T phi_k``. The shapes are complex where D is not
+        proportional, for example after a damper was added. Massless coordinates and overdamped
+        motions give no modes.
 
         Raises
         ------
@@ -362,7 +374,7 @@ class ReducedModel(Value):
         freq: FloatArray | None = None,
         loss: float | None = None,
     ) -> ReductionQuality:
-        """Return the errors of this model relative to the full one, found independently.
+        """Return the errors of this model relative to the full model, computed independently.
 
         Parameters
         ----------
@@ -372,16 +384,16 @@ class ReducedModel(Value):
         band : (float, float) [Hz]
             Frequency band of the comparison.
         inputs, outputs : places
-            Places of forces and displacements: DOF labels, points (z) or mappings. No inputs: those
-            of the bound. No outputs: the inputs.
+            Places of forces and displacements: DOF labels, points (z) or mappings. Without inputs,
+            the channels are those of the bound. Without outputs, they are the inputs.
         count : int, optional
-            Number of modes that are compared; None: those up to the end of the band.
+            Number of modes that are compared. None: all modes up to the end of the band.
         freq : (m,) array [Hz], optional
-            Check frequencies; None: the resonances and antiresonances of both models in the band,
-            and a grid over it.
+            Check frequencies. None: the resonances and antiresonances of both models in the band,
+            and a grid over the band.
         loss : float, optional
-            Loss factor of both when the FEModel has no D: ``K (1 + i loss)``. None: twice the mean
-            damping ratio of the reduced model, 0.01 when it has none.
+            Loss factor of both models when the FEModel has no D: ``K (1 + i loss)``. None: twice
+            the mean damping ratio of the reduced model, or 0.01 when that model is undamped.
 
         Raises
         ------

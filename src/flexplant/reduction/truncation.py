@@ -31,8 +31,8 @@ _RESIDUE = "residual flexibility over twice the damping (Cauchy-Schwarz)"
 class ModalTruncation(ReductionMethod):
     """The lowest (or chosen) modes alone (paper, eq. (5)), with or without static correction.
 
-    Coordinates are "mode 1", ..., then "static 1", ... With `static_at`, residual attachment
-    vectors keep the static compliance there of what was truncated.
+    The coordinates are "mode 1", ..., then "static 1", ... With `static_at`, residual attachment
+    vectors (see `Modes`) keep the static compliance of the truncated modes at these places.
 
     Parameters
     ----------
@@ -43,19 +43,25 @@ class ModalTruncation(ReductionMethod):
     static_at : place or sequence of places
         Places where the static compliance is kept.
     inputs, outputs : place or sequence of places
-        Channels of the a-priori bound; no outputs: the inputs.
+        Channels of the error bound. Without outputs, they are the inputs.
     damping : ModalDamping or Rayleigh, optional
         Damping of modes and vectors in place of the model's D, with an FEModel.
 
     Notes
     -----
-    With `Modes`, the bound is the sum over the truncated ones (attachment vectors included) of
-    ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, the peak of each mode. It covers the solved
-    modes only (`ErrorBound.covers`). With an FEModel and one damping ratio for all modes, the bound
-    covers all modes of the structure, also unsolved ones: by Cauchy-Schwarz the sum is at most
-    ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``, G the residual flexibility of one
-    static solution. With `static_at`, the peaks of the vectors are added. Over a band, modes above
-    it are far from their peaks, and `ErrorBound.below(freq)` is tighter by orders of magnitude.
+    With `Modes`, the bound is the sum of the peaks of all truncated modes and attachment vectors. A
+    peak is ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, with the displacements b of the
+    mode at the inputs and c at the outputs. This bound covers the solved modes only
+    (`ErrorBound.covers`).
+
+    With an FEModel and one damping ratio for all modes, the bound covers all modes of the
+    structure, including modes that were not solved. By the Cauchy-Schwarz inequality the sum is at
+    most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``. B and C hold the places of
+    inputs and outputs, and G is the residual flexibility, from one static solution. With
+    `static_at`, the peaks of the attachment vectors are added.
+
+    Below a frequency, modes above it are far from their peaks. `ErrorBound.below` gives a bound for
+    this band that is often smaller by orders of magnitude.
 
     Examples
     --------
@@ -144,27 +150,31 @@ class ModalTruncation(ReductionMethod):
 class ModalBalanced(ReductionMethod):
     """The modes with the largest modal Hankel values between the channels (balanced truncation).
 
-    Lightly damped and well separated modes are each almost balanced, with the Hankel values
-    ``||c|| ||b|| / (4 zeta omega^2)``. The modes with the smallest values are left out, whatever
-    their frequency. Rigid-body modes stay. `rank_modes` shows the values.
+    Each lightly damped mode that is well separated from the others is almost balanced. Its Hankel
+    singular values are about ``||c|| ||b|| / (4 zeta omega^2)``, with the displacements b of the
+    mode at the inputs and c at the outputs. The modes with the smallest values are left out,
+    whatever their frequency. Rigid-body modes stay. `rank_modes` gives the values.
 
     Parameters
     ----------
     count : int
         Number of modes, rigid-body modes included.
     inputs, outputs : place or sequence of places
-        Places of forces and displacements; no outputs: the inputs.
+        Places of forces and displacements. Without outputs, they are the inputs.
     among : int, optional
-        Number of lowest modes that are used, with an FEModel; None: all modes of a small model.
-    static_at, damping : as for `ModalTruncation`
+        Number of lowest modes from which the method chooses, with an FEModel. None: all modes of a
+        small model.
+    static_at, damping
+        Places of static correction, and damping, as for `ModalTruncation`.
 
     Notes
     -----
-    The bound is the sum of the peaks of the neglected modes and exact for one neglected mode. It
-    covers the solved modes only (`ErrorBound.covers`), which are not all with `among` or `Modes`.
-    Over a band `ErrorBound.below(freq)` is tighter. Twice the sum of neglected Hankel values
-    [Glover1984]_ bounds the truncation of the exactly balanced model (`flexplant.balanced`), which
-    is not of second order; `rank_modes(...).exact` has them.
+    The error bound is the sum of the peaks of the neglected modes. It is exact for one neglected
+    mode. It covers the solved modes only (`ErrorBound.covers`), which may not be all modes with
+    `among` or `Modes`. `ErrorBound.below` gives a smaller bound for a band. The usual bound, twice
+    the sum of the neglected Hankel singular values [Glover1984]_, holds for the truncation of the
+    exactly balanced model (`flexplant.balanced`), which is not of second order. These values are
+    `ModeRanking.exact`.
 
     References
     ----------

@@ -5,12 +5,13 @@ It is read from files (`fx.read_model`), or meshed here:
 
 - `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `solid_block` and
   `chain` make meshes; thickness and modulus may vary over a plate.
-- `FEModel.with_parts`: `PointMass`, `Spring`, `Damper` on any model; `FEModel.fixed` holds DOFs.
+- `FEModel.with_parts` adds `PointMass`, `Spring` and `Damper` to any model; `FEModel.fixed` holds
+  DOFs.
 - `ModalDamping` (one ratio, one for each mode, or measured ones) and `Rayleigh` give damping; a
   complex K is read as modal damping.
 - `check`: report on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
-- `interpolated`: shapes between the nodes of matrices without elements, so that a POI may be
-  anywhere.
+- `interpolated`: shapes between the nodes of matrices without elements, so that a point of
+  interest (POI) may be anywhere between them.
 
 >>> import flexplant as fx
 >>> plate = fx.plate(

@@ -36,13 +36,14 @@ class PointMass(Value):
     Parameters
     ----------
     at : str, (3,) array [m] or mapping
-        Place of the mass. At a point it acts on every translation that the model has there; at a
-        DOF label (or a mapping) it acts on this motion only.
+        Place of the mass: a DOF label, a point, or a mapping of DOF labels to weights. At a point
+        the mass acts on every translation that the model has there. At a DOF label or a mapping it
+        acts on this motion only.
     mass : float [kg]
-        Mass; at a label of a rotation, moment of inertia [kg m^2].
+        Mass. When the place is the label of a rotation, it is a moment of inertia [kg m^2].
     inertia : float or (3,) array [kg m^2]
-        Moments of inertia about the centre of the mass along x, y, z. They act on the rotations
-        that the model has at the point, or that follow from its shapes.
+        Moments of inertia about axes along x, y and z through the centre of the mass. They act on
+        the rotations that the model has at the point, or that follow from its displacements.
 
     Examples
     --------
@@ -175,7 +176,7 @@ class HeldShape(Interpolation):
     free : Interpolation
         Interpolation of the structure with all its DOFs.
     rows_left : (n,) array of int
-        Positions of the remaining DOFs among all, from 0, ascending.
+        Positions of the remaining DOFs among all DOFs, counted from 0, in ascending order.
 
     Examples
     --------
@@ -195,7 +196,7 @@ class HeldShape(Interpolation):
         return np.asarray(self.free.row(xyz, direction)[self.rows_left])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3), one `row` for each point."""
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
         return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:

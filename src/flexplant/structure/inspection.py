@@ -41,7 +41,8 @@ class ModelCheck(Value):
     inertia : (3, 3) array [kg m^2]
         Inertia about the centre of gravity.
     rigid : tuple of str
-        Directions x to rz (rotations about the middle) in which the structure moves freely.
+        Directions x, y, z, rx, ry, rz in which the structure moves freely. Rotations turn about the
+        middle of the structure.
     grounded : tuple of str
         Directions in which the structure is held.
     n_rigid : int
@@ -116,11 +117,12 @@ class ModelCheck(Value):
 def check(model: FEModel | FEMatrices) -> ModelCheck:
     """Return the report on a model: errors, unusual findings, and a next step for each.
 
-    It covers symmetry and definiteness (by factorisation), rigid-body motions in K compared with
-    those of the geometry, mechanisms and which DOFs move in them, total mass, centre of gravity and
-    inertia, DOFs without mass or stiffness, parts that are not joined, penalties, odd units,
-    damping to ground, and digits lost in a text or in single precision. Nothing is changed or
-    repaired.
+    The report covers symmetry and definiteness (by factorisation), and the rigid-body motions of K,
+    which are compared with those of the geometry. It names mechanisms (motions without elastic
+    energy that are not rigid-body motions) and the DOFs that move in them. It gives total mass,
+    centre of gravity and inertia. It also covers DOFs without mass or stiffness, parts that are not
+    joined, penalties (very stiff springs that hold DOFs), unusual units, damping to ground, and
+    digits that K lost in a text file or in single precision. Nothing is changed or repaired.
 
     Parameters
     ----------
@@ -130,7 +132,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     Raises
     ------
     ModelError
-        When it is neither.
+        When `model` is neither of the two.
 
     Examples
     --------

@@ -27,16 +27,16 @@ Interpolated = TypeVar("Interpolated", bound=Value)
 def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """Return a model (or its modes, or a DofSet) whose shapes are interpolated between its nodes.
 
-    It serves imported models, whose elements are not known: places may then be any point inside the
-    nodes, not only labels. It is only done on request.
+    Use this function for imported models, whose elements are not known. Places may then be any
+    point between the nodes, not only labels. Such a model is interpolated only on this request.
 
     Parameters
     ----------
     item : FEModel, Modes or DofSet
         Model whose nodes are not all in one place.
     margin : float [m]
-        Largest distance of a point outside of the hull of the nodes, for example of a surface from
-        a mid-plane.
+        Largest distance by which a point may lie outside the convex hull of the nodes. For example,
+        the surface of a plate lies outside its middle plane.
 
     Returns
     -------
@@ -50,11 +50,12 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
 
     Notes
     -----
-    Each displacement is a radial basis function r^3 with linear part (scipy's RBFInterpolator):
-    exact at the nodes and for rigid-body motion. Where the model has no rotations, they are half
-    the curl of the displacements, or the one slope that is known: rx = dz/dy, ry = -dz/dx on a
-    plate. Up to 600 nodes the field is smooth; on larger models it uses the 80 nearest nodes, and
-    may step by the interpolation error where these change.
+    Each displacement is a sum of radial basis functions r^3 and a linear part (RBFInterpolator of
+    SciPy). The interpolation is exact at the nodes and for rigid-body motion. Where the model has
+    no rotations, they are half the curl of the displacements. Where only one slope is known, such
+    as rx = dz/dy or ry = -dz/dx on a plate, the rotation is this slope. With up to 600 nodes the
+    field is smooth. With more nodes, the 80 nodes nearest to the point are used. The field may then
+    jump, by about the interpolation error, where other nodes become the nearest ones.
 
     Examples
     --------

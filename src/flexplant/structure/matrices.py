@@ -36,10 +36,10 @@ class FEMatrices(Value):
     Parameters
     ----------
     K : (n, n) array or sparse matrix
-        Stiffness, both triangles. Of a complex matrix ``K (1 + i eta)`` the real part is kept, and
-        the loss factor eta becomes a modal damping ratio of eta / 2; a note says so, and `model`
-        warns. The two dampings give the same response at resonance, and differ by at most a
-        fraction eta elsewhere.
+        Stiffness, with both triangles. When the matrix is complex, ``K (1 + i eta)``, the real part
+        is kept, and the loss factor eta becomes a modal damping ratio of eta / 2. A note says so,
+        and `model` warns. The two kinds of damping give the same response at resonance, and differ
+        by at most a fraction eta elsewhere.
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping; M may be singular.
     dofs : DofSet, optional
@@ -253,7 +253,7 @@ class FEMatrices(Value):
         ModelError
             When a unit is unknown.
         LabelError
-            When the DOFs are not named: rotations convert differently.
+            When the DOFs have no names, since rotations are converted differently.
 
         Examples
         --------

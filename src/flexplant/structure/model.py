@@ -45,11 +45,11 @@ class FEModel(Placed, Value):
     M : (n, n) array or sparse matrix [kg, kg m, kg m^2]
         Mass: symmetric, positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
-        Stiffness: symmetric, positive semi-definite; singular for a free structure, with negative
-        eigenvalues only where they belong to rigid-body motion (magnets). K needs double precision.
-        The rounding of a K in single precision may act as springs on the rigid-body motions, which
-        leads to an error or a warning; ``FEMatrices(K, M, dofs=dofs).model(free=True)`` removes
-        these springs.
+        Stiffness: symmetric and positive semi-definite. It is singular for a free structure.
+        Negative eigenvalues are allowed only for rigid-body motions (springs of negative stiffness,
+        such as magnets). K needs double precision. The rounding of a K in single precision may act
+        as springs on the rigid-body motions, which leads to an error or a warning.
+        ``FEMatrices(K, M, dofs=dofs).model(free=True)`` removes these springs.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
     dofs : DofSet, optional
@@ -80,8 +80,8 @@ class FEModel(Placed, Value):
     -----
     FlexplantWarning
         When K is in single precision, and its rounding stiffens rigid-body motions or changes the
-        first elastic eigenvalue. When the frequencies of all DOFs are too low for a machine, which
-        may mean that K and M are swapped.
+        first elastic eigenvalue. Also when the frequencies of all DOFs are too low for a machine,
+        which may mean that K and M are swapped.
 
     References
     ----------
@@ -176,14 +176,14 @@ class FEModel(Placed, Value):
 
     @cached_property
     def rigid_body(self) -> FloatArray:
-        """The rigid-body motions (n, r), ``K R = 0`` and ``R^T M R = I``.
+        """The rigid-body motions R (n, r), with ``K R = 0`` and ``R^T M R = I``.
 
-        They follow from the coordinates and are therefore exact: translations first, then rotations
-        about the centre of gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0)
-        when held. Pieces that neither K nor M connects each have separate motions, the largest
-        piece first. Where coordinates have few digits (down to four), rotations are the null
-        vectors of K closest to the geometric ones. A motion that is held by a spring, however soft,
-        is not included.
+        They follow from the coordinates and are therefore exact. The order is x, y, z, rx, ry, rz,
+        without the motions that do not exist; rotations turn about the centre of gravity. A held
+        structure has none, (n, 0). Pieces that neither K nor M connects have separate motions, and
+        those of the largest piece come first. Where the coordinates have few digits (down to four),
+        rotations are the null vectors of K closest to the rotations of the geometry. A motion that
+        is held by a spring, however soft, is not included.
         """
         return np.asarray(
             frozen(rigid_body_basis(self.M, self.K, self.body_motions, self.dofs.xyz))
@@ -214,8 +214,8 @@ class FEModel(Placed, Value):
     def ground_inertia(self, ground: FloatArray) -> FloatArray:
         """Return the inertia load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
 
-        The motion is about the origin: x, y, z, rx, ry, rz. The coupling is known for DOFs held by
-        `fixed`.
+        The motion holds x, y, z, rx, ry, rz, with rotations about the origin. f marks the free DOFs
+        and s the held DOFs. M_fs is known only for DOFs that `fixed` holds.
         """
         load = self.inertia(self.rigid_motions() @ ground)
         return load if self.held_inertia is None else load + self.held_inertia @ ground
@@ -223,9 +223,10 @@ class FEModel(Placed, Value):
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return how strongly DOFs held by `fixed` prevent each of the six rigid-body motions (6,).
 
-        Springs to ground prevent no motion, since the DOFs can still make it. The measure is ``max
-        |K r|_i / max (|K| |r|)_i``, with forces relative to the root of K_ii. It is 0 for a free
-        motion: the terms of K r cancel everywhere except next to held DOFs.
+        Springs to ground do not count, since the DOFs can still make the motion. For a motion r the
+        result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
+        square root of K_ii. It is 0 for a free motion, since the terms of K r cancel everywhere
+        except next to held DOFs.
         """
         if self.held_inertia is None:
             return np.zeros(6)

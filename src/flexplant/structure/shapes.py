@@ -84,7 +84,7 @@ class PlateShape(GridShape):
     size : (float, float) [m]
         Lengths in x and y.
     thickness : float or (ny, nx) array [m]
-        Points between the two surfaces belong to the plate.
+        Thickness of the plate. Points between the two surfaces belong to the plate.
     elements : (int, int)
         Number of elements in x and y.
 
@@ -177,7 +177,7 @@ class BeamShape(GridShape):
     elements : int
         Number of elements.
     softness : float or (elements,) array, optional [m^2]
-        Bending stiffness over shear stiffness. None: the beam does not shear.
+        Ratio of bending stiffness to shear stiffness. None: the beam has no shear deformation.
 
     Examples
     --------

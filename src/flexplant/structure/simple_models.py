@@ -41,7 +41,8 @@ def chain(
 ) -> FEModel:
     """Return masses in a row along x, springs and dampers between neighbours.
 
-    ``m_i x_i'' = k_{i-1} (x_{i-1} - x_i) + k_i (x_{i+1} - x_i) - g_i x_i``, likewise with dampers.
+    ``m_i x_i'' = k_{i-1} (x_{i-1} - x_i) + k_i (x_{i+1} - x_i) - g_i x_i`` with the stiffness g_i
+    to the ground. Dampers between neighbours add their forces in the same way.
 
     Parameters
     ----------
@@ -129,13 +130,16 @@ def beam(
 ) -> FEModel:
     """Return a straight beam in bending along x from the origin, by Euler-Bernoulli or Timoshenko.
 
-    ``rho A z'' + (E I z_xx)_xx = f``: two-node elements with cubic shape functions and consistent
-    mass. Nodes are numbered from 1; each has the DOFs z [m] and ry = -dz/dx [rad], without those
-    that its end holds. The model is accurate for wave lengths well above ten times the height.
+    Without `poisson_ratio` this is the beam of Euler and Bernoulli, ``rho A z'' + (E I z_xx)_xx =
+    f``, where the index x is a derivative. Its elements have two nodes, cubic shape functions and
+    consistent mass. Nodes are numbered from 1. Each node has the DOFs z [m] and ry = -dz/dx [rad],
+    except those that are held at an end. The model is accurate for wave lengths well above ten
+    times the height.
 
-    With `poisson_ratio` the beam shears and its sections have inertia: ``rho A z'' = (k G A (z_x -
-    t))_x``, ``rho I t'' = (E I t_x)_x + k G A (z_x - t)``, in elements that are exact in statics
-    [FriedmanKosmatka1993]_. There ry is the rotation -t of the section.
+    With `poisson_ratio` the beam has shear deformation and rotary inertia (Timoshenko):
+    ``rho A z'' = (k G A (z_x - t))_x``, ``rho I t'' = (E I t_x)_x + k G A (z_x - t)`` with the
+    slope t of the section. Its elements are exact in statics [FriedmanKosmatka1993]_, and ry is the
+    rotation -t of the section.
 
     Parameters
     ----------
@@ -148,11 +152,11 @@ def beam(
     area, inertia : float, (elements,) array or function of x [m^2], [m^4]
         Area of the cross section, and its second moment of area.
     poisson_ratio : float, (elements,) array or function of x, optional [-]
-        Poisson's ratio, for the shear modulus G = E / 2 (1 + nu). None: Euler-Bernoulli.
+        Poisson's ratio nu, for the shear modulus G = E / (2 (1 + nu)). None: Euler-Bernoulli.
     shear_factor : float
-        k of the shear stiffness k G A; 5/6 of a rectangular section.
+        Factor k of the shear stiffness k G A; 5/6 for a rectangular section.
     ends : (str, str)
-        How each end is held: "free", "pinned" (z), "clamped" (z and ry) or "guided" (ry).
+        Support of each end: "free", "pinned" (z is held), "clamped" (z and ry) or "guided" (ry).
     name : str, optional
         Name of the model, as it is printed.
 
@@ -270,7 +274,7 @@ def kirchhoff_plate(
     Raises
     ------
     ModelError, ShapeError
-        When a number is not physical, or an array has not one number for each element.
+        When a number is not physical, or the size of an array differs from the number of elements.
 
     Examples
     --------

@@ -212,8 +212,8 @@ def plate(
     poisson_ratio : float, (nx, ny) array or function [-]
         Poisson's ratio, above -1 and below 0.5.
     shear_factor : float, optional
-        k of the shear stiffness k G h; 5/6 for a plate whose shear stress is a parabola over the
-        thickness. None: the plate does not shear, but its sections have inertia.
+        Factor k of the shear stiffness k G h; 5/6 for a plate whose shear stress is a parabola over
+        the thickness. None: the plate has no shear deformation, but its sections have inertia.
     name : str, optional
         Name of the model, as it is printed.
 
