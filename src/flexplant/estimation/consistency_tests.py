@@ -78,26 +78,28 @@ class ConsistencyReport(Value):
         P-values of the NIS (chi-square), of the Ljung-Box statistic, and of the cumulative
         periodogram.
     sensor_ratios : mapping {sensor: float}
-        Ratio of the deviation of each innovation to the predicted one.
+        Ratio of the standard deviation of each innovation to the predicted one.
     nees : mapping {channel: (mean, low, high)}
         Mean normalised squared error of the estimates with its confidence interval, if the true
         motions were given; 1 if the predicted deviations are correct.
     peaks : tuple of (float, float)
-        Frequencies [Hz] at which the innovations exceed the density explained by the best levels of
-        process and sensor noise, and ratios to it, the most significant first.
+        Frequency [Hz] and height of each peak in the spectrum of the innovations. The height is
+        the ratio of the spectrum to the spectrum of the model with the best-fitting levels of
+        process and sensor noise. The most significant peak comes first.
     causes : tuple of str
         The likely causes: "none", or of "outliers", "offset", "noise level", "noise ratio",
         "frequency", "truncation", "folding".
     text : str
-        Text of the verdict.
+        Verdict in words.
     level : float
         Confidence level of all tests together.
     spectra : mapping {mode: (float, float)}
         Ratio of the power of the innovations around each mode of the plant to the predicted one,
         and its p-value.
     moved : MovedModes, optional
-        Modes with a different frequency on the machine, with change and deviation, if this is a
-        cause: ``model.calibrated(found.moved.measured)`` is the machine's model.
+        Modes with a different frequency or damping on the machine, with the changes and their
+        standard deviations, if this is a cause. ``model.calibrated(found.moved.measured)`` is then
+        the model of the machine.
     """
 
     nis: float
@@ -178,22 +180,26 @@ def consistency(
     model passes all five with the probability `level`. The likely causes follow from the failed
     tests:
 
-    - single samples of a sensor that noise cannot explain, and whose effect on the filter is that
-      of one sample: *outliers*;
-    - a mean that is larger than the spectrum at the lowest frequencies explains: the *offset* of a
-      sensor.
+    - *outliers*: single samples of a sensor that noise cannot explain, and whose effect on the
+      filter is that of one sample;
+    - *offset* of a sensor: the mean of its innovations is larger than the spectrum at the lowest
+      frequencies explains.
 
-    Outliers and offsets are removed. One cause is then given for the remaining innovations:
+    Outliers and offsets are removed. One cause is then given for the remaining innovations.
+    *Truncation* means that modes of the machine are missing in the plant. *Folding* means that
+    modes above half the sampling rate appear at lower frequencies. Innovations that are not white
+    are called coloured. The causes are:
 
-    - coloured with the spectrum that the evaluation model predicts, if there is one: the plant is
-      correct, and the cause is its *truncation*, or the *folding* of modes above half the rate;
-    - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
-    - coloured, but explained by other levels of process and sensor noise (two levels, fitted to
-      the spectrum): the *noise ratio*;
-    - another peak, and a change of a neighbouring mode explains it better than an additional mode
-      does: the *frequency* or damping of that mode. Frequency and damping of all such modes are
-      fitted to the record by maximum likelihood, including the commands, so that a closed loop
-      does not bias them (`moved`);
+    - *truncation* or *folding*: the innovations are coloured with the spectrum that the evaluation
+      model predicts, if there is one. The plant is then correct except for these modes;
+    - *noise level*: the innovations are white, but their NIS differs from 1. The sensors with too
+      large innovations are named;
+    - *noise ratio*: the innovations are coloured, but other levels of process and sensor noise
+      (two levels, fitted to the spectrum) explain them;
+    - *frequency*: the spectrum has another peak, and a change of a neighbouring mode explains it
+      better than an additional mode does. Frequency and damping of all such modes are fitted to
+      the record by maximum likelihood, including the commands, so that a closed loop does not bias
+      them (`moved`);
     - any other peak: *truncation*, if it lies above all modes or a truncated mode is known there;
       *folding*, if the plant has modes above it, or the truncated mode lies above half the rate;
       or a disturbance that is missing in the plant.
@@ -221,7 +227,8 @@ def consistency(
     Raises
     ------
     ModelError
-        When there are fewer than 200 samples with all innovations, or the kinds are wrong.
+        When there are fewer than 200 samples with all innovations, or `observer` or `estimate` has
+        a wrong type.
 
     References
     ----------

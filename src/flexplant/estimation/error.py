@@ -357,9 +357,9 @@ class PoiEstimator(Value):
         Parameters
         ----------
         channel : str
-            A POI's motion under any of its names, as for `rms`.
+            Motion of a POI under any of its names, as for `rms`.
         level : float
-            Fraction of the machines, between 0 and 1.
+            Fraction of the machines in the interval, between 0 and 1.
 
         Returns
         -------
@@ -381,31 +381,32 @@ class PoiEstimator(Value):
     def compared(
         self, other: PoiEstimator, channel: str, level: float = INTERVAL
     ) -> FigureInterval:
-        """Return where this error over that of another estimator lies, machine by machine.
+        """Return the interval of the ratio of this rms error to that of another estimator.
 
-        Is one place of a sensor better than another on 95 % of the machines? Design an estimator
-        for each, on plants of the same evaluation model: below 1 this one is better.
+        The ratio is computed on each machine that agrees with the measurement. Below 1 this
+        estimator is better. To compare two places of a sensor, design an estimator for each place,
+        on plants of the same evaluation model.
 
         Parameters
         ----------
         other : KalmanEstimator or StaticEstimator
             Estimator of the same POIs, on a plant of the same machines.
         channel : str
-            A POI's motion under any of its names, as for `rms`.
+            Motion of a POI under any of its names, as for `rms`.
         level : float
-            Share of the machines, between 0 and 1.
+            Fraction of the machines in the interval, between 0 and 1.
 
         Returns
         -------
         FigureInterval
-            ``(low, high, sentence)`` of the ratio of the errors; low and high are None where
-            something is missing for an interval: the sentence says what.
+            ``(low, high, sentence)`` of the ratio of the errors; low and high are None if the
+            interval does not exist; the sentence gives the reason.
 
         Raises
         ------
         LabelError, ModelError
-            When it is not a motion of a POI, the level is out of range, or the other estimator's
-            plant has another number of machines.
+            When the channel is not a motion of a POI, the level is out of range, or the plant of
+            the other estimator has another number of machines.
         """
         own, others = (row_of(poi_channels(one.plant), channel) for one in (self, other))
 
@@ -469,11 +470,12 @@ class PoiFilter(PoiEstimator):
         Parameters
         ----------
         channel : str
-            A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
+            Motion of a POI under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
         on : StandardPlant or ClosedLoop, optional
-            Sampled plant with other modes or noises, with u = 0; or a closed loop around such a
-            plant, where u also excites the differences to the filter's model. The result is exact,
-            in closed form. None: the predicted error.
+            Another sampled plant, with other modes or noises, on which the error is computed with u
+            = 0; or a closed loop around such a plant, where u also excites the differences between
+            this plant and the filter's model. The error is computed from a Lyapunov equation, not
+            by simulation. None: the predicted error.
 
         Returns
         -------

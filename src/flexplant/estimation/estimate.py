@@ -35,7 +35,9 @@ class Estimate(Value, Mapping[str, FloatArray]):
     """Estimated motions over a record, by name, with their deviations and the innovations.
 
     ``result["die:hat"]`` (N,) is an estimate, ``result["y1:innovation"]`` the measurement of y1
-    minus its prediction. A Mapping: `dict(result)` feeds a data frame.
+    minus its prediction. The result is a Mapping, so that `dict(result)` can be made into a data
+    frame. N is the number of samples; nz, ny and nu are the numbers of estimates, sensors and
+    commands.
 
     Parameters
     ----------
@@ -54,14 +56,15 @@ class Estimate(Value, Mapping[str, FloatArray]):
         Measurements minus their prediction, in the sensors' units; NaN where one is missing or not
         predicted yet.
     innovation_deviations : (ny, N) array
-        Their standard deviations.
+        Standard deviations of the innovations.
     whitened : (ny, N) array
-        ``W e`` with ``W' W`` the inverse of their covariance: white noise of unit variance if the
-        model is correct.
+        Whitened innovations ``W e``, where ``W' W`` is the inverse of the covariance of the
+        innovations e. They are white noise of unit variance if the model is correct.
     lag : Predictor, Filter, FixedLag or Smoother
         Type of the estimates.
     state : (n,) array
-        State x[N|N-1], from which `estimate(..., start=)` continues with the next record.
+        Prediction of the state for the sample after the record, x[N|N-1], from which
+        `estimate(..., start=)` continues with the next record.
     units : mapping {channel: unit}
         Unit of each channel.
     gate : float
@@ -140,7 +143,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         return len(self.names) + len(self.sensors)
 
     def warn_of_gate(self) -> None:
-        """Warn of a sensor with too many gated samples, which are then not outliers."""
+        """Warn if a sensor has so many gated samples that they cannot be outliers."""
         share = self.gated.mean(axis=1) if self.gated.size else np.zeros(len(self.sensors))
         worst = int(np.argmax(share))
         if share[worst] > max(_MOST, 10 * erfc(self.gate / np.sqrt(2.0))):

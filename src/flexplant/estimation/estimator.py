@@ -34,7 +34,8 @@ class KalmanEstimator(PoiFilter):
         hat[k] = C1 x[k|k-1] + D12 u[k] + L_z (y[k] - C2 x[k|k-1] - D22 u[k])
         x[k+1|k] = A x[k|k] + B2 u[k]
 
-    L is the gain of the state and L_z that of the estimates ``hat`` of the POI motions z. L_z is
+    x[k|j] is the estimate of the state x[k] from the measurements up to sample j. L is the gain of
+    the state and L_z that of the estimates ``hat`` of the POI motions z. L_z is
     ``C1 L`` if no truncated modes are known. A, B2, C1, D12, C2 and D22 are the matrices of the
     plant from u to z and y.
 
@@ -50,7 +51,8 @@ class KalmanEstimator(PoiFilter):
     covariance : (n, n) array
         Covariance of the error of x[k|k], after the measurement, on the filter's model.
     certificate : Certificate
-        Checks of the filter, such as the spectral radius of its error.
+        Checks of the filter, such as the spectral radius of its error dynamics ``A - K C2``, with
+        the predictor gain K.
     variances : (nz,) array [m^2 or rad^2]
         Predicted variances of the errors at the POIs, on the plant with truncated modes if these
         are known.
@@ -258,8 +260,9 @@ class KalmanEstimator(PoiFilter):
     def report(self, lags: npt.ArrayLike = LAGS) -> LagReport:
         """Return the rms errors at the POIs by lag, with the static relation; prints as a table.
 
-        The rows are the static relation, predictor, filter, fixed lags and smoother, all
-        stationary. They show how much the error falls if the estimate may be later.
+        The rows are the static relation (see `design_static`), the predictor, the filter, fixed
+        lags and the smoother, all stationary. They show how much smaller the error is if the
+        estimate is allowed a delay.
         `fx.plot.lag_report` draws them.
 
         Parameters
@@ -282,14 +285,18 @@ class KalmanEstimator(PoiFilter):
         return lag_errors(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))
 
     def to_control(self) -> Any:
-        """Return the filter as a `control.StateSpace`, sensors and u to estimates, same names."""
+        """Return the filter as a `control.StateSpace`, from sensors and u to the estimates.
+
+        The names of inputs, outputs and states are those of `system`.
+        """
         return self.system.to_control()
 
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
 
-        At each sample, call `update(y)` and then `predict(u)`. y holds the sensors without
-        references, u all actuators, as 1-D arrays or columns.
+        At each sample, call `update(y)` and then `predict(u)`. y holds the measurements in the
+        order of `sensors` (references are not included), and u holds the commands of all actuators.
+        Both are 1-D arrays or columns.
         `batch_filter(ys, us, update_first=True)` processes a record. `rts_smoother` has no argument
         u and is therefore correct only for u = 0; use `estimate(records, Smoother())` for other u.
         """

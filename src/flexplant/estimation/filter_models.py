@@ -39,6 +39,11 @@ class FilterModel(Value):
         z[k]   = C1 x[k] + D1 u[k] + n[k]         cov [  n ] = [0  V  N]
         y[k]   = C2 x[k] + D2 u[k] + H xi[k]          [H xi]   [S' N' R]
 
+    The noises xi[k] and n[k] are independent from sample to sample. The matrices ``Q = G G'``,
+    ``R = H H'`` and ``S = G H'`` follow from G and H. In the methods, x[k|j] is the estimate of the
+    state at sample k from the measurements up to sample j. An innovation is a measurement minus its
+    prediction.
+
     Parameters
     ----------
     A, B, C1, D1, C2, D2 : arrays
@@ -97,7 +102,15 @@ class FilterModel(Value):
         return self.G @ self.H.T
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
-        """Return the model with states x / d and measurements y / s."""
+        """Return the model with states x / d and measurements y / s.
+
+        Parameters
+        ----------
+        d : (n,) array
+            Unit of each new state.
+        s : (ny,) array
+            Unit of each new measurement.
+        """
         return self.replace(
             A=self.A * d / d[:, None],
             B=self.B / d[:, None],
@@ -110,17 +123,37 @@ class FilterModel(Value):
         )
 
     def innovation(self, P: FloatArray) -> FloatArray:
-        """Return the covariance ``C2 P C2' + R`` of the innovations; P is that of x[k|k-1]."""
+        """Return the covariance ``C2 P C2' + R`` of the innovations.
+
+        Parameters
+        ----------
+        P : (n, n) array
+            Covariance of the error of x[k|k-1].
+        """
         return np.asarray(self.C2 @ P @ self.C2.T + self.R)
 
     def updated(self, P: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return the covariance of x[k|k] for any gain L (Joseph's form); P is that of x[k|k-1]."""
+        """Return the covariance of the error of x[k|k] for any gain L, by Joseph's form.
+
+        Parameters
+        ----------
+        P : (n, n) array
+            Covariance of the error of x[k|k-1].
+        gain : (n, ny) array
+            Gain L of the innovations.
+        """
         left = np.eye(P.shape[0]) - gain @ self.C2
         updated = left @ P @ left.T + gain @ self.R @ gain.T
         return np.asarray(0.5 * (updated + updated.T))
 
     def driven(self, gain: FloatArray) -> FloatArray:
-        """Return the noise covariance ``(G - K H)(G - K H)'`` of a sample, K the predictor gain."""
+        """Return the covariance ``(G - K H)(G - K H)'`` that one sample adds to the error.
+
+        Parameters
+        ----------
+        gain : (n, ny) array
+            Predictor gain K, from the innovation to x[k+1|k].
+        """
         entering = self.G - gain @ self.H
         return entering @ entering.T
 

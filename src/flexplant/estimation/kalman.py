@@ -41,33 +41,38 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     Parameters
     ----------
     plant : StandardPlant
-        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`, also read `through` a
-        static block, for example to decoupled motions, whose noise is then correlated. A system
-        with labels has no noise densities: the error says how to add them.
+        Sampled plant: `assemble_plant(model, ports).discretized(rate, delay=1)`. Its sensors may
+        also be read `through` a static block, for example one that decouples the motions; the
+        noises of the new signals are then correlated. A labelled system without noise densities is
+        refused, and the message tells how to add them.
     machines : PlantMachines, optional
-        ``plant.machines``: modes are weighed by their uncertainty. What the machines do beyond the
-        filter's model counts as noise, as much of it as lowers the upper ends of the intervals of
-        the errors most.
+        The machines ``plant.machines`` that agree with a measurement. If they are given, the filter
+        relies less on uncertain modes. The noise of the truncated modes is increased towards the
+        mean covariance of the difference between the machines and the filter's model: not at all,
+        by a quarter, by half or by all of the way. The filter with the smallest upper ends of the
+        intervals of the errors is returned. Without truncated modes this argument has no effect.
 
     Returns
     -------
     KalmanEstimator
-        Estimator with a certificate of the error by two routes.
+        Estimator with a certificate. The variances of the error are computed by two independent
+        methods, and the certificate contains their difference.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous, a sensor has no noise, a disturbance that is not held over
-        each sample reaches a sensor directly, w does not excite a rigid-body mode or y does not
-        see it; when the machines have no intervals.
+        When the plant is continuous or a sensor has no noise. When a disturbance that is not
+        constant during each sample reaches a sensor directly. When w does not excite a rigid-body
+        mode, or y does not see it. When the machines have no intervals.
     ModelError
-        When the plant is weighted, its noise is not known, or the evaluation model has fewer modes.
+        When the plant is weighted, its noise is not known, or the evaluation model has fewer modes
+        than the plant.
     LabelError
         When the labels of a system do not name w, u, z and y.
     SolverError
         When no strictly stable filter exists for another reason.
     CertificateError
-        When the check by the other route fails.
+        When the two methods for the variances disagree.
 
 
     References

@@ -36,26 +36,27 @@ PREDICTOR, FILTER, SMOOTHER, STATIC = "predictor", "filter", "smoother", "static
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LagReport(Value):
-    """The stationary rms errors of one filter by lag; prints as a table.
+    """The stationary rms errors of one filter for several lags; prints as a table.
 
-    They hold on the filter's model, where truncated modes are white noise; `on_whole` is the
-    filter's error on the plant with these modes.
+    The errors hold on the filter's model, where truncated modes are white noise. `on_whole` is the
+    error of the filter on the plant with these modes. The static relation is the estimate of
+    `design_static`, a constant gain for the sensors.
 
     Parameters
     ----------
     channels : sequence of str
-        The POI motions.
+        Names of the POI motions.
     names : sequence of str
-        The rows: static relation, predictor, filter, lags such as "1 ms", smoother.
+        Names of the rows: static relation, predictor, filter, lags such as "1 ms", smoother.
     rms : (n_row, nz) array [m or rad]
         RMS errors; NaN without a static relation.
     lag : (n,) array [s]
         Lags of the curve; 0 is the filter.
     curve : (n, nz) array [m or rad]
-        The rms by lag.
+        RMS errors at these lags.
     on_whole : (nz,) array
-        RMS errors of the filter on the plant with truncated modes; equal to its row if these are
-        not known.
+        RMS errors of the filter on the plant with truncated modes; equal to the filter's row in
+        `rms` if no truncated modes are known.
     note : str
         Reason why no static relation exists, or "".
     units : mapping {channel: unit}
@@ -84,7 +85,11 @@ class LagReport(Value):
         return np.asarray(self.rms[list(self.names).index(row)])
 
     def recovered(self, row: str, channel: str) -> float:
-        """Return the fraction of smoothing's decrease of a variance that a row ("1 ms") reaches."""
+        """Return how much of the smoother's gain over the filter a row (such as "1 ms") reaches.
+
+        The result is the decrease of the error variance from the filter to this row, divided by
+        the decrease from the filter to the smoother: 0 for the filter, and 1 for the smoother.
+        """
         i = row_of(self.channels, channel)
         filtered, smooth = self[FILTER][i] ** 2, self[SMOOTHER][i] ** 2
         return float((filtered - self[row][i] ** 2) / (filtered - smooth))
@@ -156,7 +161,10 @@ def lag_errors(
 
 @dataclass(frozen=True, eq=False)
 class Predictor(Value):
-    """From the measurements before a sample: x[k|k-1].
+    """Estimates of a sample from the measurements before this sample: x[k|k-1].
+
+    The notation x[k|j] means the estimate of the state at sample k from the measurements of the
+    samples 0 to j.
 
     Examples
     --------
@@ -168,7 +176,10 @@ class Predictor(Value):
 
 @dataclass(frozen=True, eq=False)
 class Filter(Value):
-    """From the measurements up to a sample, its own among them: x[k|k].
+    """Estimates of a sample from the measurements up to and including this sample: x[k|k].
+
+    The notation x[k|j] means the estimate of the state at sample k from the measurements of the
+    samples 0 to j.
 
     Examples
     --------
@@ -180,7 +191,10 @@ class Filter(Value):
 
 @dataclass(frozen=True, eq=False)
 class FixedLag(Value):
-    """From the measurements up to some samples after: x[k|k+lag], known with this lag.
+    """Estimates of a sample from the measurements up to some samples later: x[k|k+lag].
+
+    The estimate is available with this lag. The notation x[k|j] means the estimate of the state at
+    sample k from the measurements of the samples 0 to j.
 
     Parameters
     ----------
@@ -203,7 +217,10 @@ class FixedLag(Value):
 
 @dataclass(frozen=True, eq=False)
 class Smoother(Value):
-    """From all measurements of the record: the fixed-interval smoother x[k|N-1].
+    """Estimates of each sample from all N measurements of the record: x[k|N-1].
+
+    This is the fixed-interval smoother. The notation x[k|j] means the estimate of the state at
+    sample k from the measurements of the samples 0 to j.
 
     References
     ----------
@@ -248,15 +265,15 @@ class StaticEstimator(PoiEstimator):
 
     @property
     def gain(self) -> FloatArray:
-        """The gains (n_poi, n_sensors)."""
+        """Gain matrix (n_poi, n_sensors) from the displacement sensors to the estimates."""
         return self.system.D
 
     def rms(self, channel: str, *, on: AnyPlant | System | None = None) -> float:
         """Return the predicted rms of the error at sample instants, with u = 0.
 
-        It includes the deformation by disturbances (also of known truncated modes) and the sensor
-        noise; free motions have no error. `channel` and the plant `on` are as for
-        `KalmanEstimator.rms`; without `on`, it is the evaluation plant if there is one.
+        The error includes the deformation by disturbances (also of known truncated modes) and the
+        sensor noise. Rigid-body motions cause no error. `channel` and the plant `on` are as for
+        `KalmanEstimator.rms`; without `on`, the evaluation plant is used if there is one.
         AssumptionError is raised for a continuous plant, since continuous white sensor noise has an
         infinite variance. SolverError is raised when an elastic mode is not damped.
         """
@@ -272,11 +289,13 @@ class StaticEstimator(PoiEstimator):
 def design_static(plant: AnyPlant) -> StaticEstimator:
     """Return the static relation between the displacement sensors and the POIs.
 
-    ``hat = Z Y^+ y``, Z and Y the motions of POIs and sensors that the actuators make at rest, or
-    actuators and disturbances where no actuator moves a POI. Of a free body these are its
-    rigid-body motions, and the relation is that of the geometry; of a machine whose bodies are
-    joined by drives and springs they are what its drives move. It is usual practice, and the
-    baseline for estimators with a flexible model.
+    The estimate is ``hat = Z Y^+ y`` with the pseudo-inverse ``Y^+``. The columns of Z and Y are
+    the static motions of the POIs and of the sensors under the forces of the actuators. If the
+    actuators do not cause every motion of the POIs, the forces of the disturbances are used too.
+    For a free body the static motions are its rigid-body motions, and the relation follows from the
+    geometry only. For a machine whose bodies are connected by drives and springs, they are the
+    motions that the drives cause. The static relation is usual practice, and estimators with a
+    flexible model are compared with it.
 
     Parameters
     ----------
@@ -286,8 +305,8 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     Returns
     -------
     StaticEstimator
-        Estimator that is exact for static motions. A motion that no force of the plant makes counts
-        as zero.
+        Estimator that is exact for static motions. A motion that no force of the plant causes is
+        estimated as zero.
 
     Raises
     ------

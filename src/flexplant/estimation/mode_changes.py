@@ -61,18 +61,22 @@ class ModeChange(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MovedModes(Value):
-    """Modes with other poles on the machine than in the plant, by maximum likelihood.
+    """Modes whose poles on the machine differ from those of the plant model.
+
+    `consistency` estimates the poles of the machine from a record by maximum likelihood. The decay
+    rate of a mode is minus the real part of its pole.
 
     Parameters
     ----------
     modes : sequence of m int
-        Their numbers in the plant, from 1, rigid-body modes included.
+        Numbers of the modes in the plant, counted from 1 with rigid-body modes.
     expected : (m,) complex array [rad/s]
         Poles of the plant.
     poles : (m,) complex array [rad/s]
         Poles of the machine.
     covariance : (2 m, 2 m) array
-        Covariance of the logarithms of |pole|, then of the decay rates.
+        Covariance of the errors of the m values ``log |pole|``, followed by those of the m
+        logarithms of the decay rates.
 
     Examples
     --------
@@ -98,7 +102,7 @@ class MovedModes(Value):
 
     @property
     def frequency(self) -> dict[int, tuple[float, float]]:
-        """Relative change of each mode's frequency, and its standard deviation."""
+        """Relative change of each mode's frequency and its standard deviation, by mode number."""
         change = np.abs(self.poles / self.expected) - 1.0
         return self._with(change, np.sqrt(np.diag(self.covariance))[: len(self.modes)])
 
@@ -108,7 +112,7 @@ class MovedModes(Value):
 
     @property
     def damping(self) -> dict[int, tuple[float, float]]:
-        """Each mode's damping ratio on the machine, and its standard deviation."""
+        """Damping ratio of each mode on the machine and its standard deviation, by mode number."""
         m = len(self.modes)
         turned = np.hstack([-np.eye(m), np.eye(m)])
         deviation = np.sqrt(np.diag(turned @ self.covariance @ turned.T))
@@ -117,7 +121,7 @@ class MovedModes(Value):
 
     @property
     def texts(self) -> list[str]:
-        """Text of each mode."""
+        """A sentence for each mode: its frequency and damping on the machine and in the plant."""
         found = []
         for i, n in enumerate(self.modes):
             (df, sf), (z, sz) = self.frequency[n], self.damping[n]
@@ -132,7 +136,7 @@ class MovedModes(Value):
 
     @property
     def changes(self) -> tuple[ModeChange, ...]:
-        """The logarithms of the ratios of |pole| and of the decay rate, mode by mode."""
+        """Logarithms of the ratios, machine to plant, of |pole| and decay rate of each mode."""
         size = np.log(np.abs(self.poles / self.expected))
         decay = np.log(self.poles.real / self.expected.real)
         return tuple(
@@ -141,7 +145,10 @@ class MovedModes(Value):
 
     @property
     def measured(self) -> MeasuredModes:
-        """The poles with numbers and covariance: ``model.calibrated(moved.measured)``."""
+        """Poles of the machine with mode numbers and covariance.
+
+        ``model.calibrated(moved.measured)`` returns the model with these poles.
+        """
         m = len(self.modes)
         real, imag = self.poles.real, self.poles.imag
         # |p| and decay rate: d Re = Re d(log decay), d Im = (|p|^2 d(log |p|) - Re dRe) / Im

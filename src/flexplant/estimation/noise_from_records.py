@@ -46,27 +46,32 @@ def estimate_noise(
 
         S(f) = sum_i t_i P_i(f),   P_i = T_i T_i^*,   T_i = H_i + C (z I - A + K C)^-1 (G_i - K H_i)
 
-    (``G_i = 0`` for sensor noise). Their likelihood over the lines of the Fourier transform
-    (Whittle) and its derivatives are sums::
+    A, C and K are the matrices of the filter (K is the predictor gain), G_i and H_i are the gains
+    from the noise of channel i to the states and to the sensors, and ``z = exp(2 pi i f dt)``. For
+    sensor noise ``G_i = 0``. I is the periodogram of the innovations at a frequency f. Whittle's
+    likelihood l over the lines of the Fourier transform, its derivatives and Fisher's information F
+    are sums::
 
         l = -sum_f log det S + tr S^-1 I,   dl/dt_i = -sum_f tr S^-1 P_i - tr S^-1 P_i S^-1 I
         information F_ij = sum_f tr S^-1 P_i S^-1 P_j
 
-    Scoring in the logarithms of t_i starts at the non-negative least-squares fit of the
-    autocovariances (linear in t_i as well). The filter is designed again with the result, so that
-    its innovations become white, and the likelihood is then that of the exact filter.
+    The search for the maximum is Fisher's scoring (Newton's method with F in place of the second
+    derivatives) in the logarithms of t_i. It starts at the non-negative least-squares fit of the
+    autocovariances, which are linear in t_i as well. The filter is designed again with the result,
+    so that its innovations become white, and the likelihood is then that of the exact filter.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled plant with guesses of all unknown densities (their orders of magnitude); channels
-        without a density get none. The record is explained with the modes of its evaluation model,
-        which should be those of the machine, `fit.applied_to(model)`; without it the sensor noises
-        include the truncated modes.
+        Sampled plant with guesses of all unknown densities (their orders of magnitude). Every
+        sensor needs a density; disturbances without a density are assumed absent. The record is
+        explained with the modes of the evaluation model, which should be those of the machine:
+        update the model first, ``fit.applied_to(model)``. Without an evaluation model the sensor
+        noises include the motion of the truncated modes.
     records : Response, mapping {channel: (N,) array} or data frame
-        All sensors and commands; the longest stretch without gaps is used.
+        Records of all sensors and commands; the longest stretch without gaps is used.
     gate : float, optional
-        Gate as in `KalmanEstimator.estimate`: outliers are gaps.
+        Gate as in `KalmanEstimator.estimate`: outliers count as gaps.
 
     Returns
     -------
@@ -76,7 +81,8 @@ def estimate_noise(
     Raises
     ------
     AssumptionError
-        As `design_kalman`; or when the sensors cannot separate the channels, which are named.
+        In the cases of `design_kalman`; or when the effects of some channels on the sensors cannot
+        be separated. The message names these channels.
     LabelError, ShapeError
         When channels are missing or of different lengths.
     ModelError
@@ -362,7 +368,7 @@ class NoiseLevels(Value):
     Parameters
     ----------
     given : StandardPlant
-        The plant with the densities that the search started from.
+        Plant with the given densities, from which the search started.
     channels : tuple of str
         Disturbances of w, then sensors (`y1:noise`); `process` means all disturbances of a plant
         that was not assembled.
@@ -371,10 +377,11 @@ class NoiseLevels(Value):
     covariance : (p, p) array
         Covariance of the logarithms of the ratios: the inverse of Fisher's information.
     start : (p,) array
-        Ratios by autocovariance least squares, the start of the search; 0 without a result.
+        Ratios from the non-negative least-squares fit of the autocovariances, at which the search
+        started; 0 for a channel to which this fit assigns no noise.
     slope : float
-        Largest derivative of the likelihood at the end, relative to its standard deviation: below
-        1e-3.
+        Largest derivative of the logarithm of the likelihood at the end of the search, relative to
+        the standard deviation of this derivative. The search ends when it is below 1e-4.
     nis : float
         Mean normalised innovation squared per sensor of the filter with these levels, from the
         record: 1 if the model explains it.
@@ -425,7 +432,10 @@ class NoiseLevels(Value):
 
     @property
     def plant(self) -> AnyPlant:
-        """The plant with the estimated densities and their deviations, which machines draw."""
+        """The plant with the estimated densities and their standard deviations.
+
+        Random machines made from this plant draw their densities with these deviations.
+        """
         given = self.given
         if PROCESS in self.channels:
             factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]

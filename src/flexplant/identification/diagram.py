@@ -44,8 +44,8 @@ class PoleSelection(Value):
     poles : (m,) complex array [rad/s]
         Poles with positive imaginary parts.
     participation : (n_in, m) complex array
-        Participation factor of each input in each pole; of each output, if there are fewer outputs
-        than inputs. Repeated poles have linearly independent columns.
+        Participation factor of each input in each pole. If there are fewer outputs than inputs, the
+        rows are those of the outputs instead. Repeated poles have linearly independent columns.
 
     Examples
     --------
@@ -83,12 +83,14 @@ class PoleSelection(Value):
 class StabilisationDiagram(Value):
     """Poles of all model orders, and whether each was present at the previous order.
 
+    A track is a sequence of poles at successive model orders that belong together.
+
     Parameters
     ----------
     orders : (n,) int array
         Model order of each pole.
     poles : (n,) complex array [rad/s]
-        Stable poles inside the band.
+        Poles with positive damping ratios inside the band.
     flags : (n,) int array
         0: new pole, 1: same frequency as at the previous order, 2: same damping too, 3: same shape
         too (stable).
@@ -137,14 +139,15 @@ class StabilisationDiagram(Value):
     def automatic(self, *, presence: float = 0.5) -> PoleSelection:
         """Return the poles that are stable over the orders.
 
-        A track is accepted when it is stable at a fraction `presence` of the orders from its first
-        to the highest one, and at least at four. All poles are taken from the order with most
+        A track is accepted when its pole is stable at no less than the fraction `presence` of the
+        orders, and at four orders or more. The orders are counted from the first one of the track
+        to the highest one. All poles are taken from the order with most
         tracks, so that the participation vectors of repeated poles belong together.
 
         Parameters
         ----------
         presence : float
-            Fraction of the orders, between 0 and 1.
+            Smallest fraction of the orders at which the pole of a track is stable, between 0 and 1.
         """
         presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
         kept = []

@@ -121,13 +121,17 @@ def estimate_frf(
     | with ``reference=r`` | S_yr S_ur^-1: under feedback (joint input-output) |
     | `impact_frf` | hammer blows, found in the record |
 
-    A levitated machine is measured under feedback, where noise returns to the inputs and H1 is
-    biased towards ``-1/K``. References r that are not correlated with the noise give the process
-    sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the plant is their
-    quotient (the three-point method): r is an excitation added to the commands, or set-points, one
-    for each input. Periodic signals need as many experiments as inputs, with and without r;
-    averaging over their periods reduces the noise before the division. The inputs are the signals
-    that act on the machine: the commands plus the added excitation.
+    S_ab is the matrix of cross spectra between the signals a and b: inputs u, outputs y and
+    references r. Y and U are the Fourier transforms of the outputs and inputs.
+
+    A levitated machine is measured under feedback. Noise then returns to the inputs through the
+    controller K, and H1 is biased towards ``-1/K``. A reference r is an excitation added to the
+    commands, or a set-point; one reference for each input is needed. References that are not
+    correlated with the noise give the process sensitivity PS = S_yr S_rr^-1 and the sensitivity S =
+    S_ur S_rr^-1. The plant is the quotient ``PS S^-1`` (the three-point method). Periodic signals
+    need as many experiments as inputs, whether a reference is given or not. Averaging over their
+    periods reduces the noise before the division. The inputs are the signals that act on the
+    machine: the commands plus the added excitation.
 
     Parameters
     ----------
@@ -216,22 +220,25 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
     .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
 
-    The noise of an output does not depend on which input is excited, so that the variance is a
-    factor of the output times a factor of the input. The spread of a few repetitions is therefore
-    averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``. The correlation of the
-    errors of two outputs is pooled over the inputs. The degrees of freedom of the variance
+    Here R is the number of repetitions, G^(r) is repetition r, and o and i number the outputs and
+    inputs. The noise of an output does not depend on which input is excited. The variance is
+    therefore a product of two factors, one for the output and one for the input. For this reason
+    the spread of a few repetitions is averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) /
+    mean(sigma^2)``. The correlation of the errors of two outputs is pooled over the inputs. The
+    degrees of freedom of the variance
     (`freedom`) follow from R, the inputs and the number of outputs with independent errors.
 
-    Use another `rng` of `multisine` for each run. With the same signal, quantisation without dither
-    is equal in every run and not part of the spread, and the variance is 28 to 300 times too small.
+    Use another `rng` of `multisine` for each run. With the same signal and no dither, the
+    quantisation error is equal in every run. It is then not part of the spread, and the variance is
+    28 to 300 times too small.
     If the machine drifts between runs, pass the runs separately to `identify_modes`: their mean has
     broader resonances, with errors larger than its standard deviations.
 
     Parameters
     ----------
     repeated : iterable of at least two Frf
-        Measurements of the same channels, frequencies and quantity, with independent noise; at
-        least four for useful weights.
+        Measurements of the same channels, frequencies and quantity, with independent noise. At
+        least four are needed if the variances are to be useful as weights of a fit.
 
     Raises
     ------

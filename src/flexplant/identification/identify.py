@@ -51,7 +51,9 @@ def stabilisation_diagram(
 ) -> StabilisationDiagram:
     """Return the poles of matrix-fraction models of rising order, by pLSCF.
 
-    Model: ``H(z) = B(z) A(z)^-1`` with complex coefficients on the band, see
+    pLSCF is the poly-reference least-squares complex frequency-domain method. The model is ``H(z) =
+    B(z) A(z)^-1``, where B and A are matrix polynomials in z with complex coefficients, and z moves
+    along the unit circle as the frequency moves through the band. The poles follow from A. See
     `flexplant.identification.diagram`.
 
     Parameters
@@ -61,10 +63,11 @@ def stabilisation_diagram(
         counts as displacement.
     orders : iterable of int, optional
         Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
-        of the lines, or to 100 poles; every second one where many references make each costly.
+        of the lines, or to 100 poles. Only every second order is used where a wide band and many
+        inputs and outputs make each order costly.
     tolerances : (float, float, float)
-        Relative change of frequency and of damping from one order to the next, and the MAC, below
-        which a pole counts as stable.
+        Largest relative change of frequency and of damping from one order to the next, and the
+        smallest MAC (modal assurance criterion) of its shapes at both orders, for a stable pole.
     max_zeta : float
         Largest damping ratio of a pole.
 
@@ -176,9 +179,9 @@ def identify_modes(
     refine : bool, optional
         Whether to refine the poles by maximum likelihood. None: yes if this is useful and takes at
         most one or two minutes. It is not useful if each output has its own poles. The cost of a
-        step is estimated as ``n (m r)^2`` with n values of the FRF, m poles and r references; the
-        limits are 5e7 for each step and 5e10 in total. False: the result without refinement, in
-        about a second.
+        step is estimated as ``n (m r)^2`` with n values of the FRF, m poles and r references (the
+        inputs, or the outputs if there are fewer of them). The limits are 5e7 for each step and
+        5e10 in total. False: the result without refinement, in about a second.
     most : int
         Largest number of poles of the fit. The strongest poles of the diagram are used; `rejected`
         lists the others.
@@ -198,10 +201,10 @@ def identify_modes(
     -----
     FlexplantWarning
         When the residual of a group of lines exceeds the noise, because a mode was missed or two
-        were merged. When a resonance is too narrow for the distance between lines: less than half
-        of it if the fit includes the window (Hann-windowed segments), otherwise less than about
-        four times it. When the FRF uses the convention exp(-i omega t), so that its conjugate is
-        used.
+        were merged. When a resonance is too narrow for the distance between lines: its width is
+        less than half of this distance if the fit includes the window (Hann-windowed segments),
+        otherwise less than about four times this distance. When the FRF uses the convention exp(-i
+        omega t), so that its conjugate is used.
 
     Raises
     ------

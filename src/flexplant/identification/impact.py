@@ -45,7 +45,7 @@ class Blow(Value):
     experiment : int
         Number of the record, from 0.
     reason : str
-        Reason why it is refused, or empty.
+        Reason why the blow is refused and not averaged; empty if it is used.
 
     Examples
     --------
@@ -62,7 +62,10 @@ class Blow(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImpactTest(Value):
-    """FRFs of an impact test by `impact_frf`, with the damping of the window.
+    """FRFs of an impact test by `impact_frf`, with the damping of the exponential window.
+
+    `impact_frf` multiplies force and responses by the window ``exp(-t/decay)``, which adds damping
+    to every pole; `corrected` subtracts it.
 
     Parameters
     ----------
@@ -101,7 +104,11 @@ class ImpactTest(Value):
 
     @property
     def dependence(self) -> float:
-        r"""Sum of the correlations of a line's error with all others', T/tau coth(T/tau)."""
+        r"""Sum of the correlations between the error of a line and the errors of all lines.
+
+        It is ``T/tau coth(T/tau)`` with the length T of the segment and the time constant tau of
+        the window.
+        """
         return _dependence(self.segment / self.decay)
 
     def __repr__(self) -> str:
@@ -113,18 +120,20 @@ class ImpactTest(Value):
         return "\n".join([head, *(f"  refused {blow!r}" for blow in self.refused)])
 
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
-        r"""Return modes identified from `frf` without the window's damping.
+        r"""Return modes identified from `frf` without the damping of the window.
 
         Poles whose remaining damping is smaller than its standard deviation are moved to
-        `rejected`. Force and responses times ``exp(-t/tau)`` belong to ``H(s + 1/tau)``: poles move
-        by exactly -1/tau, and residues do not change. For white noise, a fit of ``g = t exp(-(a +
-        1/tau) t)``, the derivative of a pole, has the variance
+        `rejected`. Force and responses that are multiplied by the window ``w = exp(-t/tau)`` have
+        the FRF ``H(s + 1/tau)``: poles move by exactly -1/tau, and residues do not change. The
+        covariance is corrected too, for white noise and segments of length T. For a pole with the
+        real part -a on the machine, the derivative of the response with respect to the pole has the
+        envelope ``g = t exp(-(a + 1/tau) t)``. The variance of the pole is
 
         .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
             \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
 
-        relative to that of independent lines with the variance before the enlargement in `frf`. For
-        residues the exponent is 1 in place of 3.
+        times the variance for independent lines with the variance before the enlargement in `frf`.
+        For residues the exponent is 1 in place of 3.
 
         Parameters
         ----------
@@ -196,12 +205,14 @@ def impact_frf(
 ) -> ImpactTest:
     r"""Return the FRFs of an impact test, ``G = sum(Y F^*) / sum(F F^*)`` over its blows.
 
-    Blows are the pulses of the force in long records. Each blow has a separate segment, in which
-    the force outside of the pulse is set to zero (force window), and force and responses are
-    multiplied by ``exp(-t/decay)``. This moves all poles by -1/decay (`ImpactTest.corrected`
-    reverses it). Vibration that remains at the end of a segment changes residues but no pole. Blows
-    are left out if their segment contains another blow, if they are clipped, or if the record ends
-    too early. The machine is assumed to be at rest before a record that begins with a blow.
+    Y and F are the Fourier transforms of a response and of the force after a blow, and F^* is the
+    complex conjugate of F. Blows are the pulses of the force in long records. Each blow has a
+    separate segment, in which the force outside of the pulse is set to zero (force window). Force
+    and responses are multiplied by the exponential window ``exp(-t/decay)``. This moves all poles
+    by -1/decay (`ImpactTest.corrected` reverses it). Vibration that remains at the end of a segment
+    changes residues but no pole. Blows are left out if their segment contains another blow, if they
+    are clipped, or if the record ends too early. The machine is assumed to be at rest before a
+    record that begins with a blow.
 
     Parameters
     ----------
@@ -219,10 +230,10 @@ def impact_frf(
     level : float
         Fraction of the largest force of a record above which a pulse begins, between 0 and 1.
     limits : mapping {channel: value}, or float, optional
-        Full scale of each channel, or of all channels: a blow that reaches it is refused. A channel
-        without a limit counts as clipped where it stays at its extreme value after a steep rise,
-        unless this is its value at rest; ``limits=1e9`` disables this test. A warning names each
-        output that never changes its value.
+        Full scale of each channel, or of all channels: a blow that reaches it is refused as
+        clipped. For a channel without a limit, clipping is detected automatically: the signal stays
+        at its extreme value after a steep rise, and this value is not its value at rest.
+        ``limits=1e9`` disables this test. A warning names each output that never changes its value.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the responses.
 

@@ -35,10 +35,11 @@ class MeasuredModes(Value):
     Parameters
     ----------
     poles : (m,) complex array [rad/s]
-        One pole of each conjugate pair, with either sign of the imaginary part (the paper prints
-        the negative one); stored with the positive one.
+        One pole of each conjugate pair, with either sign of the imaginary part (the paper on which
+        flexplant is based prints the negative one); stored with the positive one.
     modes : sequence of m int, optional
-        Number of each mode in the model, counted from 1 with rigid-body modes. Updating needs them.
+        Number of each mode in the model, counted from 1 with rigid-body modes. The numbers are
+        needed to update a model.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
         Either the variance E|d lambda|^2 of each pole, whose real and imaginary parts are then
         equally uncertain and independent, or the covariance matrix of the vector [Re lambda; Im
@@ -331,16 +332,23 @@ def numbered(
 ) -> MeasuredModes:
     r"""Return measured modes with the numbers of the corresponding modes of a model.
 
-    Pairs minimise the sum of ``(ln(f / f_model) / tolerance)^2 + 1 - MAC`` (Hungarian method),
+    Each measured mode is paired with a different mode of the model. The pairs are chosen by the
+    Hungarian method: they minimise the sum of ``(ln(f / f_model) / tolerance)^2 + 1 - MAC``. Here f
+    and f_model are the frequencies of a pair, and
 
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
-    over the measured DOFs. Where the model has the places of the inputs, the residues of a pair may
-    differ by a factor of at most 30. This excludes modes of the model that the sensors do not see,
-    whose shapes there are rounding, and folded modes that happen to have the right frequency. Modes
-    of the model within 0.5 % of each other count as repeated. Their MAC is that of the closest
-    combination of their shapes; it does not distinguish them, and they are numbered by frequency.
-    Where fewer poles than modes of one frequency are measured, they get the lowest numbers.
+    is the modal assurance criterion of the shapes phi of the model and psi of the measurement at
+    the measured DOFs. If the places of the inputs are known on the model, the residues of a pair
+    may differ by a factor of at most 30. This excludes modes of the model that the sensors do not
+    see, whose shapes at the sensors are only rounding errors. It also excludes folded modes (modes
+    above half the sampling rate, seen at a lower frequency) that happen to be near a frequency of
+    the model.
+
+    Modes of the model within 0.5 % of each other count as repeated. Their MAC is that of the
+    closest combination of their shapes. It does not distinguish them, and the measured modes are
+    numbered by frequency. If fewer poles are measured than the model has repeated modes, the
+    measured ones get the lowest numbers.
 
     Parameters
     ----------
@@ -349,21 +357,21 @@ def numbered(
     model : Modes, or a model with `.modes()`
         Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
-        Ports, for the places of their sensors and actuators; or the place of each row of the shapes
-        (a point means along z there, a sensor has its direction). By default the labels are DOFs of
-        the model.
+        Places of the rows of the shapes on the model. Ports give the places of their sensors and
+        actuators. A mapping gives the place of each row: a sensor with its direction, or a point,
+        which means the direction z there. By default the labels are DOFs of the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float
         Smallest MAC in a pair.
     partial : bool
-        Whether to leave out poles without a partner instead of raising an error: modes above half
-        the sampling rate fold into the band of a sampled measurement, where the model has no mode.
+        Whether to leave out poles without a partner instead of raising an error. Such poles are
+        found where modes above half the sampling rate fold into the band of the measurement.
 
     Returns
     -------
     MeasuredModes
-        Modes of the same kind, in the same order, with `modes`.
+        The measured modes, of the same class and in the same order, with mode numbers in `modes`.
 
     Raises
     ------

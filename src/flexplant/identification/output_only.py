@@ -49,17 +49,21 @@ def identify_output_only(
     :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation form the matrix
 
     .. math:: H = \begin{bmatrix} R_1 & R_2 & \cdots \\ R_2 & R_3 & \cdots \\ \vdots & & \ddots
-        \end{bmatrix} = O\,C, \quad O = [C;\ C A;\ C A^2;\ \ldots].
+        \end{bmatrix} = O\,Z, \quad O = [C;\ C A;\ C A^2;\ \ldots].
 
-    The leading singular vectors of H give O in some basis of the states. A follows from O and O
-    shifted by one block, and the poles are :math:`\lambda = rate\,\ln \mu(A)`. Poles that are
-    stable over the orders are chosen at the lowest order that has most of them, since more states
-    add noise. White sensor noise is in :math:`R_0` only, which is not used. The covariance of each
-    pole is found by leaving out each block of the record in turn (a jackknife). With b blocks it is
+    A and C are the state and output matrices of a discrete-time model of the machine, O is its
+    observability matrix, and Z is the other factor. The leading singular vectors of H give O in
+    some basis of the states. A follows from O and O shifted by one block, and the poles are
+    :math:`\lambda = rate\,\ln \mu` with the eigenvalues :math:`\mu` of A. This is repeated for
+    several model orders (numbers of states). Poles that hardly change from order to order count as
+    stable. They are chosen at the lowest order that has most of them, since more states add noise.
+    White sensor noise is in :math:`R_0` only, which is not used. The covariance of each pole is
+    found by leaving out each block of the record in turn (a jackknife). With b blocks it is
     multiplied by (b - 1)/(b - 3), so that squared errors relative to the variance (Student's
     distribution) have a mean of 1. Poles whose frequency varies by more than 2 % or whose damping
     varies by more than 60 % count as noise and are left out. A rotating part or mains hum appears
-    as a mode with almost no damping, and excitation that is not white as additional modes.
+    as a mode with almost no damping. Peaks in the spectrum of an excitation that is not white
+    appear as additional modes.
 
     Parameters
     ----------
@@ -70,7 +74,7 @@ def identify_output_only(
     band : (low, high) [Hz]
         Frequency band of the modes.
     orders : iterable of int, optional
-        Numbers of states; 4, 6, ..., 40 by default.
+        Model orders (numbers of states); 4, 6, ..., 40 by default.
     lags : int, optional
         Number of block rows and columns of H; two periods of the lowest frequency by default.
     blocks : int
@@ -82,9 +86,9 @@ def identify_output_only(
     Returns
     -------
     MeasuredModes
-        Sorted by frequency, without mode numbers; shapes at the channels, with a largest entry of
-        1, since the scale is unknown without the excitation. The covariance is given for each pole
-        separately.
+        Modes sorted by frequency, without mode numbers. The shapes are those at the channels, with
+        a largest entry of 1, since their scale is unknown without the excitation. The covariance is
+        given for each pole separately.
 
     Raises
     ------

@@ -259,6 +259,10 @@ class IdentifiedModes(MeasuredModes):
     .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k}
         + \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k} + E(s)
 
+    The lambda_k are the poles, psi_k the shapes and l_k the participation vectors. E(s) contains
+    the residual terms, which represent the modes outside the band. M and D are the mass and damping
+    matrices of the structure.
+
     Parameters
     ----------
     poles, modes, covariance, shapes, dofs, xyz, directions
@@ -269,7 +273,7 @@ class IdentifiedModes(MeasuredModes):
         Names of the channels.
     input_dofs : sequence of n_in str
         Labels of the inputs' DOFs, or their names where no DOF is known.
-    terms : (n_out, n_in, lower + upper) array
+    terms : (n_out, n_in, number of terms) array
         Coefficients of E(s), the effect of modes outside the band: `lower` terms in 1/s, 1/s^2,
         ..., then the terms in 1, s, .... Here s is divided by ``2 pi top``.
     lower : int
@@ -346,7 +350,7 @@ class IdentifiedModes(MeasuredModes):
 
     @property
     def refined(self) -> bool:
-        """Whether poles are those of the complete maximum likelihood fit."""
+        """Whether the poles are the result of the complete maximum likelihood fit."""
         return not self.first_answer
 
     def __repr__(self) -> str:
@@ -363,12 +367,12 @@ class IdentifiedModes(MeasuredModes):
 
     @property
     def shape_covariance(self) -> ComplexArray | None:
-        """E[n n^H] (m, n_out, n_out) of the error n of each shape, None if not known."""
+        """Covariance E[n n^H] (m, n_out, n_out) of the error n of each shape, or None."""
         count, spread = len(self.outputs), self.channel_covariance
         return None if spread is None else spread[:, :count, :count]
 
     def frf(self, freq: FloatArray, *, as_measured: bool = False) -> Frf:
-        """Return the identified response (displacement per input), to compare or to extend.
+        """Return the FRF of the identified modes and residual terms (displacement per input).
 
         Parameters
         ----------

@@ -29,7 +29,9 @@ class H1Estimator(SpectralMethod):
     """The estimator H1, ``G = S_yu S_uu^-1``, for noise on the outputs.
 
     S_yu is the matrix of cross spectra between outputs y and inputs u, and S_uu that of the inputs.
-    The estimate has no bias from noise on the outputs if the machine is measured in open loop.
+    The record is divided into overlapping segments, and the spectra are means over the segments
+    (Welch's method). The estimate has no bias from noise on the outputs if the machine is measured
+    in open loop.
 
     Parameters
     ----------
@@ -66,7 +68,8 @@ class H2Estimator(SpectralMethod):
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`; the source is the same.
+        Length of the segments, their overlap and their window, as for `H1Estimator`. The
+        reference is the same too.
 
     Examples
     --------
@@ -78,13 +81,15 @@ class H2Estimator(SpectralMethod):
 class HvEstimator(SpectralMethod):
     """The estimator Hv, for noise on inputs and outputs: total least squares.
 
-    At each frequency every output is fitted together with all inputs, each scaled to unit power.
+    At each frequency every output is fitted together with all inputs. Before the fit, each of these
+    signals is scaled to unit power.
     For one input the magnitude is the geometric mean of those of H1 and H2.
 
     Parameters
     ----------
     segment, overlap, window : optional
-        As for `H1Estimator`; the source is the same.
+        Length of the segments, their overlap and their window, as for `H1Estimator`. The
+        reference is the same too.
 
     Examples
     --------

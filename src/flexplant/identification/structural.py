@@ -35,20 +35,23 @@ def structural_modes(
 ) -> Modes:
     r"""Return identified modes as modes of a structure for `assemble_plant`.
 
-    From the fit :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`, which is
-    mass-normalised at a place where the machine was both driven and measured, the modes of the
-    structure are:
+    The fit is :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`, see
+    `IdentifiedModes`. Its shapes are mass-normalised at a place where the machine was both driven
+    and measured. The modes of the structure are:
 
     - shapes :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
-      :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, their mean at places
-      that are both;
-    - the remainder, approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band.
-      A gives the rigid-body modes, :math:`\Phi_r \Phi_r^T = A`, as combinations of the rigid-body
-      motions of the geometry. G gives residual vectors v, :math:`v v^T/\omega_v^2 = G`, with a
-      frequency :math:`\omega_v` above the band. Between places that are not both driven and
-      measured (o), G follows from those that are (c): :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`;
-    - modes just outside the band become residual vectors too, with their frequency and damping,
-      where they are modes of a structure: real shapes with equal input and output shapes.
+      :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, and the mean of both
+      at places that are output and input;
+    - the remainder E(s), approximated in the band by
+      :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)`. A gives the rigid-body modes,
+      :math:`\Phi_r \Phi_r^T = A`, as combinations of the rigid-body motions of the geometry. G
+      gives residual vectors v, :math:`v v^T/\omega_v^2 = G`, with a
+      frequency :math:`\omega_v` above the band. The index c denotes the places that were both
+      driven and measured, and o the other places. Between two places of the kind o, the value is
+      :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`;
+    - modes just outside the band. They become residual vectors too, with their frequency and
+      damping, if they are modes of a structure: their shapes are real, and the shapes at inputs
+      and outputs agree.
 
     Parameters
     ----------
@@ -58,9 +61,11 @@ def structural_modes(
         DOFs of the labels. POIs at other places need shapes between these:
         ``interpolated(DofSet(...))``.
     over : Modes, optional
-        Modes of a model of the same structure, at most as many as measured places. Shapes are
-        expanded over all its DOFs, ``phi = Phi Phi_a^+ psi`` (SEREP), so that POIs may be anywhere
-        on the model.
+        Modes of a model of the same structure, at most as many as measured places. The measured
+        shapes psi are expanded to all DOFs of the model, ``phi = Phi Phi_a^+ psi``. Phi holds the
+        shapes of the model at all its DOFs, Phi_a those at the measured DOFs, and ^+ denotes the
+        pseudo-inverse (SEREP, the system equivalent reduction expansion process). POIs may then be
+        anywhere on the model.
     rigid : bool
         Whether the term in 1/s^2 is rigid-body motion. False for a held structure.
 
@@ -325,9 +330,11 @@ def shape_deviations(
 
     The error n of a mode's identified shape and participation causes the error :math:`A n` of the
     mode shape. The matrix A takes the mean at places that were both driven and measured, and
-    expands over the modes of a model if they are given. For circular noise the real part has the
-    covariance :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The largest v_j are
-    kept and scaled so that the sum of all variances is preserved.
+    expands over the modes of a model if they are given. The noise is assumed circular: real and
+    imaginary parts have the same variance and are not correlated. The real part of the error then
+    has the covariance :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The vectors
+    v_j are the eigenvectors of C, scaled by the square roots of their eigenvalues. The largest v_j
+    are kept and scaled so that the sum of all variances is preserved.
 
     Parameters
     ----------
