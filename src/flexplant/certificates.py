@@ -26,9 +26,10 @@ class Verified(Value):
     route : str
         Method by which it was computed; empty if it is the method that gave the answer.
     limit : float, optional
-        The figure must be below this limit. Without a limit the figure is only information.
+        Largest allowed figure, or the smallest one if `at_least` is true. Without a limit the
+        figure is only information.
     at_least : bool
-        The figure must be above the limit instead.
+        Whether the limit is a lower one.
 
     Examples
     --------

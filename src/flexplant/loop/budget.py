@@ -40,28 +40,29 @@ RESIDUE = "set-point residue"
 class ErrorBudget(Value):
     """Contributions to the rms of one signal of a closed loop; prints as a table.
 
-    Independent sources: their variances add. Made by `ClosedLoop.budget`.
+    The sources are independent, so that their variances add. Made by `ClosedLoop.budget`.
 
     Parameters
     ----------
     channel, unit : str
-        The signal and its SI unit (empty: none known).
+        Name of the signal and its SI unit; the unit is empty if it is not known.
     names : sequence of str
-        The sources: white disturbances, sensor noises, the residue of a set-point.
+        Names of the sources: white disturbances, sensor noises, and the residue of a set-point,
+        which is the error that remains without noise.
     variances : (n_source,) array [unit^2]
         Variance of each source.
     freq : (n_freq,) array [Hz]
         Frequencies from 0 to half the rate; to infinity for a continuous loop.
     cumulative : (n_source, n_freq) array [unit^2]
-        Variance of each source below a frequency.
+        Variance of each source below each frequency of `freq`.
     left_out : float [unit]
         RMS on the plant with the truncated modes; NaN where these are not known, infinite where the
         loop is unstable with them.
     certificate : Certificate
-        Relative differences of the variance computed in other ways.
+        Relative differences between the variance and the same variance computed by other methods.
     interval : str
-        Interval of the rms on the machines that agree with the measurement, or the reason
-        why it does not exist; empty where no machines are known.
+        Text of the interval of the rms over the machines that agree with a measurement, or the
+        reason why it does not exist; empty if the plant knows no such machines.
 
     Examples
     --------
@@ -247,7 +248,7 @@ class Spectrum(NamedTuple):
     freq : (n_freq,) array [Hz]
         Frequencies.
     psd : (n_freq,) array [unit^2/Hz]
-        Its integral over all frequencies is the mean square.
+        Power spectral density. Its integral over all frequencies is the mean square of the signal.
 
     Examples
     --------

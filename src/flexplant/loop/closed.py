@@ -55,19 +55,19 @@ from .other_machines import (
 class ClosedLoop(Value):
     """A plant with its controller, ``u = K y``, with named signals.
 
-    Made by `close_loop`.
+    Made by `close_loop`. A plant has inputs w (noises, disturbances, references) and u (commands),
+    and outputs z (motions and errors at points of interest) and y (sensors, references).
 
     Parameters
     ----------
     plant : StandardPlant
-        The plant, open.
+        Plant without its controller.
     blocks : sequence of StateSpace
         Connected blocks; `close_loop(other_plant, *loop.blocks)` closes the same controller around
         another machine.
     controller : StateSpace
-        All blocks as one system, with the outputs y of the plant as inputs. Its outputs are the
-        commands of the driven actuators, then the monitored outputs, such as estimates of an
-        observer.
+        All blocks as one system from the outputs y of the plant to the commands of the driven
+        actuators, followed by the monitored outputs, such as estimates of an observer.
     idle : sequence of str
         Actuators that no block drives.
 
@@ -189,7 +189,7 @@ class ClosedLoop(Value):
         return Frf(grid, data, tuple(self.plant.w), tuple(self.plant.z), units=self.units)
 
     def gain(self, reference: str, error: str) -> Responder:
-        """Return the function of frequency [Hz] that gives the response from a w to a z.
+        """Return a function of frequency [Hz]: the response from one channel of w to one of z.
 
         Use it for many calls: it is prepared once and does not check frequencies. It returns an
         array (1, 1, n_freq).
@@ -222,7 +222,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def broken(self) -> BrokenLoop:
-        """Plant and controller of the open loop: between u and the outputs y that u moves."""
+        """Plant and controller of the open loop, with u and only the outputs y that u moves."""
         read = self.controller.input_index(self.fed_back)
         return BrokenLoop(
             self.driven,
@@ -238,7 +238,7 @@ class ClosedLoop(Value):
     def spectral_radius(self) -> float:
         """Largest magnitude of the closed loop's eigenvalues; stable below 1.
 
-        ModelError in continuous time, where the `spectral_abscissa` decides.
+        A continuous loop raises ModelError: use its `spectral_abscissa`.
         """
         if not self.plant.dt:
             raise ModelError(
@@ -251,7 +251,7 @@ class ClosedLoop(Value):
     def spectral_abscissa(self) -> float:
         """Largest real part of the closed loop's eigenvalues [rad/s]; stable below 0.
 
-        For a sampled loop the decay rate ``log(spectral_radius) / dt``.
+        For a sampled loop it is ``log(spectral_radius) / dt``.
         """
         if self.plant.dt:
             with np.errstate(divide="ignore"):
@@ -303,7 +303,7 @@ class ClosedLoop(Value):
         """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances; with scaled axes where actuators have different units, as in
+        loop's resonances. If actuators have different units, axes are scaled as in
         `LoopReport.scaled_margin`. It is 0 for an unstable loop.
         """
         return self.broken.margin()
@@ -318,7 +318,7 @@ class ClosedLoop(Value):
     def on_machines(self) -> MachineLoops:
         """The same controller around machines that agree with the measurement.
 
-        ModelError when the plant knows no such machines.
+        A plant that knows no such machines raises ModelError.
         """
         known = self.plant.machine.machines
         if known is None:
@@ -340,15 +340,15 @@ class ClosedLoop(Value):
         Parameters
         ----------
         figure : str or callable
-            "modulus margin", "bandwidth" (the smallest of |S| < 1 of all axes with a reference,
-            Hz), "spectral radius", or a signal for its `rms`. A function of a loop that returns a
+            "modulus margin", "bandwidth" (Hz, the smallest of all axes that have a reference),
+            "spectral radius", or a signal for its `rms`. A function of a loop that returns a
             positive number is evaluated on each machine, such as the MA of the error after a move:
             ``lambda one: simulate(one, reference=move, duration=0.1, noise=False)
             .exposure("die:error", start=0.05)[0]``.
         level : float
             Fraction of the machines, between 0 and 1.
         unit : str
-            SI unit of what a function returns.
+            SI unit of the number that a function `figure` returns.
 
         Returns
         -------
@@ -365,7 +365,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:
-        """Tolerances of modes; None for coupled modes or an unstable loop.
+        """Tolerances to errors of each mode; None for coupled modes or an unstable loop.
 
         If the plant has uncertain frequencies, truncated modes are included where they are known.
         `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
@@ -435,7 +435,7 @@ class ClosedLoop(Value):
         return float(np.sqrt(variances.sum()))
 
     def drawn_rms(self, channel: str) -> float:
-        """Return `rms` without its second check, for random machines around a verified loop."""
+        """Return `rms` without its check by a second method, for variations of a verified loop."""
         variances = unverified_variances(self.monitored, *self._noises(channel))
         return float(np.sqrt(variances.sum()))
 

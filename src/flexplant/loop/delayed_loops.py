@@ -76,7 +76,7 @@ class DelayedLoop(Value):
 
     @cached_property
     def gain(self) -> Delayed:
-        """L = -G K, at y."""
+        """Loop gain L = -G K, with the loop opened at y."""
         found: Delayed = -(self.plant * self.controller)
         return found
 

@@ -33,9 +33,11 @@ def in_axes(
 ) -> Frf:
     """Return the measured plant from the axes of `before` to those of `after`.
 
-    ``after G before``; where a rate is given, times the delay of a sampled controller and its
-    zero-order hold, ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. Lines above half
-    the rate appear at lower frequencies: ``sum_k (G H)(f + k rate)``, as far as they exist.
+    The result is ``after G before``, where G is the measured response. If a `rate` is given, the
+    result is multiplied by the response of the delay and the zero-order hold of a sampled
+    controller, ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. Sampling folds the
+    response above half the rate to lower frequencies. The result is then
+    ``sum_k (G H)(f + k rate)`` over the measured frequencies.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def in_axes(
         Measured response from actuators to sensors.
     before, after : StateSpace or array, optional
         Static transformations: `accelerations` (or `to_actuators`) and `to_motions` of a
-        `decouple`. Names of a StateSpace select the channels of the Frf.
+        `decouple`. The channel names of a StateSpace select the channels of the Frf.
     rate : float [Hz], optional
         Rate of the controller; the result ends below half of it.
     delay : float

@@ -22,15 +22,15 @@ class OnMeasurement(Value):
     Parameters
     ----------
     margin : float
-        Modulus margin, broken at u; 0 where the loop is unstable, NaN where the lines do not show
-        whether it is stable.
+        Modulus margin, with the loop opened at u; 0 if the loop is unstable, NaN if the measured
+        frequencies do not show whether it is stable.
     freq : float [Hz]
-        Where |S| at u is largest.
+        Frequency at which the sensitivity |S| at u is largest.
     reason : str
-        Why the stability is not known; else empty.
+        Reason why the stability is not known; empty if it is known.
     added : float [samples]
-        Delay of the plant that was added to a response measured from sample to sample, which may
-        contain it.
+        Delay of the plant that was added to a response measured from sample to sample. Such a
+        response may already contain this delay.
 
     Examples
     --------
@@ -46,12 +46,12 @@ class OnMeasurement(Value):
 
     @property
     def is_unstable(self) -> bool:
-        """Whether the lines show an unstable loop."""
+        """Whether the measured frequencies show an unstable loop."""
         return self.margin == 0.0
 
     @property
     def summary(self) -> str:
-        """The finding in words."""
+        """Text of the result."""
         if self.reason:
             found = f"stability not known, {self.reason}"
         elif self.is_unstable:

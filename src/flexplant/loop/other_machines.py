@@ -54,7 +54,7 @@ class SpillOver(Value):
         Number of states of the plant with the truncated modes.
     modes : sequence of int
         Numbers (from 1, rigid-body modes included) of the modes of that plant with the largest
-        participation in the instability, or in the peak of |S| at u where this is `high`; empty
+        participation in the instability, or in the peak of |S| at u if `is_high` is true; empty
         otherwise.
     freq : sequence of float [Hz]
         Frequencies of the instability or peak, one for each of these modes.
@@ -78,7 +78,7 @@ class SpillOver(Value):
 
     @property
     def is_stable(self) -> bool:
-        """Whether the loop is stable there."""
+        """Whether the loop is stable with the truncated modes."""
         return self.stability < (1.0 if self.sampled else 0.0)
 
     @property
@@ -93,9 +93,9 @@ class SpillOver(Value):
 
     @property
     def spectral_radius(self) -> float:
-        """Largest magnitude of the closed loop's eigenvalues there, for a sampled loop.
+        """Largest magnitude of the eigenvalues of the sampled loop with the truncated modes.
 
-        ModelError in continuous time, where `stability` is the largest real part.
+        A continuous loop raises ModelError; its `stability` is the largest real part.
         """
         if not self.sampled:
             raise ModelError("the spectral radius belongs to sampled loops: use stability.")
@@ -122,7 +122,7 @@ class SpillOver(Value):
 
     @property
     def summary(self) -> str:
-        """The finding in one line."""
+        """Text of the result in one line."""
         found = one_line({self._measure: self.stability})
         if not self.is_stable:
             return f"unstable ({self.states} states), {found}: {self.named_modes}"

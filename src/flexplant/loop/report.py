@@ -46,11 +46,12 @@ class LoopMargins(Value):
         an unstable loop this and the other figures are distances to the critical point, not
         margins.
     modulus_margin : float
-        Least distance to the critical point, 1 / max |S|.
+        Smallest distance of the loop gain to the critical point, 1 / max |S|.
     freq : float [Hz]
         Frequency at which the modulus margin occurs.
     gain_freq, phase_freq : float [Hz]
-        Frequencies of the smaller gain margin and of the phase margin; NaN without them.
+        Frequency of the smaller (in dB) of `gain_margin` and `gain_reduction`, and frequency of the
+        phase margin; NaN if they do not exist.
     phases : tuple of float [deg]
         Change of phase at each crossover that moves the loop gain to the critical point: positive
         for a lag, negative for a lead.
@@ -110,8 +111,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         Margins of each channel where the loops are broken.
     modulus_margin : float
         Modulus margin of all loops together, ``1 / max sigma_max(S)`` with S where they are broken;
-        0 when unstable. Where the channels have several `units`, which a singular value would mix,
-        it is the scaled margin.
+        0 when unstable. If the channels have different `units`, a singular value would mix them,
+        and this is the `scaled_margin`.
     unstable : int, optional
         Number of poles of the closed loop outside the stability region; None if not known.
     reason : str
@@ -123,8 +124,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         the frequencies are close enough to show all modes, and for a model.
     scaled_margin : float
         Modulus margin of all loops together with scaled axes, ``1 / max min_D sigma_max(D S D^-1)``
-        (from the upper bound of mu with an uncertainty for each axis), to 2 %. It does not depend
-        on units.
+        (from the upper bound of the structured singular value mu with an uncertainty for each
+        axis). Its relative tolerance is 2 %. It does not depend on units.
     units : tuple of str
         Units of the channels, if they differ.
     """
@@ -142,7 +143,7 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     def is_stable(self) -> bool | None:
         """Whether the closed loop is stable; None where it cannot be judged.
 
-        For a measured plant, if it has no hidden mode narrower than `narrowest`.
+        For a measured plant, this holds if no mode narrower than `narrowest` is hidden.
         """
         return None if self.unstable is None else self.unstable == 0
 
@@ -191,11 +192,12 @@ def report_loops(
     """Return crossovers, gain, phase and modulus margin of each loop, and whether all are stable.
 
     Each loop is broken while the others stay closed: ``L_i = 1 - 1 / S_ii`` with
-    ``S = (I - L)^-1``. Stability of a model follows from the poles; that of a measured plant from
-    the Nyquist count, with the poles at zero and outside the stability region that are stated for
-    the plant and known of the controller. Modes between the lines are included as far as the lines
-    show them; otherwise the result is conditional, "stable unless a mode between the lines near 80
-    Hz is narrower than 0.02 Hz", or stability is not judged.
+    ``S = (I - L)^-1``. Stability of a model follows from its poles; that of a measured plant
+    follows from the number of Nyquist encirclements. This count uses the poles of the controller
+    and those of the plant that `rigid` and `unstable` state. The measured frequencies are called
+    lines. Modes between the lines are included if neighbouring lines show them. Otherwise the
+    result is conditional, "stable unless a mode between the lines near 80 Hz is narrower than 0.02
+    Hz", or stability is not judged.
 
     Parameters
     ----------
@@ -374,14 +376,16 @@ class LoopComparison(Value):
     rows : mapping {name: LoopFigures}
         Figures of each loop.
     channel : str
-        Channels of S: ``die:ref to die:error``; empty when the loops have no reference.
+        Input and output of S, such as ``die:ref to die:error``; empty when the loops have no
+        reference.
     sampled : bool
         Whether `decay` of the rows is a spectral radius.
     unjudged : sequence of str
-        Loops whose plants have no evaluation model.
+        Names of the loops whose plants have no evaluation model.
     intervals : mapping {name: str}
-        Intervals of margin and bandwidth of each loop whose machines are known, or the
-        reason why they do not exist.
+        Text of the intervals of margin and bandwidth over the machines that agree with a
+        measurement, or the reason why they do not exist; only for loops whose plants know such
+        machines.
     """
 
     rows: Mapping[str, LoopFigures]
@@ -427,7 +431,8 @@ def compare_loops(
     Returns
     -------
     LoopComparison
-        |S| at low frequency is read at a tenth of the largest bandwidth of all loops.
+        Table of the figures. Its |S| at low frequency is that at a tenth of the largest bandwidth
+        of all loops.
 
     Raises
     ------

@@ -24,16 +24,16 @@ from .closed import ClosedLoop, close_loop
 class ScheduledLoop(Value):
     """Closed loops of one machine at several positions; made by `schedule_loops`.
 
-    Between them the matrices of the controller are linear in the position: all designs have the
-    same states, in the same coordinates (those of the plant's modes, for observers), so that the
-    commands stay continuous while the machine moves.
+    Between these positions the matrices of the controller are interpolated linearly. All designs
+    have the same states in the same coordinates (for observers, those of the plant's modes). The
+    commands therefore stay continuous while the machine moves.
 
     Parameters
     ----------
     position : str
         The scheduling variable.
     places : (k,) array [m or rad]
-        Values of the variable, increasing.
+        Increasing values of the scheduling variable at which loops are given.
     loops : sequence of k ClosedLoop
         Loop at each place.
 
@@ -91,7 +91,7 @@ class ScheduledLoop(Value):
 
     @cached_property
     def stacked(self) -> tuple[FloatArray, ...]:
-        """A, B, C and D of the controllers, each (k, ., .)."""
+        """Matrices A, B, C and D of the controllers, stacked along a first axis of length k."""
         systems = [loop.controller for loop in self.loops]
         return tuple(np.array([getattr(one, part) for one in systems]) for part in "ABCD")
 

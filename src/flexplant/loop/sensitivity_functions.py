@@ -43,19 +43,19 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     ----------
     loop : ClosedLoop, (plant, controller), or StateSpace or Frf
         The plant is a StandardPlant, a StateSpace (also of python-control) or a measured Frf with
-        the delay of the loop. The controller is y -> u and contains the sign of the feedback, or it
-        is a ClosedLoop, whose controller is then used with this plant. A single system or Frf is a
-        loop gain with negative feedback, ``S = (I + L)^-1``.
+        the delay of the loop. The controller is a system from y to u that contains the sign of the
+        feedback. It may also be a ClosedLoop, whose controller is then used with this plant. A
+        single system or Frf is a loop gain with negative feedback, ``S = (I + L)^-1``.
     freq : (n_freq,) array, optional [Hz]
-        Frequencies; by default a grid refined at resonances, or the lines of a measured plant above
-        0 Hz (at 0 Hz free bodies and integrators are infinite).
+        Frequencies; by default a grid refined at resonances, or, for a measured plant, its measured
+        frequencies above 0 Hz (at 0 Hz the responses of free bodies and integrators are infinite).
     at : {"u", "y"}
         Where the loop is broken.
 
     Returns
     -------
     Frf
-        From the channels of `at` to themselves.
+        Loop gain from the channels of `at` to the same channels.
 
     Raises
     ------
@@ -307,9 +307,9 @@ def modulus_margin(loop: Loop) -> float:
     Raises
     ------
     AssumptionError
-        When the lines of a measured plant do not show whether the loop is stable, so that the
-        distance to the critical point is not a margin. `report_loops` accepts further knowledge of
-        the plant.
+        When the measured frequencies of a plant do not show whether the loop is stable, so that the
+        distance to the critical point is not a margin. In `report_loops` the numbers of rigid-body
+        modes and of unstable poles can be given.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
 

@@ -23,7 +23,8 @@
 >>> f"{1e9 * ma:.0f} nm, {1e9 * msd:.1f} nm"
 '1160 nm, 147.5 nm'
 
-Names elsewhere: ``lsim``, ``forced_response``, Simulink.
+Names elsewhere: ``lsim`` (MATLAB), ``forced_response`` (python-control) and runs of a Simulink
+model correspond to `simulate`.
 
 **Many machines.** A pipeline is a plain function that takes one machine and returns a row of the
 table. `examples/fleet.py` has the whole chain: measure, update, calibrate, design, verify on the

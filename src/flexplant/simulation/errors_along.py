@@ -56,7 +56,7 @@ class PathRms(Value):
     rms : (n_channels, n_time) array
         Standard deviation of each channel, in its unit.
     names : sequence of str
-        The channels: z, y, driven u and what blocks show.
+        Names of the channels: z, y, driven u and the monitored outputs of blocks.
     units : mapping {str: str}
         Units of the channels.
     """
@@ -201,10 +201,10 @@ class PathFilters(Value):
     names : sequence of str
         Motions of POIs, such as `die:z`.
     exact, scheduled, frozen : (n_names, n_time) arrays [m or rad]
-        Standard deviation of the error of each estimate, with the measurement y[k] included: with
-        the time-varying gain of the Riccati recursion (the smallest error); with steady gains of
-        some positions, interpolated linearly; with the steady gain of the present position of the
-        plant.
+        Standard deviation of the error of each estimate, which uses the measurement y[k] of the
+        same sample. The `exact` filter has the time-varying gain of the Riccati recursion and the
+        smallest error. The `scheduled` filter interpolates steady gains of some positions linearly.
+        The `frozen` filter has the steady gain of the present position of the plant.
     units : mapping {str: str}
         Units of the motions.
     """
@@ -230,7 +230,7 @@ class PathFilters(Value):
         return "\n".join(lines) + ">"
 
     def price(self, gain: str) -> dict[str, FloatArray]:
-        """Return the increase of each error (n_time,) by a steady gain, "scheduled" or "frozen"."""
+        """Return the excess of each error (n_time,) of "scheduled" or "frozen" over "exact"."""
         require_known("gain", [gain], GAINS)
         extra = getattr(self, gain) - self.exact
         return {name: np.asarray(extra[i]) for i, name in enumerate(self.names)}
@@ -274,7 +274,8 @@ def filters_along(
     Raises
     ------
     AssumptionError
-        When no steady filter exists: a rigid-body mode is not excited or not seen.
+        When no steady filter exists, because a rigid-body mode is not excited by noise or is not
+        visible to the sensors.
     ModelError
         When no position or more than one moves, or a moving port has a filter or latency or is not
         a displacement.

@@ -34,7 +34,7 @@ class ExposureFigures(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ExposureErrors(Value):
-    """Moving average and moving standard deviation of errors over exposures; prints as a table.
+    """Moving average (MA) and moving standard deviation (MSD) of errors; prints as a table.
 
     Parameters
     ----------
@@ -43,7 +43,8 @@ class ExposureErrors(Value):
     units : sequence of str
         SI units of the errors.
     values : (n, 4) array
-        Largest |MA|, the |MA| that 99.7 % of the windows do not exceed; the same of the MSD.
+        Columns: the largest |MA|, the |MA| that 99.7 % of the windows do not exceed, and the same
+        two figures of the MSD.
     window : float [s]
         Length of the moving window.
     """
@@ -77,22 +78,23 @@ def exposure_errors(
 ) -> ExposureErrors:
     """Return MA and MSD of errors over the exposures of a run, by POI and axis.
 
-    The MA is the mean over a window (overlay), the MSD the deviation in it after this mean was
-    removed (fading). Windows lie completely within an exposure and slide over it sample by sample,
-    like the slit over the points of a die.
+    The moving average (MA, overlay) is the mean over a window. The moving standard deviation (MSD,
+    fading) is the standard deviation in the window about this mean. Windows lie completely within
+    an exposure and slide over it sample by sample, like the slit over the points of a die.
 
     Parameters
     ----------
     run : Response
-        From `simulate`; all its runs count.
+        Result of `simulate`; all its runs are evaluated.
     channels : sequence of str, optional
-        Channels; by default the errors of all POIs, and their axes without a reference.
+        Names of the errors; by default those of all POIs (points of interest), and the motions of
+        their axes without a reference.
     window : float [s]
         Exposure time of one point; None: each exposure is one window.
     start : float [s]
-        Time after which everything is exposed, without `exposures`.
+        Time after which all samples are exposed, if `exposures` is not given.
     exposures : (k, 2) array [s], optional
-        Beginning and end of each, such as `SetPointProfile.exposures`.
+        Beginning and end of each exposure, such as `SetPointProfile.exposures`.
 
     Returns
     -------
@@ -145,11 +147,12 @@ def settling_time(
     Parameters
     ----------
     run : Response
-        From `simulate`.
+        Result of `simulate`.
     channel : str
         The error.
     ma, msd : float
-        Largest |MA| and MSD that are allowed, in the channel's unit.
+        Allowed |MA| and MSD (moving average and moving standard deviation, see `exposure_errors`),
+        in the unit of the channel.
     window : float [s]
         Length of the window.
     after : float [s]
@@ -269,7 +272,9 @@ def _window_moments(signal: FloatArray, count: int, whole: bool) -> tuple[FloatA
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorMap(Value):
-    """MA and MSD of the error at points of a structure; `fx.plot.error_map` draws it.
+    """Moving average (MA) and standard deviation (MSD) of the error at points of a structure.
+
+    `fx.plot.error_map` draws it.
 
     Parameters
     ----------
@@ -318,8 +323,8 @@ def error_map(
 ) -> ErrorMap:
     """Return the error at many points of a structure during one run of a closed loop.
 
-    Each point becomes a separate POI; the reference of the loop's POI applies to all of them, as
-    for a wafer that moves as a rigid body.
+    Each point becomes a separate POI (point of interest). The reference of the loop's POI applies
+    to all points, as for a wafer that moves as a rigid body.
 
     Parameters
     ----------

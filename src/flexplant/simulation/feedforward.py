@@ -44,8 +44,9 @@ _LEFT = 0.2
 class Feedforward(Value):
     """Forces of a set-point and its derivatives; a block for `close_loop`.
 
-    ``u = T sum_m gains[m] d^m r / dt^m``, T from a total force of each axis to the actuators, and
-    what slow zeros of the plant add to it. Made by `design_feedforward`.
+    The forces are ``u = T sum_m gains[m] d^m r / dt^m``. The matrix T distributes the total force
+    of each axis to the actuators. If the plant has slow zeros, the outputs of filters that invert
+    them (`zeros`) are added. Made by `design_feedforward`.
 
     Parameters
     ----------
@@ -63,8 +64,8 @@ class Feedforward(Value):
     dt : float [s]
         Sampling time of the plant.
     zeros : SlowZeros, optional
-        Filters of the highest derivative that invert zeros as slow as moves, such as those of a
-        frame on isolators. They are zero at rest.
+        Filters of the highest derivative that invert slow zeros of the plant, whose time constants
+        are as long as moves, such as those of a frame on isolators. They are zero at rest.
     """
 
     reference: str
@@ -96,7 +97,7 @@ class Feedforward(Value):
         Raises
         ------
         ModelError
-            When the gains depend on the place: then `forces` gives the signals.
+            When the gains depend on the place; use `forces` in this case.
         """
         if len(self.gains) != 1:
             raise ModelError(
@@ -130,9 +131,10 @@ class Feedforward(Value):
     def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
         """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
 
-        If the gains depend on the place, the number of times must equal that of the places. A
-        set-point of an order below that of the highest gain is refused. Filters of slow zeros have
-        a past: the times are then the samples of the plant, from rest on.
+        If the gains depend on the place, the number of times must equal that of the places. The
+        order of the set-point must be at least that of the highest gain. The output of filters of
+        slow zeros depends on earlier times. With such filters, the times must be the samples of the
+        plant and begin at rest.
         """
         _check_order(move, self._highest)
         t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))
@@ -155,36 +157,39 @@ def design_feedforward(
     elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
     slow_zeros: bool = True,
 ) -> Feedforward:
-    """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
+    """Return the feedforward of a plant or a loop: its inverse at low frequency, as a power series.
 
-    With P the response of the axes to forces T along them (including the hold, all delays and
-    filters of sensors and actuators), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: for a free machine
-    k_2 is the mass, k_3 the mass times the delay, and k_4 contains half the square of the delay and
-    the negative compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
-    are stiffness and damping. The coefficients are Cauchy integrals on the largest circle around
-    zero on which two radii agree and inside which the expansion equals the inverse; a zero of P (a
-    mass on a spring near the POI) lies outside.
+    P is the response of the axes to forces along them, which T distributes to the actuators. It
+    includes the hold and all delays and filters of sensors and actuators. For a plant, the gains
+    are the coefficients of ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the
+    mass, k_3 the mass times the delay, and k_4 contains half the square of the delay and the
+    negative compliance of the flexible modes between actuators and POI (point of interest). For a
+    machine on springs k_0 and k_1 are stiffness and damping. The coefficients are Cauchy integrals
+    on the largest circle around zero on which two radii agree and inside which the expansion equals
+    the inverse; a zero of P (a mass on a spring near the POI) lies outside.
 
     The frame of a machine on isolators gives P zeros within the band, beyond which an expansion at
-    rest is wrong. Of a sampled plant stable zeros below a hundredth of the rate are inverted
-    exactly, by filters of the highest derivative that are zero at rest (`zeros`); a warning names
-    unstable ones. Filters depend on the past, so that gains along places have none.
+    rest is wrong. If the plant is sampled, its stable zeros below a hundredth of the rate are
+    inverted exactly. Filters of the highest derivative do this (`zeros`), and their output is zero
+    at rest. A warning names unstable slow zeros. The output of filters depends on the past, so that
+    they are not combined with gains that vary along places (`along`).
 
     All axes that the actuators move independently (`flexplant.plant.driven_axes`) are treated
     together, including the forces that keep the axes without a reference at rest.
 
-    In a loop the gains minimise, by least squares, its error ``G_u F + G_r - 1``, with G_u and G_r
-    the responses of the POI to forces and reference in closed loop: where sensors and POI move
-    differently, the feedback would oppose the inverse of P. Poles of the controller and zeros of P
-    may be as slow as the moves. The errors are weighted with the spectrum of the move, or of a move
-    of about three times one over the loop's bandwidth. Without a move, a plant that needs no force
-    at rest gets none. Gains of a lower order are the best of that order.
+    In a loop the gains minimise its error ``G_u F + G_r - 1`` by least squares. F is the
+    feedforward, and G_u and G_r are the responses of the POI to forces and to the reference in
+    closed loop. The inverse of P is not used here, because the feedback opposes it if sensors and
+    POI move differently. Poles of the controller and zeros of P may be as slow as the moves. The
+    errors are weighted with the spectrum of the move. If no move is given, it is that of a move
+    with a duration of about ``3 / bandwidth`` of the loop, and the feedforward has no force at rest
+    if the plant needs none. Gains of a lower order are the best of that order.
 
     Parameters
     ----------
     given : StandardPlant or ClosedLoop
-        Plant that was assembled from a structure; sampled for a sampled loop. Or a loop on a model,
-        without feedforward.
+        Plant that was assembled from a structure, sampled if the loop is sampled; or a loop around
+        a model, without feedforward.
     reference : str, optional
         Channel of the reference; by default the only one of the plant.
     order : int
@@ -192,15 +197,15 @@ def design_feedforward(
     move : SetPointProfile, optional
         Move for which the errors of a loop are minimised; its order limits the gains.
     along : (p, 3) array [m], optional
-        Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
+        Places of a POI that moves (`simulate(moving=)`). Gains are computed for each place.
     elements : mapping {name: element, or a list of some}, optional
-        Elements of actuators and sensors, as for `simulate`: a warning names a `Saturation` that
-        the move exceeds, with the required value. The gains do not depend on it.
+        Elements of actuators and sensors, as for `simulate`. If the move exceeds a `Saturation`, a
+        warning gives its name and the required value. The gains do not depend on the elements.
     slow_zeros : bool
-        Whether stable slow zeros are inverted by filters. These tolerate machines whose isolators
-        differ from the model by 3 % in frequency or by a factor of 2 in damping: in 93 % of 448
-        trials the peak error is smaller than with gains alone, in the others it is below 0.3 % of
-        the error without feedforward.
+        Whether stable slow zeros are inverted by filters. They also work on machines whose
+        isolators differ from the model by 3 % in frequency or by a factor of 2 in damping. In 93 %
+        of 448 trials the peak error was smaller than with gains alone. In the other trials it was
+        below 0.3 % of the error without feedforward.
 
     Returns
     -------
@@ -282,7 +287,7 @@ def known_forces(plant: StandardPlant) -> StateSpace:
     Raises
     ------
     ModelError
-        When another value is given.
+        When `plant` is not a plant.
 
     Examples
     --------

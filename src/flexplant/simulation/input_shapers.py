@@ -99,7 +99,7 @@ class InputShaper(Value):
         )
 
     def then(self, other: InputShaper) -> InputShaper:
-        """Return both shapers, one after the other."""
+        """Return the shaper that applies this shaper and then `other` to a command."""
         times = (self.times[:, None] + other.times).ravel()
         order = np.argsort(times, kind="stable")
         sizes = (self.amplitudes[:, None] * other.amplitudes).ravel()
@@ -132,10 +132,12 @@ def input_shaper(
 ) -> InputShaper:
     """Return the shaper that leaves one or several modes at rest after a move.
 
-    ZV has two impulses half a period apart; ZVD has three, with zero slope of the residual at the
-    mode; EI has three, with the residual `left` at the mode and zero on both sides. With `change`,
-    ZV shapers at frequencies over the band are combined until less than `left` remains everywhere
-    in it. Several modes get one shaper each, in series.
+    The residual is the remaining vibration relative to that without a shaper. ZV (zero vibration)
+    has two impulses half a period apart. ZVD (zero vibration and derivative) has three, and the
+    slope of its residual over frequency is zero at the mode. EI (extra-insensitive) has three; its
+    residual is `left` at the mode and zero at a frequency on each side of it. With `change`, ZV
+    shapers at frequencies over the band are combined until less than `left` remains everywhere in
+    it. Several modes get one shaper each, in series.
 
     Parameters
     ----------
@@ -228,10 +230,11 @@ def quiet_setpoint(
 ) -> SetPointProfile:
     """Return a set-point of third order whose ramps last whole periods of one or two modes.
 
-    The motion is ``distance`` times three rectangles of lengths T_1 >= T_2 >= T_3 convolved, whose
-    transforms are zero where ``f T_i`` is a whole number: T_3 is a period of the first mode, and
-    T_2 one of the second. Bounds on velocity and acceleration hold; the jerk follows from the first
-    period.
+    The velocity is ``distance`` times the convolution of three rectangular pulses of unit area.
+    Their lengths are T_1 >= T_2 >= T_3. The Fourier transform of a pulse is zero at each frequency
+    f for which ``f T_i`` is a whole number, so that a mode of this frequency remains at rest after
+    the move. T_3 is one period of the first mode, and T_2 is a whole number of periods of the
+    second mode. The bounds on velocity and acceleration hold; the jerk follows from T_3.
 
     Parameters
     ----------

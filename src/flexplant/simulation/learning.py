@@ -59,11 +59,12 @@ def learn_feedforward(
     """Return feedforward gains tuned on repeated moves, by least squares on basis functions.
 
     The basis functions are the set-point's derivatives, one for each axis of the forces. In a
-    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``; Phi, the effect
-    of a unit of each gain on the error in closed loop, comes from a model and may be approximate:
-    each move measures the remaining error, and the least-squares gains for it are added. The
-    residual e_0 is not modelled, so that every repeating error (a wrong mass, a compliance, a
-    delay) is compensated as far as the basis functions allow.
+    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``. Phi is the
+    effect of a unit of each gain on the error in closed loop. It is computed from a model and may
+    be approximate, because each move measures the remaining error, and the least-squares gains for
+    this error are added. The error e_0 without these gains is not modelled. Every repeating error
+    (due to a wrong mass, a compliance or a delay) is therefore compensated as far as the basis
+    functions allow.
 
     Parameters
     ----------
@@ -74,6 +75,7 @@ def learn_feedforward(
     loop : ClosedLoop
         The same controller (without feedforward) on a model of the machine, for Phi.
     move : SetPointProfile
+        Move that each trial repeats.
     duration : float [s]
         Duration of each run.
     terms : sequence of str

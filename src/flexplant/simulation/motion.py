@@ -55,7 +55,8 @@ class SetPointProfile(Value):
     from_end : (m,) bool array
         Whether a phase's state is given at its end, not at its beginning.
     states : (m, 5) array
-        Position, velocity, acceleration, jerk and snap of each phase there.
+        Position, velocity, acceleration, jerk and snap of each phase, at its beginning or at its
+        end (see `from_end`).
     start, stop : float [m or rad]
         Position at rest before and after.
     order : int
@@ -107,10 +108,10 @@ class SetPointProfile(Value):
         return Motion(np.asarray(far), *found[1:].max(axis=1))
 
     def at(self, t: npt.ArrayLike) -> Motion:
-        """Return position, velocity, acceleration, jerk and snap at any times t [s], all in phase.
+        """Return position, velocity, acceleration, jerk and snap, all at the same times t [s].
 
-        Before and after the motion the set-point rests. Where a derivative jumps it is the one
-        after the jump, which holds until the next sample.
+        Before and after the motion the set-point rests. At a time when a derivative jumps, its
+        value after the jump is returned, which holds until the next sample.
         """
         x = real_array(t, "t") / self.tick
         if self.gridded:
@@ -338,15 +339,16 @@ def setpoint(
 ) -> SetPointProfile:
     """Return the fastest motion from rest to rest within the bounds, in closed form.
 
-    Second order (acceleration jumps), third with `jerk` (jerk jumps) or fourth with `snap`. For a
-    short distance some bounds are not reached. The second and third order are time-optimal; so is
-    the fourth where the velocity bound is reached. Where it is not, acceleration and jerk still
-    return to zero between speeding up and slowing down, which takes at most 7.5 % longer than the
-    optimum.
+    The motion is of second order (its acceleration jumps), of third order if `jerk` is given (its
+    jerk jumps), or of fourth order if `snap` is given too (its snap jumps). For a short distance
+    some bounds are not reached. Motions of second and third order are time-optimal. A motion of
+    fourth order is time-optimal if it reaches the velocity bound. If it does not, acceleration and
+    jerk still return to zero between speeding up and slowing down, and the motion is at most 7.5 %
+    longer than the optimum.
 
-    With `rate` all switching times are samples of a grid: the motion is a few samples longer and
-    its levels a little lower, so that all bounds are kept and the end is exact. The samples of all
-    derivatives are then consistent without interpolation.
+    With `rate` all switching times are samples of a grid. The motion is a few samples longer and
+    its largest derivatives are slightly smaller, so that all bounds are kept and the final position
+    is exact. The samples of all derivatives are then consistent without interpolation.
 
     Parameters
     ----------

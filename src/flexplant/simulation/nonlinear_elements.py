@@ -78,7 +78,7 @@ class Quantiser(Value):
     Parameters
     ----------
     step : float [unit of the channel]
-        The least significant bit.
+        Distance between two levels of the output (the least significant bit).
 
     Examples
     --------
@@ -96,7 +96,7 @@ Act: TypeAlias = Callable[[FloatArray], FloatArray]
 
 @runtime_checkable
 class Element(Protocol):
-    """Protocol of your own nonlinear element: any object with `begin`.
+    """Interface (a Python protocol) of your own nonlinear element: any object with `begin`.
 
     >>> class DeadZone:
     ...     def begin(self, dt, generators):
@@ -108,16 +108,17 @@ class Element(Protocol):
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
         """Return the function that acts on the values (runs,) of the channel, sample by sample.
 
-        On a disturbance they are values of the channel of y that the element names as `reads`, and
-        the result is the force, as of a stop or a stiffening spring.
+        If the element acts on a disturbance, the function receives values of the channel of y that
+        the attribute `reads` of the element names. It then returns the force, such as that of a
+        mechanical stop or a stiffening spring.
 
         Parameters
         ----------
         dt : float [s]
             Sampling time of the controller.
         generators : sequence of Generator
-            Random generators, one for each run, so that a run does not depend on the others. The
-            memory of the element starts again here.
+            Random generators, one for each run, so that a run does not depend on the others. Each
+            call resets the memory of the element.
         """
         ...
 
@@ -126,8 +127,8 @@ class Element(Protocol):
 class Hysteresis(Value):
     """Play of a signal, a gear or a magnet: the output follows after a change of `width`.
 
-    ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))``, from 0. Sums of these are the
-    Prandtl-Ishlinskii model.
+    The output is ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))`` of the input u and starts
+    at 0. A sum of such elements is the Prandtl-Ishlinskii model of hysteresis.
 
     Parameters
     ----------
@@ -192,16 +193,17 @@ class Dropout(Value):
 
 @dataclass(frozen=True, eq=False)
 class Friction(Value):
-    """Dry friction with presliding, on a disturbance at its place: an elastoplastic spring.
+    """Dry friction with presliding, as the force of an elastoplastic spring on a disturbance.
 
-    ``-s``, ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])`` within ``-level`` and ``level``, in every
-    finer sample: it is constant over a sample, so that stiffness dt^2 must be small compared with
-    the mass.
+    The force is ``-s`` with ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])``, limited to the range
+    from ``-level`` to ``level``. It is computed in every sample of the simulation (see `finer` of
+    `simulate`) and is constant over this sample. ``stiffness dt^2`` must therefore be small
+    compared with the mass.
 
     Parameters
     ----------
     level : float [N]
-        Force at which it slides.
+        Force at which the contact slides.
     stiffness : float [N/m]
         Stiffness before sliding.
     reads : str
@@ -237,8 +239,8 @@ class Friction(Value):
 class Jitter(Value):
     """Jitter: a sensor is read early, or a command is applied late, by up to `spread`.
 
-    It is uniform in steps of the finer samples, independent for each sample and channel. It needs
-    `finer`.
+    The shift of time has a uniform distribution in steps of the finer samples, and it is
+    independent for each sample and channel. It needs the argument `finer` of `simulate`.
 
     Parameters
     ----------

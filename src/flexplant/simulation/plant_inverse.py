@@ -29,13 +29,16 @@ def inverse_forces(
 ) -> dict[str, FloatArray]:
     """Return the forces that make the POI follow a set-point, by the plant's regularised inverse.
 
-    The forces minimise ``|r - P u|^2 + rho |u|^2``, including forces before a change of the
-    set-point: at each frequency ``U = P* (P P* + rho)^-1 R``. A plant with zeros outside the
-    stability region (sampled or with sensors away from actuators) has no stable causal inverse;
-    this one is stable, and acts ahead of the set-point (preview). In units of acceleration rho is
-    ``(2 pi bandwidth)^-4``: far below the bandwidth the plant is inverted, far above it the force
-    is zero. All axes of the POI are included; those without a reference stay at rest. The reaction
-    of the feedback on the model, because its sensors do not move like the POI, is subtracted.
+    P is the response of the POI (point of interest) to the forces u, and r the set-point. The
+    forces minimise ``|r - P u|^2 + rho |u|^2``. At each frequency the solution is
+    ``U = P* (P P* + rho)^-1 R`` with the spectra U of u and R of r. It includes forces before a
+    change of the set-point. A plant with zeros outside the stability region (sampled or with
+    sensors away from actuators) has no stable causal inverse; this one is stable, and acts ahead of
+    the set-point (preview). With u in units of acceleration, the weight rho is
+    ``(2 pi bandwidth)^-4``. Far below the bandwidth the plant is therefore inverted, and far above
+    it the force is zero. All axes of the POI are included; those without a reference stay at rest.
+    If the sensors do not move like the POI, the feedback reacts to the move. This reaction is
+    computed on the model and subtracted.
 
     Parameters
     ----------
@@ -69,7 +72,8 @@ def inverse_forces(
     Warns
     -----
     FlexplantWarning
-        When forces of more than 0.1 % of the largest fall before the run, or after it.
+        When forces of more than 0.1 % of the largest force would act before the beginning or after
+        the end of the run.
 
     References
     ----------

@@ -21,7 +21,7 @@ from .sampled_runs import known_inputs, named_references, simulate
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResidualVibration(Value):
-    """What is left of a signal after the end of a move; made by `residual_vibration`.
+    """Remaining vibration of a signal after the end of a move; made by `residual_vibration`.
 
     Parameters
     ----------
@@ -30,15 +30,15 @@ class ResidualVibration(Value):
     freq, damping : (k,) arrays [Hz, 1]
         Modes of the closed loop, the largest amplitude first.
     amplitude : (k,) array
-        Amplitude of each at the end of the move, in the unit of the channel.
+        Amplitude of each mode at the end of the move, in the unit of the channel.
     predicted : float
-        Largest magnitude after the end by the sum of the modes.
+        Largest magnitude after the end of the move, computed as the sum of the modes.
     simulated : float
         The same from a simulation.
     decaying : float
-        Largest magnitude after the end of the part that does not vibrate.
+        Largest magnitude, after the end of the move, of the non-oscillating component.
     rest : float
-        Final value of the channel, from which all are counted.
+        Final value of the channel. All magnitudes are deviations from it.
     unit : str
         Unit of the channel.
     judged : bool
@@ -78,25 +78,27 @@ def residual_vibration(
     channel: str | None = None,
     wait: float | None = None,
 ) -> ResidualVibration:
-    """Return how much a set-point leaves vibrating, on the evaluation model where there is one.
+    """Return the remaining vibration after a set-point, on the evaluation model if there is one.
 
-    Predicted: after the end of the move the reference is constant, and every mode of the closed
-    loop decays from what the samples of the move have left in it. Simulated: the largest magnitude
-    of a run without noise. Both are independent calculations of one number.
+    The remaining vibration is computed by two independent methods. For ``predicted``, the state at
+    the end of the move is split into the modes of the closed loop. The reference is constant from
+    then on, and each mode decays freely. For ``simulated``, it is the largest magnitude in a run
+    without noise.
 
     Parameters
     ----------
     loop : ClosedLoop
-        Around a sampled plant, stable.
+        Stable closed loop around a sampled plant.
     move : SetPointProfile
-        From `setpoint`, `quiet_setpoint` or ``shaper.shaped(move)``.
+        Move, made by `setpoint`, `quiet_setpoint` or ``shaper.shaped(move)``.
     reference : str, optional
         Reference that follows the move; needed where there are several.
     channel : str, optional
         Channel of z; by default the error of the reference.
     wait : float [s], optional
-        Time after the end that is judged; ten periods of the slowest mode that vibrates, at most
-        the duration of the move and at least a hundred samples, when not given.
+        Length of the time after the end of the move that is evaluated. By default it is ten periods
+        of the slowest oscillating mode, but at most the duration of the move and at least a hundred
+        samples.
 
     Returns
     -------

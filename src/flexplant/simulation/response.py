@@ -25,8 +25,9 @@ Numbers: TypeAlias = "float | FloatArray"
 class Response(Value, Mapping[str, FloatArray]):
     """Sampled signals of one run or of several, by name.
 
-    `response["die:error"]` is an array over time, (n_time,) for one run; when the number of runs
-    was given, (n_runs, n_time), also for one. A Mapping: `dict(response)` feeds a data frame.
+    `response["die:error"]` is an array over time. Its shape is (n_time,), or (n_runs, n_time) if
+    the number of runs was given, even if that number is 1. A Response is a mapping, so that
+    ``pandas.DataFrame(dict(response))`` makes a table of one run.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class Response(Value, Mapping[str, FloatArray]):
     units : mapping {channel: unit}, optional
         SI units of the channels that have a known one.
     seed : int or tuple of int, optional
-        Seed of the noise; as `rng` it gives the same run again.
+        Seed of the noise. The same run is repeated if it is given to `simulate` as `rng`.
 
     Raises
     ------
@@ -116,8 +117,9 @@ class Response(Value, Mapping[str, FloatArray]):
     def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the root mean square of a channel about zero, a number or one for each run.
 
-        Samples before `start` [s] are left out (transients). An unknown channel raises LabelError,
-        a start after the end ModelError; the same holds for the other methods.
+        Samples before `start` [s] are left out (transients). In this and the other methods, an
+        unknown channel raises LabelError, and a start after the end of the record raises
+        ModelError.
         """
         signal = self._from(channel, start)
         unit = signal_unit(signal)
@@ -128,8 +130,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float, float]:
         """Return the root mean square over all runs, and the ends of its confidence interval.
 
-        The mean squares of two or more independent runs count as normal: Student's interval of
-        their mean, with a lower end of at least zero.
+        The mean squares of two or more independent runs are assumed to be normally distributed. The
+        interval of their mean is that of Student's distribution, with a lower end of at least zero.
         """
         if self.data.ndim != 3 or self.data.shape[0] < 2:
             raise ModelError(
@@ -155,8 +157,9 @@ class Response(Value, Mapping[str, FloatArray]):
     def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a channel, over all runs.
 
-        Welch's method: Hann windows of the length `segment` [s] (an eighth of the record when not
-        given) that overlap by half, no mean removed, so that the integral is the mean square.
+        It is estimated by Welch's method. Hann windows of the length `segment` [s] (an eighth of
+        the record by default) overlap by half. The mean is not removed, so that the integral is the
+        mean square.
         """
         from scipy.signal import welch
 
@@ -179,7 +182,7 @@ class Response(Value, Mapping[str, FloatArray]):
 
         In lithography the window is the exposure time of a point: the MA of the error is overlay.
         It is rounded to whole samples; an even number reaches one sample further back than ahead.
-        At both ends of the record the window is cut off by it.
+        At both ends of the record the window is shortened to the samples that exist.
         """
         return self._moments(channel, window)[0]
 
@@ -196,8 +199,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float]:
         """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
 
-        Windows [s] centred before `start` [s] are left out: the move and its settling; those at
-        the record's end are cut off by it (`moving_average`).
+        Windows [s] centred before `start` [s] are left out: they cover the move and its settling.
+        At the end of the record, windows are shortened.
         """
         late = self._late(start)
         average, deviation = self._moments(channel, window)

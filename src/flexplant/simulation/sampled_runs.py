@@ -50,10 +50,10 @@ def simulate(
 ) -> Response:
     """Return the time response of a sampled closed loop.
 
-    In each sample the sensors are read, the blocks update, and the commands are applied and held
-    until the next sample (after the plant's delay). White disturbances act on the plant with the
-    exact covariance `plant.process_noise` per sample, that of `design_kalman`; sensors have the
-    variance asd^2 rate / 2.
+    In each sample the sensors are read and the blocks compute the commands. These are applied after
+    the plant's delay and held for one sample. White disturbances act on the plant with the exact
+    covariance `plant.process_noise` per sample, that of `design_kalman`; sensors have the variance
+    asd^2 rate / 2.
 
     Parameters
     ----------
@@ -71,24 +71,28 @@ def simulate(
         Signals of other channels of w, constant over each sample, in addition to their noise.
     elements : mapping {name: element, or a list of some}, optional
         Elements that act on channels of y before they are read, and on driven actuators: u is then
-        the applied value, which blocks with an input named like the actuator (observers) receive. A
-        `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
-        `Dropout`, or your own `Element`. `Jitter` moves the instants, unknown to blocks. On a
-        disturbance, `Friction` (or an `Element` with `reads`) is a force that reacts to a motion. A
-        warning before the run names a `Saturation` that the SetPoints exceed (force of an actuator,
-        range of a sensor or of the reference), with the required value.
+        the value that is applied. Blocks with an input that has the name of the actuator, such as
+        observers, receive this value. A `Quantiser` acts first, then a `Saturation`, then others in
+        their order: `Hysteresis`, `Dropout`, or your own `Element`. `Jitter` shifts the instants of
+        reading or applying, and the blocks do not know the shift. On a disturbance, `Friction` (or
+        an `Element` with `reads`) is a force that reacts to a motion. A warning before the run
+        names a `Saturation` that the SetPoints exceed (force of an actuator, range of a sensor or
+        of the reference), with the required value.
     anti_windup : float [s], optional
-        Time constant with which integrators (all slower poles) of blocks that drive actuators
-        follow the applied value while it differs from the command.
+        Time constant of an anti-windup. While the applied value differs from the command, the
+        integrators of blocks that drive actuators follow the applied value with this time constant.
+        All poles that are slower than it count as integrators.
     moving : mapping {POI or position: path}, optional
-        Places (n_time, 3) [m] of POIs over time, or functions of the times: the channels of such a
-        POI in z are those of its place at each sample. Or values of the plant's positions [m or
-        rad] over time, as a SetPoint (which may be a reference too), a function, or an array
-        (n_time,): all ports that move with it do, forces within each sample too.
+        For a POI: its places (n_time, 3) [m] over time, or a function of the times that returns
+        them. Its channels in z are then those of its place at each sample. For a position of the
+        plant: its values [m or rad] over time, as a SetPoint (which may also be a reference), a
+        function, or an array (n_time,). All ports that belong to this position then move, and
+        forces move within each sample too.
     finer : int
-        Samples of the plant in each sample of the controller, whose commands are held; it shows z
-        between samples. Sensors are read (noise, elements) in the controller's samples; between
-        them y is the motion only. Signals then have the finer samples.
+        Number of simulated samples of the plant in each sample of the controller, whose commands
+        are held. The response then also contains z between the samples of the controller. Noise and
+        elements act on the sensors at the samples of the controller; between them y is the motion
+        without noise. Given signals must then have values at the finer samples.
     noise : bool
         Whether the white noises of the plant act.
     rng : int, SeedSequence, Generator or None
@@ -440,11 +444,12 @@ def spectral_noise(
 ) -> FloatArray:
     """Return Gaussian noise of a given spectrum, for `simulate(disturbance=)`.
 
-    A floor's measured vibration, 1/f noise of a sensor, slow drift: lines of random amplitude and
-    phase, ``E |X_k|^2 = asd(f_k)^2 rate n / 2``, four times as dense as the record can resolve.
-    Components slower than a quarter of a period in the record, including the mean, are left out:
-    pass your own array for such a drift. Noise that the synthesis shall know belongs into a port
-    (`fx.plant.FirstOrder`, `NarrowBand`, `RandomWalk`, a shape).
+    It can be the measured vibration of a floor, 1/f noise of a sensor or a slow drift. The noise is
+    a sum of sines (lines) of random amplitude and phase, ``E |X_k|^2 = asd(f_k)^2 rate n / 2``,
+    four times as dense as the record can resolve. Components slower than a quarter of a period in
+    the record, including the mean, are left out. Pass your own array for such a drift. Noise that
+    the controller design takes into account is specified in a port (`fx.plant.FirstOrder`,
+    `NarrowBand`, `RandomWalk`, a shape).
 
     Parameters
     ----------
@@ -458,6 +463,7 @@ def spectral_noise(
     runs : int, optional
         Number of records. None: one record without that axis.
     rng : int, SeedSequence, Generator or None
+        Seed of the noise.
 
     Returns
     -------

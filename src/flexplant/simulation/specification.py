@@ -51,7 +51,7 @@ class Verdict(Value):
     names, units : sequence of str
         Names and units of the requirements.
     values, limits : (n,) arrays
-        Achieved and allowed values; NaN where nothing is measured.
+        Achieved and allowed values. An achieved value is NaN if it is not available.
     at_least : (n,) bool array
         Whether the limit is a lower one.
     low, high : (n,) arrays, optional
@@ -170,12 +170,13 @@ class Specification(Value):
     Parameters
     ----------
     ma, msd : float, optional [m or rad]
-        Largest |MA| and MSD of the error over the exposures.
+        Largest moving average |MA| and moving standard deviation MSD of the error over the
+        exposures (see `exposure_errors`).
     rms, peak : float, optional [m or rad]
         Rms and largest magnitude of the error in the run, from `start` on.
     settling : float, optional [s]
-        Time after `start` until |MA| (and MSD) stay within `ma` (and `msd`); with it, the
-        exposures begin that much later.
+        Largest time after `start` until |MA| (and MSD) stay within `ma` (and `msd`). If it is
+        given, the exposures begin at ``start + settling``.
     effort : float or mapping {actuator: float}, optional [N, N m]
         Largest magnitude of a command, at any time of the run.
     noise : float, optional [m or rad]
@@ -239,9 +240,10 @@ class Specification(Value):
         loop : ClosedLoop
             The loop.
         run : Response or callable, optional
-            Limits on errors and efforts need a run, of which all runs count, or a function of a
-            loop that returns one: ``lambda one: simulate(one, reference=move, duration=0.1)``. Only
-            a function can be repeated on other machines, so that its values have intervals.
+            Limits on errors and efforts need a Response, all runs of which are checked. A function
+            of a loop that returns a Response is accepted too:
+            ``lambda one: simulate(one, reference=move, duration=0.1)``. Only a function can be
+            repeated on other machines and therefore gives intervals.
         exposures : (k, 2) array [s], optional
             As for `exposure_errors`; by default all after `start` (and `settling`).
         """

@@ -63,10 +63,11 @@ def study(
         mapping {column: number, truth or text}. For a process pool it must be picklable: a function
         of a module, or a `functools.partial` of one. `examples/fleet.py` has the usual chain.
     executor : concurrent.futures.Executor, optional
-        A process pool, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; None is a
-        plain loop. When a process of a pool dies, its machines are tried again one by one, and a
-        machine whose process dies again fails; the rest continues in a new pool with the same
-        settings (context, initializer).
+        A process pool, `dask.distributed`'s `Client.get_executor()`, or an executor of
+        `mpi4py.futures`. With None the machines are computed one after another in this process.
+        When a process of a pool dies, its machines are tried again one by one, and a machine whose
+        process dies again fails; the rest continues in a new pool with the same settings (context,
+        initializer).
     checkpoint : path, optional
         File that stores each finished row. With an existing file the study continues where it was
         stopped, also after being killed: machines in the file are not computed again. The file
