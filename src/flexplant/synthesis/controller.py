@@ -43,27 +43,32 @@ class Controller(Value):
     method : str
         Method of the design.
     gamma : float, optional
-        Verified upper bound on the norm of its closed loop: H-infinity, or H2 for `design_h2`.
+        Verified upper bound on the norm of the closed loop from w to z: the H-infinity norm, or for
+        `design_h2` the H2 norm. The pages of other designs, such as `design_mu`, say what their
+        gamma is.
     lower : float, optional
-        Lower bound on the norm that any controller reaches; see the method for its conditions.
+        Lower bound on this norm for all controllers: no controller reaches a smaller norm. The page
+        of the design method states the conditions.
     certificate : Certificate
         Numbers that verify the design by a second computation.
     reached : Certificate
-        For a weighted design: the norm from each group of w to each group of z; the weights require
-        at most 1, and the largest is close to gamma. For `design_lmi`: the norm of each objective,
-        in its unit, with its bound.
+        For a weighted design, the norm from each group of channels of w to each group of channels
+        of z. The weights require that each norm is at most 1. The largest one is close to gamma.
+        For `design_lmi`, the norm of each objective in its unit, with its bound.
     left_out : SpillOver, optional
-        Stability and margins on the plant with the truncated modes, where these are known.
+        Stability and margins of the loop on the plant with the truncated modes, if these are known.
+        Truncated modes are modes that the design model leaves out.
     tolerances : ModeTolerances, optional
-        For an uncertain plant: the error of each mode at which the loop becomes unstable, compared
-        with its uncertainty; and machines drawn at random.
+        For an uncertain plant, the error of each modal frequency at which the loop becomes
+        unstable, compared with the uncertainty of this frequency. It also has the results on
+        machines that are drawn at random from the uncertainty.
     notes : sequence of str
         Remarks, such as what the certificate does not cover.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
         For `design_structured`: the given structure, with the parameters found.
     tried : Certificate
-        Attempts of the design in the order in which they were made, each with its gamma; infinite
-        for an attempt that failed.
+        Attempts of the design in the order in which they were made, each with its gamma. The gamma
+        of an attempt that failed is infinite.
 
     Examples
     --------

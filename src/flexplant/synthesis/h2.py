@@ -28,15 +28,17 @@ def design_h2(
 ) -> Controller:
     """Return the controller ``u = K y`` with the least H2 norm from w to z (rms of z for white w).
 
-    X and Y are the solutions of the Riccati equations of control and estimation, F and L their
-    gains, and ``R = D12' D12`` (sampled: ``+ B2' X B2``). For a continuous plant L0 is zero. The
-    square of the least norm is::
+    The plant is ``dx/dt = A x + B1 w + B2 u``, ``z = C1 x + D11 w + D12 u``, ``y = C2 x + D21 w +
+    D22 u``. X is the solution of the Riccati equation of control, and F its gain. Y is the solution
+    of the Riccati equation of estimation. The matrix R is ``D12' D12``, for a sampled plant ``D12'
+    D12 + B2' X B2``. The square of the least norm is::
 
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
-    A sampled plant is solved by its discrete equations; its K uses y of the same sample. The norm
-    is computed a second time by Gramians of the loop; both results must agree.
+    L0 and S are needed only for a sampled plant; L0 is zero for a continuous one. A sampled plant
+    is solved by the discrete-time equations, and u at a sample depends on y of the same sample. The
+    norm is computed a second time from the Gramians of the closed loop. Both results must agree.
 
     Parameters
     ----------
@@ -49,8 +51,9 @@ def design_h2(
     -------
     Controller
         Controller whose `gamma` is the H2 norm of the closed loop. `lower` is the least norm by the
-        formula (None where noise or effort had to be added), `certificate` holds the checks,
-        `left_out` the check with the truncated modes.
+        formula above; it is None if noise or effort had to be added (see Notes). `certificate`
+        holds the checks. `left_out` holds the check with the truncated modes, which the design
+        model leaves out.
 
     Raises
     ------
@@ -67,16 +70,18 @@ def design_h2(
 
     Notes
     -----
-    LQG is the special case of these channels: with costs ``x' Q x + u' R u`` and white noises of
-    intensity (sampled: covariance) W of the process and V of the sensors,
-    ``z = [Q^(1/2) x; R^(1/2) u]``, ``w = [process; sensor]``, ``B1 = [W^(1/2), 0]`` and
-    ``D21 = [0, V^(1/2)]``. On an assembled plant `weighted` gives both: ``w`` by the rms of each
-    noise (asd / sqrt(2) continuous, asd / sqrt(2 dt) sampled), ``z`` by one over the rms that is
-    allowed of each motion and effort.
+    LQG is a special case of this design. Its cost is ``x' Q x + u' R u``. Its white noises have the
+    intensity W (process) and V (sensors); for a sampled plant W and V are covariances. The channels
+    of LQG are ``z = [Q^(1/2) x; R^(1/2) u]`` and ``w = [process; sensor]``, with ``B1 = [W^(1/2),
+    0]`` and ``D21 = [0, V^(1/2)]``. On an assembled plant, the method `weighted` makes both. The
+    weight of each channel of w is the size of its noise: asd / sqrt(2) for a continuous plant and
+    asd / sqrt(2 dt) for a sampled one, where asd is the amplitude spectral density. The weight of
+    each channel of z is one over the allowed rms of the motion or effort.
 
-    If D12 or D21 does not have full rank, a little noise on each sensor and effort of each actuator
-    is added, as for `design_hinf`, and lowered until the norm hardly changes. If w or z misses an
-    undamped mode, a little of w is added at u, and a little of y to z.
+    If D12 or D21 does not have full rank, a little noise of each sensor is added to w, and a little
+    effort of each actuator to z, as for `design_hinf`. Both are lowered until the norm hardly
+    changes. If w does not excite an undamped mode, a small disturbance at u is added to w. If z
+    does not observe one, a small multiple of y is added to z.
 
     References
     ----------

@@ -20,8 +20,9 @@ def lqr(
 ) -> RiccatiSolution:
     """Return the linear-quadratic regulator (LQR), continuous or sampled.
 
-    ``u = -F x`` with F the `gain` of the answer minimises ``int x' Q x + 2 x' N u + u' R u dt``, or
-    the sum over samples where the system is sampled (``dlqr``).
+    The feedback ``u = -F x`` minimises the cost ``int x' Q x + 2 x' N u + u' R u dt``. For a
+    sampled system the cost is the sum over the samples (as in ``dlqr``). F is the `gain` of the
+    result.
 
     Parameters
     ----------
@@ -216,7 +217,8 @@ def lqg(
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     Q, R : (n, n), (m, m) arrays
-        As in `lqr`; (n + p, n + p) as in `lqi` where outputs are integrated.
+        Weights as in `lqr`. If outputs are integrated, Q is (n + p, n + p) as in `lqi`, where p is
+        the number of integrated outputs.
     W, V : (n, n), (p, p) arrays
         As in `lqe`.
     integrate : iterable of str, optional
@@ -266,7 +268,8 @@ def lqg(
 def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     """Return the state feedback F (m, n) that places the poles of A - B F.
 
-    With several inputs the eigenvectors are made as independent as possible.
+    With several inputs, F is not unique. The remaining freedom is used to make the eigenvectors of
+    A - B F as independent as possible, so that the poles are not sensitive to errors.
 
     Parameters
     ----------

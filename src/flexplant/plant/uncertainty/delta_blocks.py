@@ -22,12 +22,12 @@ _PHASES = (0.1, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class RepeatedScalar(Value):
-    """An uncertainty ``w = delta z`` with one number delta for `size` channels.
+    """An uncertain block ``w = delta z`` whose number delta is the same in all its channels.
 
     Parameters
     ----------
     size : int
-        Number of channels on which it acts.
+        Number of channels z that are multiplied by delta.
     real : bool
         Whether delta is a real number (a parameter) or a complex one.
     name : str
@@ -57,12 +57,12 @@ class RepeatedScalar(Value):
 
 @dataclass(frozen=True, eq=False)
 class FullBlock(Value):
-    """An uncertainty ``w = Delta z``, Delta any complex matrix (w, z): dynamics.
+    """An uncertain block ``w = Delta z`` with any complex matrix Delta: unknown dynamics.
 
     Parameters
     ----------
     w, z : int
-        Number of outputs w of Delta, which drive the plant, and number of its inputs z.
+        Number of outputs w of Delta, which drive the plant, and number of inputs z of Delta.
     name : str
         Name of the uncertainty in results and messages.
 

@@ -281,8 +281,10 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
 
         K_ij(z) = prod_k (b0 + b1 z^-1 + b2 z^-2) / (1 + a1 z^-1 + a2 z^-2)
 
-    Poles and zeros are those of the channel's minimal states; the product is compared with the
-    channel over all frequencies.
+    A section is a filter of second order, and the sections of a channel are connected in series.
+    States that do not act in a channel are removed before its poles and zeros are computed. The
+    response of the product is then compared with that of the channel on a frequency grid that
+    includes its resonances.
 
     Parameters
     ----------
@@ -298,8 +300,9 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     Raises
     ------
     CertificateError
-        When the sections differ from the channel by more than 1e-6 of its largest gain, as where
-        the rate is so high above a pole that rounded coefficients move it.
+        When the sections differ from the channel by more than 1e-6 of its largest gain. An example
+        is a pole that is so slow compared with the sampling rate that rounding of the coefficients
+        moves it.
     ModelError
         When the controller is continuous.
 
@@ -395,24 +398,29 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
 
         x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
 
-    If u_applied = u, this system equals the controller. When actuators saturate, its states follow
-    those of a controller whose commands are the applied ones, with the poles of A - L C.
-    ``L = B D^-1`` (Hanus) makes these the zeros of the controller. With `recovery`, poles of the
-    controller that decay more slowly, such as integrators, move to that time constant and keep
-    their frequency; the others stay. For a PI controller this is back-calculation with that time.
+    Here u is the command of the controller and u_applied is the command that the actuators really
+    apply. If both are equal, this system equals the controller. When an actuator saturates, the
+    term with L corrects the states, so that they agree with the applied command. The poles of A - L
+    C determine how fast this correction acts.
+
+    By default, ``L = B D^-1`` (the form of Hanus). The poles of A - L C are then the zeros of the
+    controller. If `recovery` is given, L moves only those poles of the controller that decay more
+    slowly than this time constant, such as integrators. They get this time constant and keep their
+    frequency. The other poles do not change. For a PI controller this is the well-known
+    back-calculation with `recovery` as its tracking time.
 
     Parameters
     ----------
     controller : StateSpace or Controller
         Controller from y to u, continuous or sampled.
     recovery : float [s], optional
-        Time constant of the slowest poles of A - L C.
+        Time constant of the slowest poles of A - L C. By default the form of Hanus is used.
 
     Returns
     -------
     StateSpace
-        System [y; u] -> u, a block of `close_loop`, which connects the applied commands to its
-        input u.
+        System whose inputs are y and the applied commands, and whose outputs are the commands u. If
+        it is given to `close_loop` as a block, the applied commands are connected to it.
 
     Raises
     ------
@@ -420,7 +428,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
         When Hanus' form needs the inverse of a D that is singular, or its poles (the zeros of the
         controller) are not stable: give a recovery time.
     ModelError
-        When slow states are not seen in the commands.
+        When slow states do not appear in the commands, so that the commands cannot correct them.
 
     References
     ----------

@@ -79,33 +79,38 @@ def reduce_controller(
 ) -> Controller:
     """Return a controller of fewer states that keeps the closed loop, or raise an error.
 
-    The method is weighted balanced truncation of ``[N; M]``, where ``K = N M^-1`` is a normalised
-    right coprime factorisation of the controller and P is the plant. The errors dN and dM of the
-    factors enter the closed loop through the weight W::
+    The controller K is written as ``K = N M^-1``, a normalised right coprime factorisation: N and M
+    are stable even if K is not. The states of ``[N; M]`` are reduced by weighted balanced
+    truncation. This changes the factors by the errors dN and dM. The loop of K with the plant P
+    stays stable if the following system, with the weight W, has an H-infinity norm below one::
 
         W [dN; dM],   W = (M - P N)^-1 [P, -I]
 
-    If that weighted error is below one, the reduced loop is stable (small gain). The loop is closed
-    again in any case. An error is raised if it is unstable or loses more margin than `loss` allows;
-    for a weighted plant gamma counts instead of the margin.
+    This condition (the small-gain theorem) is sufficient, but not necessary. The loop with the
+    reduced controller is therefore computed in any case. An error is raised if this loop is
+    unstable, or if it loses more of its modulus margin than `loss` allows. For a weighted plant,
+    gamma (the H-infinity norm from w to z) may grow by at most `loss`, and the margin is not
+    limited.
 
     Parameters
     ----------
     plant : StandardPlant
-        Plant of the design, continuous or sampled like the controller. For a weighted plant gamma
-        is kept.
+        Plant of the design, continuous or sampled like the controller. If it is weighted, gamma is
+        compared instead of the margin.
     controller : StateSpace or Controller
         Controller from y to u; its integrators and unstable poles are kept.
     order : int, optional
         Largest number of states of the result, which may have fewer. By default the smallest number
         with which the loop stays stable and the loss is allowed.
     loss : float
-        Allowed relative loss of the modulus margin, or growth of gamma.
+        Allowed relative loss of the modulus margin (one over the largest singular value of the
+        sensitivity S), or allowed relative growth of gamma.
 
     Returns
     -------
     Controller
-        The certificate holds margin, gamma and stability before and after, and the weighted error.
+        Reduced controller. The certificate holds the margin, gamma and the stability of the loop
+        before and after the reduction, and the weighted error of the factors (the norm above).
 
     Raises
     ------
@@ -317,9 +322,10 @@ def discretise_controller(
 ) -> Controller:
     """Return a continuous controller sampled at the rate of a plant, with the margin of its loop.
 
-    The method is bilinear (Tustin) and keeps the response at one frequency if `prewarp` is given.
-    The loop on the sampled and delayed plant is compared with the continuous loop of the design;
-    the loss of margin includes the effect of the delay. A design for the sampled plant loses less.
+    The method is bilinear (Tustin). If `prewarp` is given, the response at this frequency is kept.
+    The sampled controller is closed with the sampled and delayed plant, and the modulus margin of
+    this loop is compared with that of the continuous loop. The loss of margin therefore includes
+    the effect of the delay. A controller that is designed for the sampled plant loses less margin.
 
     Parameters
     ----------
@@ -330,7 +336,8 @@ def discretise_controller(
     prewarp : float [Hz], optional
         Frequency at which the response is kept, such as that of a notch or of the crossover.
     loss : float
-        Allowed relative loss of the modulus margin.
+        Allowed relative loss of the modulus margin, which is one over the largest singular value of
+        the sensitivity S.
 
     Returns
     -------

@@ -47,27 +47,31 @@ def design_hinf(
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
-    Weights define the required norms. For a stage they follow from a bandwidth:
-    ``weights = fx.stage_weights(plant, 60.0)``, then
-    ``K = fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``; if `K.gamma` is below 1, all
-    their requirements are satisfied. `mixed_sensitivity` builds a plant from weights of S, KS and
-    T. The controller is verified with its closed loop in the original channels: stability, and the
-    norm by two methods; ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
+    The H-infinity norm is the largest gain over all frequencies. Weights on w and z define how
+    large it may be in each channel. For a stage the weights follow from a bandwidth: ``weights =
+    fx.stage_weights(plant, 60.0)``, then ``K = fx.design_hinf(plant.weighted(z=weights.z,
+    w=weights.w))``; if `K.gamma` is below 1, all their requirements are satisfied.
+    `mixed_sensitivity` builds a plant from weights of S, KS and T. Two checks are made on the
+    closed loop in the original channels: it must be stable, and its norm is computed by two
+    methods. ``fx.close_loop(plant, K)`` returns the closed loop. The page `algorithms` describes
+    the method.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant or mapping {position: StandardPlant}
-        Usually weighted; continuous or sampled. For a moving machine, a mapping by position,
+        Plant, usually weighted; continuous or sampled. For a moving machine, a mapping by position,
         ``{x: plant.at(x=x) for x in places}``. One controller for all positions is then designed on
         the mean plant; additional channels of w and z represent the change with position. `gamma`
         is the largest norm of all positions. The certificate contains the norms at each position
         and half way between them. A StateSpace (also of python-control) is accepted if its channels
         are named as in a StandardPlant, or if u and y are given.
     method : Riccati or Lmi, optional
-        Method of the synthesis. By default `Riccati()`. If D12 or D21 does not have full rank, it
-        adds a small weight of u or a small sensor noise. If w does not excite or z does not observe
-        an undamped mode, it adds a small disturbance. `Lmi()` finds gamma by a semidefinite program
-        and is suitable for up to 20 states.
+        Method of the synthesis. By default `Riccati()`. It needs full rank of D12, the feedthrough
+        from u to z, and of D21, the feedthrough from w to y. If D12 does not have full rank, it
+        adds a small weight of u; if D21 does not, a small sensor noise. If w does not excite an
+        undamped mode, it adds a small disturbance at the actuators; if z does not observe one, it
+        adds a small multiple of the sensors to z. `Lmi()` finds gamma by a semidefinite program and
+        is suitable for up to 20 states.
     bandwidth : float [Hz], optional
         Bandwidth for a stage without weights: those of `stage_weights` are used, and the POI must
         have one reference. `design_stage` finds the largest possible bandwidth.
@@ -77,12 +81,14 @@ def design_hinf(
         Uncertainty of the plant before it was weighted, such as
         ``plant.uncertain(frequency=0.005)``. The loop shall remain stable for all its modal
         frequencies. Not needed if `plant` is an UncertainPlant. Each mode gets an additional
-        channel through which a change of its frequency acts. The channel includes the G scaling of
-        the real structured singular value mu, and its size is found in a first design. `gamma` then
-        includes these channels; a value above 1 is not a failure. The check
-        ``all frequencies at once`` of `certificate` is below 1 if no plant of the uncertainty has a
-        closed-loop pole at a frequency of the grid. ``ClosedLoop.mode_tolerances`` gives the
-        allowed error of each frequency.
+        channel through which a change of its frequency acts. The structured singular value mu
+        measures how near the uncertainty comes to an unstable loop (see `mu`). Changes of
+        frequencies are real numbers, and the scaling matrix G of mu uses this; the channel includes
+        it. The size of the channel is found in a first design. `gamma` then includes these
+        channels, and a value above 1 is not a failure. The entry ``all frequencies at once`` of
+        `certificate` is an upper bound on mu over a frequency grid. If it is below 1, no plant of
+        the uncertainty has a closed-loop pole at a frequency of the grid.
+        ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
     damped_below : float [Hz]
         Frequency below which the controller actively damps uncertain modes that actuators excite.
         Their channels then represent frequency errors of 1 % and errors of their mode shapes.
@@ -94,9 +100,10 @@ def design_hinf(
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` a lower bound for any controller, `certificate` holds
-        the checks, `reached` the norm of each block of the weights, `left_out` the check with
-        truncated modes.
+        Controller. `gamma` is the verified norm, and `lower` is a lower bound on the norm for all
+        controllers. `certificate` holds the checks. `reached` holds the norm from each group of
+        channels of w to each group of channels of z. `left_out` holds the check with the truncated
+        modes, which the design model leaves out.
 
     Raises
     ------
@@ -112,7 +119,8 @@ def design_hinf(
     Warns
     -----
     FlexplantWarning
-        When truncated modes make the loop unstable, or raise |S| at u above 8 dB; it names them.
+        When truncated modes make the loop unstable, or raise the sensitivity |S| at u above 8 dB.
+        The warning names these modes.
 
     References
     ----------

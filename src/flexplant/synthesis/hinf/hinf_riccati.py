@@ -48,19 +48,24 @@ Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Riccati(Value):
-    """Synthesis by the two Riccati equations of Glover and Doyle, gamma by bounded bisection.
+    """Synthesis by the two Riccati equations of Glover and Doyle; bisection finds gamma.
 
-    A gamma counts as reached only if its closed loop is stable with all gains below gamma. The
-    controller is computed for a gamma `back_off` above the smallest one, because at the optimum it
-    is fast and badly conditioned. The lower bound is the largest gamma that was proven impossible,
-    not the largest one for which the computation failed.
+    Gamma is the bound on the H-infinity norm from w to z. A value of gamma counts as reached only
+    if the closed loop of its controller is stable and has all gains below gamma. The controller is
+    computed for a gamma `back_off` above the smallest one, because the controller of the smallest
+    gamma has very fast poles and is badly conditioned. The lower bound is the largest gamma for
+    which a proof exists that no controller reaches it. It is not the largest gamma for which the
+    computation failed.
 
-    The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
-    boundary. If a rank is missing, a little noise on each sensor and a little effort of each
-    actuator are added, at most 1e-3 of the plant's own signals at the speed of its loop. If w or z
-    misses such a mode, or one that decays by less than 1e-6 of that speed (1e-2 where several lie
-    together), a little of w is added at the actuators and a little of the sensors to z. The loop is
-    verified without these additions. The notes state what was added and what it costs in gamma.
+    The equations make two assumptions. First, the feedthrough D12 from u to z and the feedthrough
+    D21 from w to y have full rank. Second, w excites and z observes every mode on the stability
+    boundary (undamped modes). If a rank is missing, a little noise on each sensor and a little
+    effort of each actuator are added, at most 1e-3 of the plant's own signals at the speed of its
+    loop. If w or z misses an undamped mode, a small disturbance at the actuators is added to w, and
+    a small multiple of the sensors is added to z. A mode counts as undamped if its decay rate is
+    less than 1e-6 of that speed, or less than 1e-2 if several such modes lie close together. The
+    loop is verified without these additions. The notes state what was added and what it costs in
+    gamma.
 
     Parameters
     ----------
@@ -97,9 +102,10 @@ class Riccati(Value):
         Raises
         ------
         InfeasibleError
-            When gamma has a greatest lower bound that only infinite gain reaches.
+            When gamma can approach its lower limit only with infinite gains of the controller.
         SolverError
-            When the plant is too badly conditioned to be stabilised in rounding.
+            When the plant is so badly conditioned that no stabilising controller is found in double
+            precision.
         """
         return back_off_controller(problem, self._searched, self.back_off)
 

@@ -49,30 +49,35 @@ def design_ncf(
 ) -> Controller:
     """Return the loop-shaping controller of Glover and McFarlane, ``u = K y``.
 
-    The shaped plant ``G_s = after G before`` = N / M (normalised left coprime factors) is
-    stabilised together with all ``(N + dN) / (M + dM)``, ``|[dN, dM]| < 1 / gamma``::
+    The plant G is first shaped by filters: ``G_s = after G before``. The shaped plant is written as
+    ``G_s = M^-1 N`` with normalised left coprime factors M and N, which are stable. The controller
+    K_s stabilises G_s and also every plant ``(M + dM)^-1 (N + dN)`` whose errors dM and dN are
+    stable and satisfy ``|[dN, dM]| < 1 / gamma``. The bound gamma is::
 
         gamma_min = (1 + lambda_max(X Z))^(1/2),   gamma = (1 + back_off) gamma_min
 
-    with X and Z of the two Riccati equations of G_s, so that no search is needed.
-    ``K = before K_s after``. A sampled plant is mapped to continuous time and the controller back,
-    which keeps gains and factors. Rigid-body modes and integrators are allowed in the plant and in
-    `before` and `after`.
+    Here X and Z are the solutions of the two Riccati equations of G_s. The smallest value gamma_min
+    is known from them, so that no search is needed. The result is ``K = before K_s after``. A
+    sampled plant is mapped to continuous time by the bilinear transformation, and the controller is
+    mapped back. This keeps
+    the H-infinity norms and the normalisation of the factors. Rigid-body modes and
+    integrators are allowed in the plant and in `before` and `after`.
 
     Parameters
     ----------
     plant : StandardPlant or StateSpace
-        Plant. Of a StandardPlant the channels from u to y are used.
+        Plant G. For a StandardPlant, the channels from u to y are used.
     before, after : StateSpace or array, optional
-        Shaping at u and at y, with the plant's sampling time: filters that give the loop its slope,
-        and transformations to decoupled axes (`decouple`: accelerations and to_motions).
+        Shaping filters at u and at y, with the sampling time of the plant. They give the loop gain
+        its slope. They may also transform to decoupled axes: `decouple` returns the matrices
+        `accelerations` (for `before`) and `to_motions` (for `after`).
     bandwidth : float [Hz], optional
         Bandwidth of every channel. ``after G before`` must be square; each of its channels is
         multiplied by ``k (1 + w / (10 s))`` with w = 2 pi bandwidth, and k makes its gain 1 at the
         bandwidth.
     back_off : float
-        Relative distance of gamma from gamma_min. It must be positive, because K_s is singular at
-        gamma_min.
+        Relative distance of gamma from gamma_min. It must be positive, because the formula for K_s
+        has a singular matrix at gamma_min.
 
     Returns
     -------
@@ -214,14 +219,16 @@ class _LoopShaping(Design):
 def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> float:
     """Return the margin of a loop u = K y against errors of normalised coprime factors.
 
-    ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |``, between 0 (unstable) and
-    ``(1 + lambda_max(X Z))^(-1/2)`` of the plant. It depends on the units of u and y: scale both
-    sides so that signals are of size 1, or give the shaped plant and its controller.
+    The margin is ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |`` with the H-infinity norm. It lies
+    between 0 (unstable loop) and the largest value that any controller reaches, ``(1 + lambda_max(X
+    Z))^(-1/2)``, where X and Z are the solutions of the two Riccati equations of the plant. It
+    depends on the units of u and y. Scale u and y so that typical signals have size 1, or give the
+    shaped plant and its controller.
 
     Parameters
     ----------
     plant : StandardPlant or StateSpace
-        Plant, of which u -> y is used.
+        Plant G. For a StandardPlant, the channels from u to y are used.
     controller : Controller or StateSpace
         Controller from y to u, its channels in the plant's order.
 
@@ -233,7 +240,7 @@ def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> flo
     Raises
     ------
     ModelError, ShapeError
-        When plant and controller do not fit.
+        When the channels or sampling times of plant and controller do not match.
 
     Examples
     --------

@@ -65,17 +65,20 @@ def design_stage(
 ) -> Controller:
     """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
 
-    The weights are `stage_weights` of rising bandwidths on
-    ``plant.through(reference_errors(plant))`` (without references, on the plant itself); each
-    problem is solved by ``design_hinf(uncertain=)``. The result is the design of largest bandwidth
-    that satisfies three conditions. The modulus margin at u is at least `margin`, also with
-    truncated modes if they are known. It is at least 7/8 of `margin` if the frequency of any one
-    mode is off by its uncertainty. The same holds on each of 20 machines drawn at random, and hence
-    on a further one with a probability of 20/21 (95 %). The machines agree with the measurement
-    (`StandardPlant.machines`) where the plant comes from a calibrated fit and no frequencies are
-    stated. Otherwise all frequencies change simultaneously by their stated uncertainties, the
-    shapes change with them, and the damping ratios change by their stated uncertainties, or by 30 %
-    by default. The certificate has the margin on the machines of a fit as well.
+    A controller is designed for each of several bandwidths. The weights of each design are
+    `stage_weights` of its bandwidth, on ``plant.through(reference_errors(plant))`` or, without
+    references, on the plant itself. ``design_hinf(uncertain=)`` solves the problem. The result is
+    the design of largest bandwidth that satisfies three conditions. First, the modulus margin at u
+    is at least `margin`, also with the truncated modes (which the design model leaves out) if they
+    are known. Second, it is at least 7/8 of `margin` if the frequency of any one mode is off by its
+    uncertainty. Third, it is at least 7/8 of `margin` on each of 20 machines that are drawn at
+    random. A further machine then satisfies this with a probability of 20/21 (95 %). How the
+    machines are drawn depends on the plant. If it comes from a calibrated fit and no uncertainties
+    of frequencies are stated, the machines agree with the measurement (`StandardPlant.machines`).
+    Otherwise all frequencies change simultaneously by their stated uncertainties, and the mode
+    shapes change with them. The damping ratios change by their stated uncertainties, or by 30 % by
+    default. For a plant of a calibrated fit, the certificate also has the margin on the machines of
+    the fit.
 
     Parameters
     ----------
@@ -83,15 +86,18 @@ def design_stage(
         Plant of a machine that follows references, or of one that is held at rest (without
         references); continuous or sampled. A plant without stated uncertainty is taken with all its
         frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})`` and
-        ``plant.uncertain(fit)`` are more accurate. Only Deltas of frequencies are used.
+        ``plant.uncertain(fit)`` are more accurate. The design itself uses the uncertainties of the
+        frequencies only.
     bandwidth : float [Hz], optional
         Bandwidth of the loop: frequency at which |S| from reference to error crosses 1 on the
-        slowest axis. The weights are adjusted to reach it within 1 %; without a reference they are
-        those of 1.5 times the bandwidth. By default the largest possible bandwidth.
+        slowest axis. The weights are adjusted until the loop reaches it within 1 %. For a plant
+        without references, the weights are those of 1.5 times the bandwidth. By default the largest
+        possible bandwidth.
     margin : float
-        Least modulus margin, with the loop opened at u.
+        Smallest allowed modulus margin, with the loop opened at u. The modulus margin is one over
+        the largest singular value of the sensitivity S at any frequency.
     poi : str, optional
-        POI as for `stage_weights` and `reference_errors`.
+        Point of interest (POI), as for `stage_weights` and `reference_errors`.
     disturbance, effort : float
         Sizes of the weights as for `stage_weights` of an uncertain plant.
     progress : as for `design_hinf`

@@ -37,19 +37,20 @@ Kind = Literal["velocity", "ppf", "irc"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ActiveDamping(Value):
-    """A damped mode; made by `damp_modes`.
+    """The controller that damps one mode, with what it reaches; made by `damp_modes`.
 
     Parameters
     ----------
     element : DampingElement
-        The tuned law from error to command.
+        The tuned element. Its input is the error (minus the measurement), its output the command.
     controller : StateSpace
-        From y to u, including the sign of the feedback: for `close_loop`, in parallel with a servo.
+        Controller from y to u, including the sign of the feedback. `close_loop` takes it, also
+        together with a servo, whose commands are added.
     freq : float [Hz]
         Frequency of the mode without the loop.
     before, damping : float
-        Damping ratio of the mode without the loop; with the loop, least damping ratio of the mode
-        and the poles of the filter.
+        Damping ratio of the mode without the loop (`before`), and the least damping ratio of the
+        mode and of the poles of the filter with the loop (`damping`).
     margin : float
         Modulus margin of the loop.
     undamped : StandardPlant
@@ -77,7 +78,7 @@ class ActiveDamping(Value):
 
     @cached_property
     def plant(self) -> StandardPlant:
-        """The plant with the damping loop closed, whose u adds to its command: for the servo."""
+        """The plant with the damping loop closed, for the design of a servo, whose u is added."""
         found = _with_loop(self.undamped, self.controller)
         whole_plant = self.undamped.evaluation_plant
         if whole_plant is None:
@@ -108,13 +109,14 @@ def damp_modes(
     damping: float | None = None,
     margin: float = 0.3,
 ) -> ActiveDamping:
-    """Return the law that gives a mode a damping ratio, or the largest one that its kind reaches.
+    """Return the law that damps a mode: to a given damping ratio, or as much as its kind can.
 
-    The search follows the root loci of all filters of the kind, for both signs. The damping ratio
-    that counts is the smallest one of the mode's pole and the poles of the filter. Admissible laws
-    keep the modulus margin, do not move rigid-body poles to the right, and keep at least 70 % of
-    the damping of every other mode. If a damping ratio is given, the result is the law that reaches
-    it with the least gain over the resonance.
+    The search tries filters of the given kind with both signs of the gain, and follows the root
+    locus of each. The filter adds poles to the loop. The damping ratio that is maximised is
+    therefore the smallest one of the mode's pole and the poles of the filter. A law is accepted
+    only if it keeps the modulus margin, does not move rigid-body poles to the right, and keeps at
+    least 70 % of the damping ratio of every other mode. If a damping ratio is given, the result is
+    the law that reaches it with the least gain over the resonance.
 
     Parameters
     ----------
@@ -130,17 +132,19 @@ def damp_modes(
     damping : float, optional
         Damping ratio, below 1; by default the largest.
     margin : float
-        Modulus margin of the loop, between 0 and 1.
+        Modulus margin that the loop keeps, between 0 and 1. It is one over the largest magnitude of
+        the sensitivity S.
 
     Returns
     -------
     ActiveDamping
-        A block for `close_loop`; its `plant` is what the servo is designed for.
+        The result is a block for `close_loop`. Its attribute `plant` is the damped plant, for which
+        a servo can be designed.
 
     Raises
     ------
     AssumptionError
-        When no law of the kind reaches the damping ratio, or damps the mode at all.
+        When no law of the kind reaches the given damping ratio, or none damps the mode.
     LabelError, ModelError
         When u or y is unknown or must be named, the mode does not exist, or a number is out of
         range.

@@ -24,9 +24,11 @@ class Pid(SingleElement):
     Parameters
     ----------
     p, i, d : float
-        Gains [command per error, per s, times s].
+        Gains: p in command per error, i in command per error and second, d in command per rate of
+        the error.
     pole : float [Hz], optional
-        Corner w above which the derivative no longer grows; needed with d.
+        Corner w above which the gain of the derivative action is constant. It must be given if d is
+        not zero.
 
     Examples
     --------
@@ -62,11 +64,11 @@ class Pid(SingleElement):
         Parameters
         ----------
         gain : float
-            Between the corner of the integrator and the zero.
+            Gain between the corner of the integral action and the zero.
         integrator : float [Hz]
-            Corner of the integral action; 0 without.
+            Corner w_i of the integral action; 0 means no integral action.
         zero, pole : float [Hz], optional
-            Zero and pole of the lead; both or none.
+            Zero w_z and pole w_p of the lead. Give both or neither.
         """
         k = number(gain, "gain")
         w_i = 2.0 * np.pi * positive(integrator, "integrator", zero=True)
@@ -80,7 +82,7 @@ class Pid(SingleElement):
         return cls(p, k * w_i, k / w_z - p / w_p, float(pole))
 
     def as_corners(self) -> dict[str, float | None] | None:
-        """Return the arguments of `corners` that make it; None where its zeros are complex."""
+        """Return the arguments of `corners` that give this PID; None if its zeros are complex."""
         if self.pole is None:
             corner = self.i / self.p / (2.0 * np.pi) if self.p else -1.0
             same: dict[str, float | None] = {"gain": self.p, "integrator": corner}
@@ -118,10 +120,10 @@ class Lead(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        Frequency of the largest phase, ``asin((r - 1) / (r + 1))``; the zero lies at freq /
-        sqrt(r).
+        Frequency w at which the phase lead is largest, namely ``asin((r - 1) / (r + 1))``. The gain
+        at this frequency is one. The zero lies at freq / sqrt(r), the pole at freq sqrt(r).
     ratio : float
-        Pole over zero; below 1 it is a lag.
+        Ratio r of the pole to the zero. Below 1 the element is a lag.
 
     References
     ----------
@@ -146,12 +148,12 @@ class Lead(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Lag(SingleElement):
-    """``(p + 1) / (p + 1 / ratio)``, p = s / w: gain 1 above w, `ratio` far below it.
+    """``(p + 1) / (p + 1 / ratio)``, p = s / w: gain 1 far above w, gain `ratio` far below w.
 
     Parameters
     ----------
     freq : float [Hz]
-        Frequency of its zero; the pole lies at freq / ratio.
+        Frequency w of the zero; the pole lies at freq / ratio.
     ratio : float
         Gain at low frequency.
 
@@ -208,14 +210,15 @@ class Notch(SingleElement):
     Parameters
     ----------
     freq : float [Hz]
-        Centre frequency, that of the zeros.
+        Frequency w of the zeros, the centre of the notch.
     depth : float
-        Gain at the centre, below 1; above 1 it is a resonance. depth times width is the damping
-        ratio of the zeros.
+        Gain at the centre for skew 1, below 1. Above 1 the element is a resonance. The damping
+        ratio of the zeros is depth times width.
     width : float
-        Damping ratio of the poles: half the relative width.
+        Damping ratio of the poles, which is half the relative width of the notch.
     skew : float
-        Frequency of the poles over that of the zeros; the gain far above is its square.
+        Ratio of the frequency of the poles to that of the zeros. The gain at high frequency is the
+        square of this ratio.
 
     Examples
     --------
@@ -245,7 +248,8 @@ class LowPass(SingleElement):
     freq : float [Hz]
         Corner.
     order : {1, 2}
-        Order, the slope above the corner.
+        Order of the filter. The gain falls with 20 dB per decade above the corner for order 1, and
+        with 40 dB per decade for order 2.
     damping : float
         Damping ratio of order 2; by default that of a Butterworth filter.
 
@@ -276,9 +280,10 @@ class FixedBlock(SingleElement):
     Parameters
     ----------
     block : StateSpace
-        From error to command, continuous or sampled; a sampled one runs at its own rate only.
+        System from error to command, continuous or sampled. A sampled one with states can only be
+        used at its own rate.
     label : str
-        Description for the reader of the law.
+        Description that is shown when the law is printed.
 
     Examples
     --------
@@ -301,10 +306,11 @@ class FixedBlock(SingleElement):
         Parameters
         ----------
         given : StateSpace or Controller
-            A controller of a design, ``u = K y``, has the sign of the feedback in it: the element
-            is ``-K``. A StateSpace is taken from error to command as it is.
+            System of the element. A designed Controller K is used as ``u = K y`` and includes the
+            sign of the feedback, so that the element is ``-K``. A StateSpace is used unchanged,
+            from error to command.
         label : str, optional
-            What it is; else what `given` says of itself.
+            Description of the element; by default the name or the method of `given`.
         """
         if isinstance(given, Controller):
             return cls(-given.system, label or given.method)
@@ -320,11 +326,11 @@ class FixedBlock(SingleElement):
 
     @property
     def own_rate(self) -> float:
-        """The only rate [Hz] at which it runs; 0 where any will do."""
+        """The only rate [Hz] at which the block can run; 0 if it can run at any rate."""
         return 1.0 / self.block.dt if self.block.dt and self.block.n_states else 0.0
 
     @cached_property
     def section(self) -> BlockSection:
-        """Its system; for a sampled block, the continuous one from which Tustin's rule gives it."""
+        """The system; for a sampled block, its continuous equivalent by Tustin's rule."""
         rate, g = self.own_rate, self.block
         return BlockSection(bilinear(g, rate) if rate else g.replace(dt=0.0))

@@ -26,13 +26,13 @@ _CORNERS = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
 class DampingElement(SingleElement):
     """An element from error to command (``u = -L y``) whose gain damps a mode.
 
-    A new kind defines `section`, its transfer function, and `candidates`, the elements that
-    `damp_modes` tries.
+    A new kind of damping is a subclass. It defines the property `section`, the transfer function,
+    and the method `candidates`, which gives the elements that `damp_modes` tries.
 
     Parameters
     ----------
     gain : float
-        Factor of the element.
+        Gain by which the element is multiplied.
     """
 
     gain: float = field(metadata=checked(number))
@@ -47,13 +47,13 @@ class DampingElement(SingleElement):
 class VelocityFeedback(DampingElement):
     """Velocity feedback: ``gain s / (1 + s / w)``, the velocity of a displacement sensor.
 
-    Between an actuator and a sensor at one place every mode below w gains damping, rigid-body
-    modes as well.
+    If actuator and sensor are at the same place, every mode below w is damped, including rigid-body
+    modes.
 
     Parameters
     ----------
     gain : float
-        Command per velocity.
+        Command per velocity, in the unit of the command over that of y per second.
     pole : float [Hz]
         Corner w.
 
@@ -86,16 +86,18 @@ class VelocityFeedback(DampingElement):
 class PositivePositionFeedback(DampingElement):
     """Positive position feedback: ``-gain / (p^2 + 2 damping p + 1)``, p = s / w.
 
-    The filter has its frequency w near that of the mode and shares its damping with the mode; above
-    w it rolls off. Displacements are fed back with positive sign, ``u = +gain F(s) y``, so that the
-    gain at rest must stay below the stiffness. A free body can therefore not be damped by it.
+    The frequency w of the filter lies near that of the mode, so that the filter, which is well
+    damped, also damps the mode. Above w the gain of the filter falls. The displacement is fed back
+    with positive sign, ``u = +gain F(s) y``, which acts as a negative stiffness. The gain at zero
+    frequency must therefore be below the static stiffness. A body without a spring to the ground
+    cannot be damped in this way.
 
     Parameters
     ----------
     gain : float
-        Command per displacement at rest.
+        Command per displacement at zero frequency.
     freq : float [Hz]
-        w of the filter.
+        Frequency w of the filter.
     damping : float
         Damping ratio of the filter.
 
@@ -130,14 +132,16 @@ class PositivePositionFeedback(DampingElement):
 class IntegralResonantControl(DampingElement):
     """Integral resonant control, ``-gain / (1 + s / w)``: integral feedback with a feedthrough.
 
-    An integrator ``k / s`` that reads ``y - d u`` gives gain = 1 / d and w = k d. A feedthrough d
-    larger than the static compliance puts a zero below each resonance of a collocated pair, and
-    integral feedback damps all modes that lie between its poles and zeros.
+    The law is an integrator ``k / s`` whose input is ``y - d u``, where d is an artificial
+    feedthrough. This is the same as the formula above with gain = 1 / d and w = k d. If d is larger
+    than the static compliance of a collocated actuator and sensor, the plant with feedthrough has a
+    zero below each resonance. Integral feedback then damps all these modes.
 
     Parameters
     ----------
     gain : float
-        1 / d, command per displacement at rest; below the static stiffness.
+        The number 1 / d, command per displacement at zero frequency. It must be below the static
+        stiffness.
     freq : float [Hz]
         Corner w.
 

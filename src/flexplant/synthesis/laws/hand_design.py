@@ -25,18 +25,20 @@ from .loop_design import DesignedLoops, axes_of, made
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ShapedAxis(Value):
-    """The law of one axis as it is shaped: a gain, elements, and which of them are on.
+    """The law of one axis in a `LoopDesign`: a gain, elements, and which elements are on.
 
     Parameters
     ----------
     elements : sequence of elements
-        `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`, in this order.
+        Elements of the law, multiplied in the given order: `Pid`, `Lead`, `Lag`, `Integrator`,
+        `Notch`, `LowPass` or `FixedBlock`.
     gain : float
-        A factor on all of them.
+        Gain by which the product of the elements is multiplied.
     on : sequence of bool, optional
         Whether each element acts; by default all.
     feedforward : sequence of up to 5 float
-        Command of the axis per position, velocity, acceleration, jerk and snap of its reference.
+        Feedforward gains: command of the axis per position, velocity, acceleration, jerk and snap
+        (the fourth derivative) of its reference.
     closed : bool
         Whether the loop of this axis is closed while others are shaped (sequential loop closing).
 
@@ -89,12 +91,12 @@ class ShapedAxis(Value):
 
     @property
     def forward(self) -> dict[str, float]:
-        """The gains of the feedforward that are not zero, by what they act on."""
+        """The feedforward gains that are not zero, by the derivative on which they act."""
         return {term: g for term, g in zip(TERMS, self.feedforward, strict=False) if g}
 
     @property
     def law(self) -> Law:
-        """The law of the elements that are on, continuous."""
+        """The continuous law of the elements that are on."""
         rate = max((element.own_rate for element in self.active), default=0.0)
         return Law(self.active, self.gain, rate=rate)
 
@@ -108,33 +110,37 @@ class ShapedAxis(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopDesign(Value):
-    """Loops shaped by hand: elements of each axis, the decoupling, and what it was made on.
+    """Loops shaped by hand: the elements of each axis, the decoupling and the plant's data.
 
-    ``u = before diag(law_i) (r - after y)``, with feedforward for axes that have one. The design
-    consists of numbers only: equal designs give equal controllers, to the last digit.
+    The controller is ``u = before diag(law_i) (r - after y)`` with the references r, plus the
+    feedforward of the axes that have one. The design consists of numbers only, so that equal
+    designs give exactly equal controllers.
 
     Parameters
     ----------
     axes : mapping {axis: ShapedAxis}
-        In the order of the motions of `after`.
+        Law of each axis, in the order of the outputs of `after`.
     before, after : StateSpace or array, optional
-        Static transformations: commands of the axes to u, y to motions; none for a plant whose
-        channels are axes.
+        Static transformations for decoupling. `before` maps the commands of the axes to u, and
+        `after` maps y to the motions of the axes. None if the channels of the plant are the axes.
     rate : float [Hz]
-        Rate of the controller; 0 when continuous.
+        Sampling rate of the controller; 0 if it is continuous.
     delay : float
-        For a measured plant: samples of delay in addition to those in the measurement.
+        For a measured plant, number of samples of delay in addition to the delay that the
+        measurement contains.
     hold : bool
-        For a measured plant: False when it was measured from sample to sample.
+        For a measured plant, whether the zero-order hold has still to be added. False if it was
+        measured from sampled commands to sampled outputs, so that it contains the hold.
     rigid, unstable : int
-        For a measured plant: its number of rigid-body modes, and of poles outside the stability
-        region.
+        For a measured plant, its number of rigid-body modes and its number of unstable poles (poles
+        outside the stability region).
     references : mapping {axis: channel}
-        References that axes follow. With feedforward an axis has one, ``axis:ref`` unless given.
+        Name of the reference that each axis follows. An axis with feedforward always has one; by
+        default its name is ``axis:ref``.
     made_on : str
-        Description of the plant.
+        Description of the plant on which the design was made.
     fingerprint : str
-        Digest of the plant's numbers: see `is_made_on`.
+        Hash of the plant's numbers. The method `is_made_on` compares it.
 
     Examples
     --------
@@ -198,7 +204,7 @@ class LoopDesign(Value):
         unstable: int = 0,
         references: Mapping[str, str] | None = None,
     ) -> LoopDesign:
-        """Return a design on a plant, whose driven axes are taken unless axes are given.
+        """Return a design on a plant; by default its axes are those that the actuators move.
 
         Parameters
         ----------
@@ -207,8 +213,8 @@ class LoopDesign(Value):
             Axes that are missing have a gain of 1.
         before, after, rate, delay, hold, unstable, references : as for `design_loops`
         rigid : int, optional
-            Rigid-body modes of a measured plant; unless given, one for each axis that falls
-            with slope 2 at its lowest lines.
+            Number of rigid-body modes of a measured plant. By default one for each axis whose
+            response falls with 40 dB per decade at its lowest frequencies.
 
         Raises
         ------
@@ -304,12 +310,12 @@ class LoopDesign(Value):
         return {name: found[name] for name in self.axes if name in found}
 
     def loops(self, plant: Any) -> DesignedLoops:
-        """Return the loops on a plant, all axes closed: report, check with the truncated modes.
+        """Return the loops on a plant with all axes closed: report, check with truncated modes.
 
         Parameters
         ----------
         plant : StandardPlant, StateSpace or Frf
-            With the channels and the rate of the design.
+            Plant with the channels and the rate of the design.
 
         Raises
         ------
@@ -324,7 +330,7 @@ class LoopDesign(Value):
         Parameters
         ----------
         plant : StandardPlant, StateSpace or Frf
-            With its channels.
+            Plant with the channels of the design.
         """
         if isinstance(plant, Frf) or hasattr(plant, "frdata"):
             rate = self.rate or None

@@ -185,14 +185,14 @@ class Law(LawElement):
     Parameters
     ----------
     factors : sequence of elements
-        `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`.
+        Elements of the law: `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass` or `FixedBlock`.
     gain : float
         Number by which the factors are multiplied.
     rate : float [Hz]
         Sampling rate; 0 when continuous.
     prewarped : bool
-        Whether a notch, a lead and the corner of a low-pass keep their frequencies when the law is
-        sampled.
+        Whether the frequencies of a notch, a lead and the corner of a low-pass are kept when the
+        law is sampled. Tustin's rule alone would shift them.
 
     Examples
     --------

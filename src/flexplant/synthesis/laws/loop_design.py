@@ -38,7 +38,8 @@ class DesignedLoops(Value):
     laws : mapping {axis: Law}
         Law of each axis from error to command. A positive gain means negative feedback.
     report : LoopReport
-        Stability, and crossover and margins of each axis while the loops of the others are closed.
+        Stability of all loops together, and crossover and margins of the loop of each axis while
+        the loops of the other axes are closed.
     left_out : SpillOver, optional
         Stability and margins on the plant with the truncated modes, where these are known.
     notes : sequence of str
@@ -130,28 +131,31 @@ def design_loops(
     unstable: int = 0,
     references: Mapping[str, str] | None = None,
 ) -> DesignedLoops:
-    """Return the controller of laws made by hand, ``u = -before diag(laws) after y``, and a report.
+    """Return the controller of given laws, ``u = -before diag(laws) after y``, and a report.
 
-    Each law is a product of elements, `Pid`, `Lead`, `Notch`, `LowPass`. The plant may be a
-    measured Frf; stability then follows from the Nyquist count.
+    Each law is a product of elements such as `Pid`, `Lead`, `Notch` and `LowPass`. The plant may
+    also be a measured frequency response (Frf). Stability is then determined by the Nyquist
+    criterion, which counts encirclements.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or Frf
-        For an assembled StandardPlant the axes are those that the actuators move (`decouple`),
-        unless `before` and `after` are given.
+        Plant. For a StandardPlant that was assembled from a structure, the axes are those that the
+        actuators move (`decouple`), unless `before` and `after` are given.
     laws : Law or mapping {axis: Law}
-        Error to command; one for all axes, or one each. Sampled at the rate of the plant.
+        Law from error to command: one for all axes, or one for each axis. Laws are sampled at the
+        rate of the plant.
     before, after : StateSpace or array, optional
-        Static transformations: commands of the axes to u, y to motions of the axes.
+        Static transformations. `before` maps the commands of the axes to u, and `after` maps y to
+        the motions of the axes.
     rate, delay, hold
-        For an Frf: the rate of the controller (continuous by default), its samples of delay, and
-        whether its hold is still to be applied, as for `in_axes`.
+        Only for an Frf: the sampling rate of the controller (continuous by default), its delay in
+        samples, and whether the zero-order hold has still to be added, as for `in_axes`.
     rigid, unstable : int
-        For an Frf: its number of rigid-body modes and of poles outside the stability region, as for
-        `report_loops`.
+        Only for an Frf: its number of rigid-body modes and its number of unstable poles (poles
+        outside the stability region), as for `report_loops`.
     references : mapping {axis: channel of y}, optional
-        References that an axis follows, such as ``{"die:z": "die:ref"}``.
+        Reference that each axis follows, such as ``{"die:z": "die:ref"}``.
 
     Returns
     -------
@@ -160,7 +164,7 @@ def design_loops(
     Raises
     ------
     ModelError, ShapeError
-        When plant, transformations, laws and rate do not fit.
+        When plant, transformations, laws and rate do not match.
     AssumptionError
         When the axes cannot be decoupled.
 

@@ -35,17 +35,18 @@ _POINTS, _AROUND = 60, 3
 class PidTuning(Value):
     """A tuned PID controller with what it reaches; made by `tune_pid`.
 
-    ``u = k (1 + w_i / s) (1 + s / w_d) / (1 + s / w_f) (r - y)``; without lead w_d and w_f are
-    equal and drop out.
+    The controller is ``u = k (1 + w_i / s) (1 + s / w_d) / (1 + s / w_f) (r - y)``. A PI controller
+    has no lead: the factors with w_d and w_f are then left out.
 
     Parameters
     ----------
     controller : StateSpace
         From y to u, including the sign of the feedback: for `close_loop`, `write_c`, ...
     gain : float
-        k, in the unit of u over that of y.
+        Gain k, in the unit of u over that of y.
     integral, lead, roll_off : float [Hz]
-        w_i, w_d and w_f over 2 pi; lead and roll-off are infinite if unused.
+        Corner frequencies w_i, w_d and w_f, divided by 2 pi. Lead and roll-off are infinite if they
+        are not used.
     crossover : float [Hz]
         Lowest frequency at which the loop gain is 1.
     bandwidth : float [Hz]
@@ -86,19 +87,22 @@ def tune_pid(
 ) -> PidTuning:
     """Return a PI or PID controller of a plant with one input and one output.
 
-    The loop gain is 1 at the bandwidth; the corner frequencies of integral action and lead are
-    those with the largest integral gain that keep the modulus margin. Bandwidth and margin are
-    verified on the closed loop.
+    The magnitude of the loop gain is 1 at the bandwidth. Among the corner frequencies of integral
+    action and lead that keep the modulus margin, those with the largest integral gain are chosen.
+    Bandwidth and margin are verified on the closed loop.
 
     Parameters
     ----------
     plant : StateSpace, or a system of python-control or SciPy
-        Any plant: with or without integrators, of either sign.
+        Plant with one input and one output. It may have integrators, and its gain may have either
+        sign.
     bandwidth : float [Hz], optional
-        Frequency at which the loop gain crosses 1; by default the largest that keeps the margin. In
-        continuous time it may be unlimited: then it is a thousand times the fastest pole.
+        Frequency at which the loop gain crosses 1; by default the largest that keeps the margin.
+        For a continuous plant this may have no limit; the bandwidth is then a thousand times the
+        fastest pole.
     margin : float
-        Modulus margin, between 0 and 1.
+        Modulus margin to be kept, between 0 and 1. It is one over the largest magnitude of the
+        sensitivity S.
     rate : float [Hz], optional
         Rate of the controller; the plant is then sampled exactly with its dead time. By default the
         controller is continuous.

@@ -70,13 +70,13 @@ def design_servo(
 
     Here w_i is the corner of the integral action; F is a second-order roll-off with the notches.
     Between two lines, the law with the smaller peak of |S| at u is used. The gain k makes the loop
-    of the axis cross 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance, k is
+    gain of the axis 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance, k is
     computed from the response at s = sigma, provided that this keeps 6 dB. If a mode lies above the
-    bandwidth within a factor of 4, wider leads are tried on a mass line: 16 in place of 4, or 64 if
-    16 does not keep 6 dB. A wide lead suppresses the error up to a higher frequency, but less at
-    low frequencies, and passes more noise to the actuators. A notch has the damping of its mode,
-    and its frequency or, for a fast mode, a lower one, so that the loop tolerates errors of the
-    mode's frequency. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
+    bandwidth within a factor of 4, larger numbers are tried for each 4 of the mass line's law: 16,
+    or 64 if 16 does not keep 6 dB. Such a wide lead suppresses the error up to a higher frequency,
+    but less at low frequencies, and passes more noise to the actuators. A notch has the damping of
+    its mode, and its frequency or, for a fast mode, a lower one, so that the loop tolerates errors
+    of the mode's frequency. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
@@ -216,12 +216,12 @@ def servo_bandwidth(
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
-    Plant and observer are swept once over a grid that includes their resonances. The loop is opened
-    at the plant's input; the observer still receives u. A bandwidth that keeps the peak on this
-    grid is accepted on three conditions: the closed loop is stable, every axis with a reference has
-    |S| of at most 0.3 at a twentieth of the bandwidth, and `modulus_margin` keeps the peak.
-    Truncated modes are included if known. Bandwidths are tried downwards in steps of 9 % until one
-    is accepted. Those between it and the step before are tried next.
+    The responses of plant and observer are computed once on a grid that includes resonances. The
+    loop is opened at the plant's input; the observer still receives u. A bandwidth that keeps the
+    peak on this grid is accepted on three conditions: the closed loop is stable, every axis with a
+    reference has |S| of at most 0.3 at a twentieth of the bandwidth, and `modulus_margin` keeps the
+    peak. Truncated modes are included if known. Bandwidths are tried from high to low in steps of
+    9 % until one is accepted. A bisection then searches above it.
 
     Parameters
     ----------

@@ -46,30 +46,34 @@ def tune_loops(
     notches: int = 3,
     progress: bool | None = None,
 ) -> DesignedLoops:
-    """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
+    """Return the laws of highest bandwidth that keep the sensitivity |S| of all axes below a peak.
 
     For a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds
     the law of each axis (PID, low-pass and notches), `design.report` its margins; `close_loop`
     takes `design.system`, and `write_c` exports it. ``before=`` and ``after=`` decouple several
-    axes; `decouple` computes them. Where the lines do not resolve a resonance, or have variance,
-    the loop gain is kept small. The result is the best of many starts, without proof that it is
-    optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
+    axes; `decouple` computes them. At frequencies where the measured lines (frequency points) do
+    not resolve a resonance, or have a variance, the loop gain is kept small. The search is started
+    many times, and the result is the best one. There is no proof that it is optimal. A warning is
+    given if the peak is exceeded. The page `algorithms` describes the method.
 
-    The law of an axis depends on its line: that of a mass, a velocity (damper) or a spring. A
-    single axis that integrates an odd number of times, as motors do, or is unstable has the law of
-    `tune_pid`.
+    The form of the law depends on how the response of the axis behaves: as that of a mass (falls
+    with 40 dB per decade), of a damper (20 dB per decade) or of a spring (constant). A plant with a
+    single axis that is unstable or has an odd number of integrators, such as a motor, gets the law
+    of `tune_pid`.
 
     Parameters
     ----------
     plant, before, after, rate, delay, hold : as for `design_loops`
     peak : float
-        Bound on |S| at u and of each axis, and at y if each axis has one sensor; 2 is 6 dB, a
-        modulus margin of 0.5.
+        Upper bound on |S| at u and on |S| of each axis. If each axis has one sensor, it is also an
+        upper bound on |S| at y. A peak of 2 (6 dB) is a modulus margin of 0.5.
     rigid : int, optional
-        Number of rigid-body modes; by default the number of axes, or those of a model. 0 if the
-        machine is on springs and the suspension modes lie within the lines.
+        Number of rigid-body modes. By default that of the model, or for a measured FRF the number
+        of axes. Give 0 if the machine stands on springs and the lines include the frequencies of
+        its suspension modes.
     notches : int
-        Largest number of notches of each axis; each has to raise the bandwidth by 2 %.
+        Largest number of notches of each axis. A notch is used only if it raises the bandwidth by
+        at least 2 %.
     progress : bool, optional
         Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
         two seconds.
@@ -90,8 +94,8 @@ def tune_loops(
     Warns
     -----
     FlexplantWarning
-        When the peak is exceeded: it states the largest |S|, its place and frequency, also in
-        `notes`.
+        When the peak is exceeded. The warning states the largest |S|, its place and its frequency.
+        The result has the same text in `notes`.
 
     Examples
     --------

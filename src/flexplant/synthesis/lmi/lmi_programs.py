@@ -239,18 +239,21 @@ _LITTLE = 1e-11
 class Lmi(Value):
     """Synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
 
-    One semidefinite program gives the smallest gamma, in states that are balanced by the solutions
-    of least quadratic cost. The eigenvalues of its X and Y prove that this gamma can be reached, to
-    the accuracy of the solver. The Riccati equations prove a lower bound for all controllers. An
-    optimum more than 2 % above that bound is refused. The controller is not computed from X and Y,
-    because ``I - X Y`` is nearly singular next to the optimum, and digits would be lost. It is the
-    central controller of the Riccati equations, as for `Riccati()`, for a gamma a little larger
-    than the smallest one, which is taken at most 0.5 % above the bound. Noise, effort and
-    disturbance are added as for `Riccati()`.
+    Gamma is the bound on the H-infinity norm from w to z. One semidefinite program with the matrix
+    variables X and Y gives the smallest gamma. For this program, the states are balanced: they are
+    transformed so that the solutions of the two equations of least quadratic cost (control and
+    estimation) are equal and diagonal. The eigenvalues of X and Y prove, to the accuracy of the
+    solver, that this gamma can be reached. The Riccati equations of H-infinity control prove a
+    lower bound for all controllers. If the optimum is more than 2 % above that bound, an error is
+    raised. The controller is not computed from X and Y, because ``I - X Y`` is nearly singular next
+    to the optimum, and digits would be lost. It is computed from the Riccati equations, as by
+    `Riccati()`, for a gamma a little larger than the smallest one. The smallest one is taken as at
+    most 0.5 % above the lower bound. Small noise, effort and disturbances are added where the
+    equations need them, as by `Riccati()`.
 
-    Plants of up to 20 states are served, in at most 10 s; the time grows with the sixth power of
-    the number of states. Larger plants are refused, and so are plants whose fast and slow states,
-    or large and small gains, the solver does not resolve together.
+    Plants may have up to 20 states, which take at most 10 s. The time grows with the sixth power of
+    the number of states, and larger plants are refused. An error is also raised if the ratio of
+    fast to slow states, or of large to small gains, is too large for the accuracy of the solver.
 
     Parameters
     ----------
@@ -258,9 +261,9 @@ class Lmi(Value):
         Relative distance from the smallest gamma. By default 0.5 % if D12 and D21 have full rank,
         otherwise as for `Riccati()`.
     tolerance : float
-        Tolerance of the solver: gap and residuals, relative.
+        Relative tolerance of the solver on the duality gap and on the residuals.
     max_states : int
-        Largest number of states that is served; more are refused at once.
+        Largest number of states of the plant. An error is raised for a larger one.
 
     References
     ----------
@@ -287,7 +290,7 @@ class Lmi(Value):
         ModelError
             When the problem has no states, or more than max_states.
         InfeasibleError
-            When gamma has a greatest lower bound that only infinite gain reaches.
+            When gamma can approach its lower limit only with infinite gains of the controller.
         SolverError
             When the solver stops early, or its optimum is not near the lower bound.
         """

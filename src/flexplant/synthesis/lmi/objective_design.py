@@ -42,15 +42,17 @@ _KINDS = (H2, Hinf, PeakGain)
 
 @dataclass(frozen=True, eq=False)
 class AutoBackOff(Value):
-    """Back-offs of `design_lmi` that are tried in turn, each twice the one before.
+    """Distances from the optimum that `design_lmi` tries in turn, each twice the one before.
 
-    Next to the optimum of the LMIs gains may be infinite, and the distance at which a controller
-    keeps all bounds in rounding is not known in advance. `Controller.tried` lists the back-offs.
+    The back-off is the relative distance of the minimised norm from the optimum of the linear
+    matrix inequalities (LMIs). Close to the optimum, the gains of the controller may be infinite.
+    It is not known in advance at which distance a controller keeps all bounds in spite of rounding.
+    `Controller.tried` lists the back-offs that were tried.
 
     Parameters
     ----------
     first : float
-        The first back-off, relative to the optimum.
+        The first back-off that is tried, as a fraction of the optimum.
 
     Examples
     --------
@@ -75,24 +77,26 @@ def design_lmi(
 ) -> Controller:
     """Return a controller that keeps several norms below bounds and makes one of them small.
 
-    Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. All objectives
-    share one Lyapunov matrix. This makes the problem convex, but its optimum is only an upper
-    bound: a better controller may exist. The results are computed again from the closed loop:
-    H-infinity by `hinf_norm`, H2 by Gramians, peaks by the impulse response, poles as eigenvalues.
+    Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. The problem is
+    solved by linear matrix inequalities (LMIs), in which all objectives share one Lyapunov matrix.
+    This makes the problem convex, but its optimum is only an upper bound: a better controller may
+    exist. All results are computed again from the closed loop: the H-infinity norm by `hinf_norm`,
+    the H2 norm from Gramians, peak gains from the impulse response, and poles as eigenvalues.
 
     Parameters
     ----------
     plant : StandardPlant
-        Usually weighted; at most max_states states. For a sampled plant, damping and bandwidth of a
-        PoleRegion are not convex: the poles are kept in a polygon and a disc inside the region.
+        Plant, usually weighted, with at most max_states states. For a sampled plant, the damping
+        and the bandwidth of a PoleRegion give a region that is not convex. The poles are then kept
+        in the intersection of a polygon and a disc, which lies inside this region.
     minimize : H2, Hinf or PeakGain
         Objective that is minimised, without `below`.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
         Constraints.
     back_off : float or AutoBackOff, optional
-        Relative distance of the minimised norm from its optimum, at which gains may be infinite. A
-        number is used as it is. None: ``AutoBackOff()`` tries 3 %, 6 % and so on until a controller
-        keeps all bounds.
+        Relative distance of the minimised norm from its optimum. It is needed because the gains of
+        the controller may be infinite at the optimum. A number is used as it is. None:
+        ``AutoBackOff()`` tries 3 %, 6 % and so on until a controller keeps all bounds.
     max_states : int
         Largest number of states; larger problems are refused, since the time grows with the sixth
         power.
@@ -102,20 +106,21 @@ def design_lmi(
     Returns
     -------
     Controller
-        `gamma` is the verified norm of the minimised objective, `reached` that of every objective,
-        the certificate holds the bound of the LMIs for comparison, `tried` the back-offs with the
-        norm that each reached (infinite where a bound was not kept, with the reason).
+        Controller. `gamma` is the verified norm of the minimised objective, and `reached` holds the
+        norm of every objective. The certificate holds the bound of the LMIs for comparison. `tried`
+        lists the back-offs with the norm that each reached; it is infinite, with the reason, if a
+        bound was not kept.
 
     Raises
     ------
     AssumptionError
-        When w reaches z of an H2 norm at once in a continuous plant, or u does not reach, or y does
-        not see, a mode that is not stable.
+        When the plant is continuous and has a direct feedthrough from w to z of an H2 norm. Also
+        when a mode that is not stable is not excited by u or not measured by y.
     CertificateError
         When the closed loop does not keep a bound.
     InfeasibleError
-        When a bound is too small even without the others, or the solver proves that no controller
-        keeps all of them with one Lyapunov matrix.
+        When a bound cannot be kept even if the others are ignored, or the solver proves that no
+        controller keeps all of them with one Lyapunov matrix.
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError

@@ -41,14 +41,14 @@ _APART = 1.005
 
 @dataclass(frozen=True, eq=False, repr=False)
 class H2(MeasuredObjective):
-    """The H2 norm from w to z: the rms of z for white w of unit intensity.
+    """The H2 norm from w to z: the rms of z for white noise w of unit intensity.
 
     Parameters
     ----------
     w, z : sequences of str, optional
         Channels; by default all.
     below : float, optional
-        Bound on the norm; none for the norm that is minimised.
+        Upper bound on the norm. It is not given for the norm that is minimised.
 
     Examples
     --------
@@ -96,17 +96,18 @@ class Hinf(MeasuredObjective):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PeakGain(MeasuredObjective):
-    """The largest amplitude of z for w of amplitude one: peak to peak.
+    """The peak-to-peak gain: the largest amplitude of z for w of amplitude one.
 
-    The LMI bounds the length of z for w of length one (the star norm). The result is verified by
-    the integral (sampled: the sum) of the absolute impulse response of each channel, which is its
-    exact gain.
+    The linear matrix inequality bounds the Euclidean length of the vector z at all times, for a
+    vector w whose length is at most one (the star norm). The result is verified by the integral of
+    the absolute impulse response of each channel (for a sampled plant by the sum), which is the
+    exact peak-to-peak gain of the channel.
 
     Parameters
     ----------
     w, z, below : as for `H2`
     decay : float [rad/s], optional
-        Assumed rate at which the reachable set shrinks; by default several are tried.
+        Decay rate in the linear matrix inequality. By default several values are tried.
 
     Examples
     --------
@@ -137,10 +138,11 @@ class PoleRegion(Value):
         Least decay rate: real parts are below -decay, or magnitudes below e^(-decay dt) for a
         sampled plant.
     damping : float, optional
-        Smallest damping ratio; for a sampled pole z that of ``log(z) / dt``.
+        Smallest damping ratio of the poles. For a sampled plant it is the damping ratio of ``s =
+        log(z) / dt`` with the pole z.
     bandwidth : float [Hz], optional
-        Largest magnitude of s over 2 pi, which excludes poles that are too fast for the sampling;
-        below half the rate of a sampled plant.
+        Largest magnitude of the poles s, divided by 2 pi. It excludes poles that are too fast for
+        the sampling of the controller. For a sampled plant it must be below half the rate.
 
     Examples
     --------

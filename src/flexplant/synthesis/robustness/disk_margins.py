@@ -30,19 +30,22 @@ _ROUNDS = 6
 class DiskMargin(Value):
     """The largest complex change of the gain at which a loop is guaranteed to stay stable.
 
-    Every loop gain is multiplied by ``f = (2 + (1 - sigma) d) / (2 - (1 + sigma) d)``; the loop
-    stays stable for all complex ``|d| < alpha``, with ``alpha = 1 / max |S + (sigma - 1) / 2|``.
+    The loop gain is multiplied by the complex factor ``f = (2 + (1 - sigma) d) / (2 - (1 + sigma)
+    d)``. The closed loop stays stable for all complex numbers d with ``|d| < alpha``. For one loop,
+    ``alpha = 1 / max |S + (sigma - 1) / 2|``, where S is the sensitivity and sigma is the skew.
 
     Parameters
     ----------
     kind : {"S-T", "S", "T"}
-        Skew sigma of 0, 1 or -1: factors as large as their reciprocals, changes of 1 / L (whose
-        alpha is the modulus margin), and changes of L relative to itself.
+        Kind of change. "S-T" is a skew sigma of 0: the gain may rise and fall by the same factor.
+        "S" is a skew of 1: a relative change of 1 / L, where L is the loop gain; its alpha is the
+        modulus margin. "T" is a skew of -1: a relative change of L.
     alpha : float
         Guaranteed size: no smaller change makes the loop unstable.
     reached : float
-        Size of a change that makes the loop unstable. It equals alpha for one loop; for several
-        loops together it is the other bound of mu.
+        Size of a change d that makes the loop unstable. It equals alpha for one loop. For several
+        loops together it follows from the lower bound of the structured singular value mu, and may
+        be larger than alpha.
     freq : float [Hz]
         Frequency at which the loop is closest to the critical point.
 
@@ -92,10 +95,11 @@ class MarginTable(Value):
     loops : tuple of LoopMargins
         Classical margins, one loop at a time: all crossovers, gain, phase and delay.
     disks : tuple of tuples of DiskMargin
-        For each loop the disks S-T, S and T.
+        Disk margins of each loop, for the kinds S-T, S and T.
     together : tuple of DiskMargin
-        The same three disks where all loops change at once, each by a separate complex factor:
-        bounds of the structured singular value. One loop has the same disks here.
+        Disk margins of the same three kinds if all loops change at once, each by a separate complex
+        factor. They are computed from bounds of the structured singular value. For a single loop
+        they equal those of `disks`.
     """
 
     loops: tuple[LoopMargins, ...]

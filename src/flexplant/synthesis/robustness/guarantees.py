@@ -49,11 +49,14 @@ class RobustStability(Value):
     Parameters
     ----------
     upper : float
-        mu: every machine with Deltas smaller than ``1 / upper`` is stable; below 1, all machines
-        of the uncertainty are. Values below 0.05 are not resolved.
+        Upper bound of the structured singular value mu. A Delta is an uncertainty that is scaled to
+        size 1. Every machine whose Deltas are smaller than ``1 / upper`` is stable. If `upper` is
+        below 1, all machines of the uncertainty are stable. Values below 0.05 are not computed more
+        exactly.
     lower : float
-        A machine with Deltas of ``1 / lower`` is not stable; 0 if none was found, or if the search
-        was not needed because all machines of the uncertainty are stable.
+        Lower bound of mu: a machine with Deltas of size ``1 / lower`` is not stable. It is 0 if no
+        such machine was found, or if none was searched for because all machines of the uncertainty
+        are stable.
     freq : float [Hz]
         Frequency at which mu is largest; NaN if mu is not resolved.
     values : mapping {str: float}
@@ -64,9 +67,11 @@ class RobustStability(Value):
     frequencies, bounds : (k,) arrays [Hz, 1]
         Upper bounds at single frequencies; only those near the largest are tight.
     certificate : Certificate
-        Stability of the least stable of the machines that were drawn and closed exactly; distance
-        of sampled channels from sampled machines; number of intervals between frequencies that were
-        proven by Hamiltonian matrices (0 above 260 states: sampled instead); check with truncated
+        Checks of the result. It holds the stability of the least stable machine among those drawn
+        at random, whose loops are computed exactly. For a sampled plant it holds the distance
+        between the channels of the Deltas and exactly sampled machines. It also holds the number of
+        frequency intervals that were proven by Hamiltonian matrices (0 for more than 260 states,
+        where the intervals are covered by sampling instead), and the check with the truncated
         modes.
     left_out : SpillOver, optional
         Stability and margins of the nominal loop on the plant with the truncated modes, where these
@@ -121,10 +126,13 @@ def robust_stability(
 ) -> RobustStability:
     """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
 
-    Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
-    block; unmodelled dynamics and the blocks of `uncertain_system` keep their kind. The bound also
-    holds between grid points; a sampled loop is examined with its sampling and delay. The result is
-    checked on machines drawn from the uncertainty, each closed exactly.
+    The structured singular value mu is one over the size of the smallest Deltas that make the loop
+    unstable, where a Delta is an uncertainty that is scaled to size 1. Deltas of frequencies,
+    damping and parameters are real numbers. All neglected modes together are one full complex
+    block. Unmodelled dynamics and the blocks of `uncertain_system` keep their kind. The bound holds
+    at all frequencies, also between grid points. A sampled loop is examined with its sampling and
+    delay. The result is checked on machines that are drawn from the uncertainty, and the loop of
+    each is computed exactly.
 
     Parameters
     ----------
@@ -134,9 +142,10 @@ def robust_stability(
     *blocks : StateSpace, or values with a `system`
         Controller, as for `close_loop`.
     quick : bool
-        If all Deltas are frequencies, first compute a simpler bound: one channel for each mode, to
-        first order, on a grid through the resonances (below a second for twenty modes, whose full
-        search takes ten). If it is below 1, it is the result; otherwise the full search follows.
+        Whether to compute a simpler bound first, if all Deltas are frequencies. It uses one channel
+        for each mode, is valid to first order in the changes, and is computed on a frequency grid
+        through the resonances. For twenty modes it takes less than a second, while the full search
+        takes ten. If it is below 1, it is the result. Otherwise the full search follows.
     machines : int
         Number of machines drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
@@ -154,10 +163,10 @@ def robust_stability(
     AssumptionError
         When the nominal loop is not stable.
     CertificateError
-        When a machine is unstable although stability was proven, or sampled machines are not affine
-        enough in their Deltas.
+        When a machine is unstable although stability was proven, or when sampled machines depend on
+        their Deltas in a way that is too far from linear.
     SolverError
-        When intervals do not cover the frequency axis.
+        When the proven intervals do not cover all frequencies.
 
     References
     ----------
@@ -350,15 +359,18 @@ def worst_case_gain(
 ) -> WorstCaseGain:
     """Return bounds on the largest gain from w to z over an uncertainty, and the worst machine.
 
-    The upper bound is skewed mu: ``|Delta| <= 1`` is fixed and the performance block grows, on
-    intervals that cover all frequencies. The lower bound is the gain of a machine that a search
-    found, closed exactly, with the sampling and delay of the plant.
+    The upper bound is a skewed structured singular value: the size of the Deltas is fixed to
+    ``|Delta| <= 1``, and only the block from z to w that represents the gain is scaled. It is
+    computed on frequency intervals that cover all frequencies. The lower bound is the gain of a
+    machine that a search found. The loop of this machine is computed exactly, with the sampling and
+    delay of the plant.
 
     Parameters
     ----------
     uncertain, *blocks : as for `robust_stability`
     w, z : sequence of str, or mapping {name: weight}
-        Channels of the gain; weights are numbers or systems of one input and output.
+        Channels between which the gain is computed, with weights if wanted. A weight is a number or
+        a system with one input and one output.
     rng : int, SeedSequence, Generator or None
         Random generator of the search, or its seed.
     progress : as for `robust_stability`, optional

@@ -53,7 +53,7 @@ Heights = Callable[[float, float], FloatArray]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MuBounds(Value):
-    """Bounds of the structured singular value, and the perturbation that shows the lower one.
+    """Bounds of the structured singular value mu, and the perturbation of the lower bound.
 
     Parameters
     ----------
@@ -61,14 +61,15 @@ class MuBounds(Value):
         Upper bound: no Delta of the structure smaller than 1 / upper makes ``I - M Delta``
         singular, at any frequency.
     lower : float
-        Lower bound: the perturbation of size 1 / lower makes it singular; 0 when none was found.
+        Lower bound: the Delta in `perturbation`, of size 1 / lower, makes ``I - M Delta`` singular.
+        It is 0 if no such Delta was found.
     freq : float [Hz]
         Frequency where the upper bound is largest; NaN for a matrix.
     perturbation : (w, z) complex array
         Perturbation of size 1 / lower, at the frequency where it acts; zero when none was found.
     frequencies, bounds : (k,) arrays [Hz, 1]
-        Upper bounds that were computed at single frequencies; where they are not near the largest
-        they need not be the smallest.
+        Upper bounds at single frequencies. Only those near the largest one are tight; the search
+        does not lower the others further.
     intervals : int
         Number of intervals that cover the frequency axis; 0 for a matrix.
     """
@@ -88,24 +89,25 @@ class MuBounds(Value):
 
 @one_thread()
 def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> MuBounds:
-    """Return bounds of the structured singular value: 1 / min |Delta| with I - M Delta singular.
+    """Return an upper and a lower bound of the structured singular value mu (as ``mussv``).
 
     ::
 
         mu(M) = 1 / min { |Delta| : det(I - M Delta) = 0 },   Delta = diag(delta_1 I, ..., Delta_F)
 
-    The upper bound uses scalings D and G: ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system
-    they are valid on intervals whose ends are eigenvalues of a Hamiltonian matrix. The intervals
-    cover all frequencies, so that no peak is missed. The lower bound uses power iterations with
-    random restarts; for a system it is verified by the eigenvalues of the closed loop with the
-    perturbation.
+    The size of Delta is its largest singular value. The upper bound uses scaling matrices D and G
+    that satisfy ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system, each pair of scalings is
+    proven for an interval of frequencies; the ends of the interval follow from the eigenvalues of a
+    Hamiltonian matrix. The intervals cover all frequencies, so that no peak is missed. The lower
+    bound uses power iterations with random restarts. For a system it is verified by the eigenvalues
+    of the closed loop with the perturbation.
 
     Parameters
     ----------
     M : (z, w) array or StateSpace
         Complex matrix; or a stable system, continuous or sampled.
     blocks : sequence of RepeatedScalar and FullBlock
-        ``w = Delta z`` in the order of the channels.
+        Blocks of Delta, ``w = Delta z``, in the order of the channels of M.
     rng : int, SeedSequence, Generator or None
         Random generator of the restarts, or its seed.
 
@@ -118,7 +120,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     AssumptionError
         When the system is not stable.
     ShapeError, ModelError
-        When the blocks do not fill M, or M is neither a matrix nor a system.
+        When the sizes of the blocks do not match M, or M is neither a matrix nor a system.
     SolverError
         When intervals do not cover the frequency axis.
 

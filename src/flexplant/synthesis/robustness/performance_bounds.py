@@ -34,8 +34,9 @@ def robust_performance(
 ) -> MuBounds:
     """Return mu of robust performance: how far uncertainty and weighted gain stay below one.
 
-    Below 1 every machine of the uncertainty is stable and has a weighted gain below 1; at 2, half
-    the uncertainty leaves twice the gain. It is what `design_mu` makes small.
+    If this number is below 1, every machine of the uncertainty is stable and has a weighted gain
+    below 1 from w to z. If it is 2, machines with half the uncertainty are stable and have a
+    weighted gain of at most 2. `design_mu` minimises this number.
 
     Parameters
     ----------

@@ -19,14 +19,14 @@ from ...store import Value
 
 @dataclass(frozen=True, eq=False)
 class BlockStructure(Uncertainty):
-    """The uncertainty of a system M whose channels are connected to blocks Delta.
+    """The uncertainty of a system M with blocks Delta; made by `uncertain_system`.
 
     Parameters
     ----------
     system : StateSpace
-        M: ``[z_Delta; z; y] = M [w_Delta; w; u]``.
+        System M of the equation ``[z_Delta; z; y] = M [w_Delta; w; u]``.
     structure : sequence of RepeatedScalar and FullBlock
-        ``w_Delta = Delta z_Delta``, in the order of the channels.
+        Blocks of ``w_Delta = Delta z_Delta``, in the order of the channels.
     """
 
     system: StateSpace
@@ -37,7 +37,7 @@ class BlockStructure(Uncertainty):
         return self.structure
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return M, or its bilinear image, with the channels that a system of the plant has."""
+        """Return M, or its continuous bilinear equivalent, with the channels of a given system."""
         M = self.system
         if plant.dt != M.dt or system.n_states != M.n_states:
             raise ModelError(
@@ -64,9 +64,11 @@ def uncertain_system(
               z <---|  M  |<--- w
               y <---|     |<--- u
 
-    The result is an input of `robust_stability`, `worst_case_gain`, `robust_performance` and
-    `design_mu`; ``.lft(values)`` closes some Deltas, ``.machines.drawn(count)`` draws systems.
-    Without u and y it is a loop that is closed already: ``robust_stability(uncertain)``.
+    A Delta is an unknown number or matrix of size at most 1. The result can be passed to
+    `robust_stability`, `worst_case_gain`, `robust_performance` and `design_mu`. Its method
+    ``.lft(values)`` inserts values of some Deltas, and ``.machines.drawn(count)`` draws systems at
+    random. If u and y are not given, M is a loop that is already closed, and no controller is
+    needed: ``robust_stability(uncertain)``.
 
     Parameters
     ----------
@@ -85,9 +87,10 @@ def uncertain_system(
     Raises
     ------
     ModelError, ShapeError
-        When blocks are not a list of blocks, or do not fit the channels of M.
+        When `blocks` is not a list of blocks, or the sizes of the blocks do not match the channels
+        of M.
     LabelError
-        When u or y are not channels of M, or are channels of Deltas.
+        When u or y contain names that are not channels of M, or that are channels of Deltas.
 
     References
     ----------

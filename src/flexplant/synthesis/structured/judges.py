@@ -236,15 +236,16 @@ _CLOSE = 1e-7
 
 
 class Judge(Protocol):
-    """A number of a stable loop that is minimised, as a logarithm with its gradient.
+    """One number of a stable loop, such as a norm, that `design_structured` minimises.
 
-    The controllers that it receives are in the user's units. The prepared problem p of an objective
-    is scaled: one unit of its time is ``1 / p.speed`` seconds. A judge that works on the matrices
-    of p therefore has to convert its number back into the user's units.
+    The search minimises the logarithm of this number and uses its gradient. The controllers that it
+    receives are in the user's units. The prepared problem p of an objective is scaled: one unit of
+    its time is ``1 / p.speed`` seconds. A judge that works on the matrices of p therefore has to
+    convert its number back into the user's units.
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
-        """Return the number (infinite for an unstable loop), and the place where it is reached."""
+        """Return the number, infinite for an unstable loop, and the place where it is reached."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
         """Return logarithms of functions near the number, including the one at the place."""

@@ -23,7 +23,7 @@ from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredObjective(Value):
-    """The base class for objectives of your own: a positive number that a closed loop gives.
+    """Base class for your own objectives: each is a positive number of a closed loop.
 
     A new objective defines the method `measured`: a smooth function of the closed loop from w to z,
     in seconds and in the units of the channels. It returns infinity for a stable loop that is not

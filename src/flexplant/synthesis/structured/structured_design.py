@@ -64,33 +64,35 @@ def design_structured(
     evaluations: int = 10_000,
     progress: bool | None = None,
 ) -> Controller:
-    """Return the controller of a structure with the least norm found from w to z.
+    """Return the controller of a given structure with the smallest norm found from w to z.
 
-    From several starts, first the spectral abscissa of the closed loop is lowered until the loop is
-    stable, then the largest norm over all plants (for several objectives, each in multiples of its
-    `below`). At a minimum of the H-infinity norm several peaks are equally high: each step takes
-    the gains at all high frequencies together, with their gradients (``d|T| = Re u* dT v``, u and v
-    the singular vectors there) and second derivatives. The best ends are continued. The problem is
-    not convex: another start may do better.
+    The search begins at several starts. From each start, the largest real part of the closed-loop
+    poles is lowered first, until the loop is stable. Then the largest norm over all plants is
+    lowered; if there are several objectives, each norm is divided by its `below`. At a minimum of
+    the H-infinity norm, several peaks of the gain are often equally high. Each step therefore uses
+    the gains at all high peaks together, with their gradients (``d|T| = Re u* dT v``, where u and v
+    are the singular vectors) and second derivatives. The searches with the best results are
+    continued. The problem is not convex, so that another start may give a smaller norm.
 
     Parameters
     ----------
     plant : StandardPlant, sequence of StandardPlant, or mapping {position: StandardPlant}
-        Continuous or sampled; one controller for several plants with the same u, y and rate; plants
-        by position are also checked half way between positions (interpolated linearly). A labelled
-        StateSpace is accepted.
+        Plant, continuous or sampled. If several plants are given, one controller is designed for
+        all of them; they must have the same u, y and rate. For a mapping by position, the loop is
+        also checked half way between positions, on plants that are interpolated linearly. A
+        labelled StateSpace is accepted.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
         Structure of the controller, and start of the search.
     objective : Hinf, H2, PeakGain, MeasuredObjective, or sequence of these
-        Objective to be minimised; of several objectives, each with `below`, the largest ratio to
-        it. Your own objective derives from `synthesis.MeasuredObjective`. The H2 norm of a
-        continuous plant with D12 and D21 is finite only without a feedthrough of the controller:
-        ``FixedOrder(n, direct=False)``.
+        Objective to be minimised. If several objectives are given, each must have its bound
+        `below`, and the largest ratio of an objective to its bound is minimised. Your own objective
+        derives from `synthesis.MeasuredObjective`. The H2 norm of a continuous plant with D12 and
+        D21 is finite only without a feedthrough of the controller: ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
-        Channels of the controller, for a StateSpace.
+        For a StateSpace: inputs that the controller drives, and outputs that it reads.
     starts : int
-        Number of starts. The first is that of the structure; the others are drawn around it and
-        around the best result.
+        Number of starts. The first start is given by the structure. The others are drawn at random
+        around it and around the best result.
     rng : int, SeedSequence or Generator
         Random generator of the starts, or its seed.
     evaluations : int
@@ -114,7 +116,7 @@ def design_structured(
     Raises
     ------
     AssumptionError
-        When u does not reach, or y does not see, a mode that is not stable.
+        When u does not excite, or y does not measure, a mode that is not stable.
     InfeasibleError
         When no start is stabilised; the message has the frequency of the pole that remains
         unstable.
@@ -122,7 +124,7 @@ def design_structured(
         When the norm of a loop differs from that of the search, or the loop is unstable between
         positions.
     ModelError, ShapeError, LabelError
-        When plants and structure do not fit.
+        When the channels of plants and structure do not match.
 
     Warns
     -----

@@ -89,10 +89,11 @@ class ControllerStructure(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FixedOrder(Value):
-    """A controller of given order, all entries of A, B, C and (unless left out) D free.
+    """A controller of given order, with all entries of A, B, C and (optionally) D free.
 
-    The search starts from the reduced controller of full order, and from the best controller of
-    each lower order with one state added.
+    One start of the search is the controller of full order, reduced to this order. Another start is
+    built up from the lowest order: the best controller of each order is found, and one state is
+    added to it for the next order.
 
     Parameters
     ----------
@@ -104,7 +105,8 @@ class FixedOrder(Value):
         Controller y -> u of this order with which the search begins, for example of an earlier
         design.
     direct : bool
-        Whether D is free; otherwise D is zero and the controller rolls off.
+        Whether D is free. Otherwise D is zero, so that the gain of the controller falls at high
+        frequency.
 
     Examples
     --------
@@ -238,9 +240,10 @@ def as_system(K: Matrices, names: tuple[Sequence[str], Sequence[str]], dt: float
 class ObserverGains(Value):
     """An observer of the plant's states with state feedback: the gains L and F are free.
 
-    ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, with the A, B2, C2 of the (weighted)
-    plant; the first gains are those of LQG. A sampled plant's observer is that of its bilinear
-    equivalent.
+    ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, where B2 is the input matrix of u, C2
+    the output matrix of y, and D22 the feedthrough from u to y, all of the plant with its weights.
+    The search starts with the gains of LQG. For a sampled plant, the observer is that of its
+    continuous equivalent by the bilinear transformation.
 
     Examples
     --------
@@ -288,9 +291,10 @@ class Parametrised:
         Function of an (n,) array that returns a StateSpace y -> u, always of the same order,
         sampled like the plant, and smooth in the parameters.
     start : (n,) array
-        Parameters at which the search begins; steps are multiples of each entry (of 1 if it is 0).
+        Parameters at which the search begins. Each parameter is scaled by the magnitude of its
+        start, or by 1 if its start is 0.
     spread : float
-        Relative size of the differences between starts.
+        Relative size of the random differences between the starts of the search.
 
     Examples
     --------
