@@ -37,7 +37,8 @@ class Exchange(Search):
     starts : int
         Number of starts: one is greedy, the others are random. If the criterion has a convex
         relaxation, one more start chooses the candidates with the largest weights in the relaxed
-        problem.
+        problem. In the relaxed problem each candidate has a weight between 0 and 1 instead of
+        being chosen or not.
 
     Examples
     --------
@@ -266,9 +267,12 @@ class BranchAndBound(Search):
 
     Notes
     -----
-    The relaxation of the criterion must be convex. This holds for `ModeInformation`, for log det of
-    Gramians, and, if no sensor or actuator has its own filter or delay, for `PoiVariance` of the
-    plant's own modes (sum), `PoiLqr` and `ClosedLoopH2` of sensors only or actuators only.
+    In the relaxation each candidate has a weight between 0 and 1 instead of being chosen or not.
+    The relaxed criterion must be a convex function of the weights. This holds for `ModeInformation`
+    and for `ModalObservability` and `ModalControllability` with the measure "log det". If no sensor
+    or actuator has its own filter or delay, it also holds for three other criteria. These are
+    `PoiVariance` of the plant's own modes with the measure "sum", `PoiLqr`, and `ClosedLoopH2` when
+    only sensors or only actuators are chosen.
 
     Examples
     --------

@@ -87,16 +87,19 @@ def confirmed(cost: float, found: float) -> float:
 class PoiLqr(MotionAndEffort):
     """Smallest mean square of POI motion and effort by state feedback (LQR): for actuators.
 
-    ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state
-    feedbacks, with the plant's disturbances and delay of u. More actuators never make it larger.
+    The cost is ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state feedbacks,
+    where z_a is a POI motion, f_a its factor and u the vector of actuator forces. E is the expected
+    value for the plant's disturbances. The delay of u is included. More actuators never increase
+    the cost. A POI (point of interest) is a point whose motion matters.
 
     Parameters
     ----------
     poi : str, sequence of str or mapping {name: factor}, optional
-        The POIs; not needed when the plant has one only.
+        Names of the POIs, with factors if they differ. By default all POIs whose first axis has the
+        same unit as the first axis of the first POI.
     axes : str, sequence of str or mapping {axis: factor}, optional
-        Axes of each of them; all when not given, a rotation with the factor 1 m.
-        Together they must see every rigid-body mode.
+        Axes of each POI; by default all of them. A rotation without a factor is multiplied by 1 m.
+        Together the axes must observe every rigid-body mode.
     effort : float [m/N]
         Weight of the actuator forces: POI motion that costs as much as a force of 1 N. With a small
         value the disturbance is rejected as well as the structure and the delay allow.
@@ -130,9 +133,10 @@ class PoiLqr(MotionAndEffort):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the actuators alone; all else is computed once.
 
-        A delay of d whole samples leaves what happens meanwhile to no controller: it is a constant,
-        ``sum_{i<d} |C1 A^i W|^2``, and the rest acts on the state predicted d samples ahead. Only a
-        fraction of a sample adds a state per actuator.
+        With a delay of d whole samples, no controller can influence the motion during these
+        samples. Their cost is the constant ``sum_{i<d} |C1 A^i W|^2``. The control acts on the
+        state that is predicted d samples ahead. Only a fractional delay adds a state for each
+        actuator.
         """
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)

@@ -147,7 +147,7 @@ class LinearRows:
 
 
 class Constraint(Value):
-    """The base of all constraints: a new one defines `rows`.
+    """The base class of all constraints; a new constraint defines `rows`.
 
     Examples
     --------
@@ -158,7 +158,7 @@ class Constraint(Value):
 
     @abstractmethod
     def rows(self, places: Places) -> LinearRows:
-        """Return linear rows in x, which is 1 for chosen candidates and 0 for others."""
+        """Return linear inequalities in x, which is 1 for chosen candidates and 0 for others."""
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
         """Return zones without candidates, seen from above, for pictures."""
@@ -175,7 +175,7 @@ def check_limits(low: int | None, high: int | None) -> None:
 
 @dataclass(frozen=True, eq=False)
 class JointGroups(Constraint):
-    """Groups of candidates of which all or none are chosen: symmetric sets, multi-axis units.
+    """Groups of candidates that are chosen together or not at all, such as multi-axis units.
 
     Parameters
     ----------
@@ -255,11 +255,11 @@ class Budget(Constraint):
     Parameters
     ----------
     total : float
-        What they may cost.
+        Largest total cost of a choice, in the unit of `costs`.
     costs : mapping {str: float}, optional
         Cost of candidates by name.
     default : float
-        Cost of the others.
+        Cost of each candidate that `costs` does not name.
 
     Examples
     --------
@@ -282,7 +282,7 @@ class Budget(Constraint):
         self._set(costs={str(n): positive(cost, f"cost of {n!r}", zero=True) for n, cost in given})
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the sum of costs, at most the total."""
+        """Return one linear inequality: the sum of costs is at most the total."""
         places.index(list(self.costs), "candidate with a cost")
         costs = np.array([self.costs.get(name, self.default) for name in places.names])
         return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))
@@ -303,12 +303,12 @@ def _checked_zones(given: Any, name: str) -> tuple[Zone, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Excluded(Constraint):
-    """Zones in which no candidate is chosen, seen from above.
+    """Zones of the x-y plane (the plate seen from above) in which no candidate is chosen.
 
     Parameters
     ----------
     zones : Rectangle, Disc or sequence of them
-        At least one.
+        Excluded zones, at least one.
 
     Examples
     --------
@@ -323,7 +323,7 @@ class Excluded(Constraint):
     zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="an excluded zone"))
 
     def rows(self, places: Places) -> LinearRows:
-        """Return x_i <= 0 inside."""
+        """Return ``x_i <= 0`` for each candidate inside, with x_i = 1 for a chosen candidate."""
         return LinearRows.closed(places.inside(_zone_list(self.zones)) > 0)
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
@@ -333,7 +333,7 @@ class Excluded(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class OffPoi(Constraint):
-    """No candidate on a POI: what is there cannot be measured.
+    """Excludes candidates on a POI (point of interest), where motion cannot be measured.
 
     Sensors are never placed at a POI, except those that the plant already has there. A radius
     excludes the whole die; a negative radius allows all places. A relative POI such as
@@ -344,7 +344,8 @@ class OffPoi(Constraint):
     Parameters
     ----------
     radius : float [m]
-        Candidates with a point no farther from any POI are excluded.
+        Largest distance from a POI at which a candidate is excluded. A candidate with several
+        points is excluded if any of them is within this distance.
 
     Examples
     --------
@@ -359,7 +360,7 @@ class OffPoi(Constraint):
     radius: float = field(default=0.0, metadata=checked(number))
 
     def rows(self, places: Places) -> LinearRows:
-        """Return x_i <= 0 near a POI."""
+        """Return ``x_i <= 0`` for each candidate near a POI, with x_i = 1 for a chosen one."""
         if self.radius < 0 or not places.pois:
             return LinearRows.closed(np.zeros(places.total, dtype=bool))
         near = places.from_pois() <= self.radius + places.same
@@ -376,14 +377,17 @@ class OffPoi(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class ZoneLimits(Constraint):
-    """Limits on how many chosen candidates lie in zones, seen from above; by default all do.
+    """Limits on the number of chosen candidates in zones of the x-y plane.
+
+    Without limits, all chosen candidates must lie in the zones.
 
     Parameters
     ----------
     zones : Rectangle, Disc or sequence of them
-        At least one; their union counts.
+        Zones, at least one. A candidate in any of them counts once.
     at_least, at_most : int, optional
-        How many. A candidate is inside when any of its points is.
+        Least and largest number of chosen candidates inside. A candidate is inside if any of its
+        points is inside.
 
     Examples
     --------
@@ -403,7 +407,7 @@ class ZoneLimits(Constraint):
         check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the limits on the number inside, or x_i <= 0 outside."""
+        """Return the limits on the number inside, or ``x_i <= 0`` for candidates outside."""
         inside = places.inside(_zone_list(self.zones))
         if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)

@@ -19,9 +19,10 @@ from .candidates import Port, Side, sides_of, with_side
 
 
 class Scorer:
-    """The scores of choices among fixed candidates; choices are rows of indices, ascending.
+    """The scores of choices among fixed candidates.
 
-    A kind of scorer defines `value`, or `score` for several choices at once, or both.
+    A choice is a row of ascending indices of candidates. A subclass defines `value` for one choice,
+    or `score` for several choices at once, or both.
 
     Examples
     --------
@@ -33,11 +34,11 @@ class Scorer:
     """
 
     def value(self, chosen: Sequence[int]) -> Any:
-        """Return the score of one choice, smaller is better; FlexplantError when it has none."""
+        """Return the score of one choice, smaller is better; FlexplantError if none exists."""
         return float(self.score([chosen])[0])
 
     def outcome(self, chosen: Sequence[int]) -> tuple[float, str]:
-        """Return the score of one choice, infinite with the reason when it has none."""
+        """Return the score of one choice, or infinity and the reason if it has no score."""
         try:
             found = self.value(chosen)
         except FlexplantError as error:
@@ -138,19 +139,20 @@ class Criterion(Value):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return an object that scores many choices; common results are computed once.
 
-        The plant is sampled and assembled from a structure, the candidates are sensors, actuators
-        or both.
+        The plant is sampled and was assembled from a structure. The candidates are sensors,
+        actuators or both.
         """
         return OnPlant(plant, sides_of(candidates), tuple(candidates), self)
 
     def unit(self, plant: StandardPlant) -> str:
-        """Return the unit of the root of a value that is a mean square of a motion; else ""."""
+        """Return the unit of the square root of a mean square of a motion; else ""."""
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
         """Return the interval of the ratio of the error to that of another plant, over machines.
 
-        It is empty where the plant's machines are not known, or the criterion has no such root.
+        The text is empty if the plant has no sampled machines, or if the value of the criterion is
+        not a mean square.
         """
         return ""
 

@@ -185,11 +185,13 @@ def noise_sizes(ports: Sequence[Any]) -> FloatArray:
 class ModalGramian(Criterion):
     """Minus a measure of a Gramian of the elastic modes; the base of one for each side.
 
-    In continuous time, in states whose square is twice the energy of a mode, every entry of
-    ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)`` for the eigenvectors: modes of one
-    frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
-    whose Gramian is infinite, are left out; filters and delays do not count. It is the sum of the
-    Gramians of single devices. Of a POI it says next to nothing, as `ModeInformation`.
+    The Gramian is that of the plant in continuous time. The states are scaled so that the sum of
+    their squares is twice the energy of a mode. In coordinates of the eigenvectors its entries are
+    ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)``. All entries are used, not only the
+    diagonal ones: two modes of equal frequency that a device cannot distinguish count as one mode.
+    Rigid-body modes are left out, because their Gramian is infinite. Filters and delays are
+    ignored. The Gramian of several devices is the sum of their separate Gramians. It tells
+    hardly anything about the motion of a POI (point of interest), as `ModeInformation`.
     """
 
     scale: ClassVar[float] = 1.0
@@ -255,9 +257,10 @@ class ModalObservability(ModalGramian):
 
 @dataclass(frozen=True, eq=False)
 class ModalControllability(ModalGramian):
-    """Minus a measure of the controllability Gramian of the elastic modes, which actuators move.
+    """Negative measure of the controllability Gramian of the elastic modes, for actuators.
 
-    See `ModalGramian`. One row per actuator: what a newton (newton metre) of it does.
+    It is negative because criteria are minimised. The input of each actuator is a force in N or a
+    torque in N m. `ModalGramian` defines the Gramian.
 
     Parameters
     ----------

@@ -87,12 +87,17 @@ class ModeRows(LogDetOfSum):
 class ModeInformation(ByShapes):
     """Minus log det of the Fisher information of mode amplitudes, ``sum_i phi_i phi_i' / asd_i^2``.
 
-    Finds choices that distinguish the mode shapes best, from one snapshot of the sensors, without
-    dynamics and disturbances. `RowSelection` searches for it by effective independence or pivoted
-    QR, and it has a bound. With fewer sensors than modes there is no information on all of them. It
-    hardly tells how well a POI is known: rankings of layouts by classical criteria (this one,
-    Gramians, indices, energy, MAC) had a Spearman correlation of -0.45 to 0.56 with that by the
-    exact variance, on plates. Where the POI matters, use `PoiVariance`.
+    phi_i is the row of mode shapes at sensor i, and asd_i is the noise density of this sensor. The
+    criterion finds choices that distinguish the mode shapes best. It assumes that the amplitudes of
+    the modes are estimated from one sample of all sensors, and ignores dynamics and disturbances.
+    `RowSelection` is a search for this criterion, by effective independence or pivoted QR. A lower
+    bound of the criterion is known. With fewer sensors than modes, the amplitudes of all modes
+    cannot be estimated.
+
+    The criterion hardly tells how accurately the motion of a POI (point of interest) is estimated.
+    In trials on plates, layouts were ranked by classical criteria (this one, Gramians, indices,
+    energy, MAC) and by the exact variance at the POI. The Spearman rank correlation of the two
+    rankings was between -0.45 and 0.56. Where the POI matters, use `PoiVariance`.
 
     Parameters
     ----------
@@ -134,8 +139,8 @@ class RowSelection(Search):
         candidate i with the least ``E_i = phi_i' F^-1 phi_i``, where ``F = sum phi_i phi_i'`` is
         the information on the modes and phi_i the row of the candidate. Removing a candidate
         multiplies the determinant of F by ``1 - E_i``. `PivotedQr` and `Greedy` add one candidate
-        after the other. As soon as there are as many as modes, they start again with the remaining
-        candidates.
+        after the other. When the number of chosen candidates reaches the number of modes, they
+        start again with the remaining candidates.
     driving_point : bool
         Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
         that places that move little are left out first (EfI-DPR).

@@ -165,28 +165,35 @@ Lag: TypeAlias = Predictor | Filter | FixedLag
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoiVariance(Criterion):
-    """Variance of the stationary Kalman estimate's error at POIs: for sensors, smaller is better.
+    """Variance of the error of the stationary Kalman estimate at POIs, for sensors.
 
-    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, or the largest of these terms, P after the
-    measurement, at sample instants: the square of `design_kalman(plant).rms(...)`. Of the plant's
-    own modes more sensors never make it larger, a score is one Riccati equation, and searches have
-    a bound. With truncated modes it is the error on the plant with these modes: each choice is a
-    separate filter, without a bound.
+    A POI is a point of interest, whose motion is estimated. The value is the sum
+    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, or the largest of these terms. f_a is the factor
+    of an axis, C1_a its row of the output matrix, and P the error covariance after the measurement,
+    at the sample instants. The square root of the value is `design_kalman(plant).rms(...)`.
+
+    If only the plant's own modes count, additional sensors never increase the value, each score
+    takes one Riccati equation, and searches have a lower bound. If the plant has an evaluation
+    model with truncated modes, the value is the error on the plant with these modes. Then a filter
+    is computed for each choice, and no lower bound is known.
 
     Parameters
     ----------
     poi : str, sequence of str or mapping {name: factor}, optional
-        The POIs; when not given all whose first axis has the unit of the first one's.
+        Names of the POIs, with factors if they differ. By default all POIs whose first axis has the
+        same unit as the first axis of the first POI.
     axes : str, sequence of str or mapping {axis: factor}, optional
-        Axes of each of them; by default its first. A rotation is turned into a
-        displacement by a factor [m], such as half the width of the die.
+        Axes of each POI, with factors if they differ; by default its first axis. A factor in m
+        turns a rotation into a displacement, for example half the width of the die.
     measure : {"sum", "max"}
         Whether the sum or the largest of the terms counts.
     lag : Predictor, Filter or FixedLag, optional
-        When the estimate is wanted: before the measurement, with it (when not given), or some
-        samples later. Of predictor and lag the plant's own modes alone are counted.
+        Time at which the estimate is made: before the measurement (Predictor), with the measurement
+        (Filter, the default), or some samples later (FixedLag). For Predictor and FixedLag only the
+        plant's own modes count.
     own_modes : bool
-        Whether the plant's own modes alone count, whatever its evaluation model is.
+        Whether only the plant's own modes count, even if the plant has an evaluation model with
+        more modes.
 
     References
     ----------
@@ -255,11 +262,11 @@ class PoiVariance(Criterion):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
 
-        Delay lines of u are left out: their states are known exactly. Where ports have filters or
-        delays every choice has its own states, and with truncated modes the noise of its sensors is
-        correlated: each choice has its own filter, on rows of the plants with all candidates. A
-        prediction is ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's motions some
-        samples ago are states as well.
+        Delay lines of u are left out, because their states are known exactly. If ports have filters
+        or delays, each choice has different states. With truncated modes, the noise of the sensors
+        of a choice is correlated. A separate filter is computed for each choice in these cases.
+        The variance of a prediction is ``rows A X+ A' rows' + rows Q rows'``. For a fixed lag, the
+        motions of the POI some samples ago are additional states.
         """
         chosen = OnPlant(plant, "y", tuple(candidates), self)
         judge = None if self._own else chosen.whole.evaluation_plant

@@ -171,20 +171,21 @@ class Placement(Value):
     Parameters
     ----------
     chosen : tuple of str
-        Names, in the order of the candidates.
+        Names of the chosen sensors or actuators, in the order of the candidates.
     value : float
         Value of the criterion.
     bound : float
-        Lower bound for every choice of the same number of candidates: the value itself when
-        the optimum is proven (by every subset, or by branch and bound); else by convex
-        relaxation, for mean squares (`PoiVariance` of the plant's own modes, `PoiLqr`,
-        `ClosedLoopH2`, what wraps them) where no port has a filter or delay, and for log
-        det; for other sums the value of all candidates together; minus infinity for a
-        callable.
+        Lower bound on the value of every choice of the same number of candidates. It is the value
+        itself if the optimum is proven, by trying every subset or by branch and bound. Otherwise it
+        follows from a convex relaxation, in which each candidate has a weight between 0 and 1. The
+        relaxation exists for log det, and, if no port has a filter or delay, for mean squares. Mean
+        squares are `PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, and criteria
+        that wrap them. For other sums the bound is the value with all candidates together. For a
+        callable it is minus infinity.
     evaluations : int
-        Choices that were scored.
+        Number of choices that were scored.
     history : tuple of tuples of float
-        The value after each improvement, for each start.
+        Values after each improvement, one tuple for each start of the search.
     criterion : str
         Name of the criterion that was minimised.
     ports : tuple of Sensor or Actuator
@@ -194,7 +195,7 @@ class Placement(Value):
     stopped : str
         Reason why the search ended early; empty if it was completed.
     unit : str
-        Unit of the square root of the value, where it is a mean square of a motion.
+        Unit of the square root of the value, if the value is a mean square of a motion.
     unjudged : str
         Remark that the value does not include truncated modes; empty where the plant has an
         evaluation model.
@@ -202,9 +203,9 @@ class Placement(Value):
         Sensors or actuators of the plant that were not among the candidates: none of them is part
         of the choice, and the value is that without them.
     interval : str
-        Ratio of the error to that with the plant's own sensors on 95 % of the plant's
-        machines, or the reason why this interval does not exist; empty where no machines
-        are known.
+        Interval that contains, for 95 % of the uncertain plant's sampled machines, the error
+        divided by the error with the plant's own sensors; or the reason why it does not exist.
+        Empty if the plant has no sampled machines.
 
     Examples
     --------
@@ -267,9 +268,9 @@ class Placement(Value):
 
     @property
     def gap(self) -> float:
-        """The part of the value by which any choice could be better; infinite without a bound.
+        """Largest fraction of the value by which a choice could be better; infinite if unknown.
 
-        Gap of a mean square: an rms could be better by about half of it.
+        If the value is a mean square, the rms could be better by about half this fraction.
         """
         if not np.isfinite(self.bound):
             return np.inf
@@ -281,7 +282,7 @@ class Placement(Value):
         return self.gap <= 1e-8  # ten times what rounding adds to a bound
 
     def on(self, plant: StandardPlant) -> StandardPlant:
-        """Return a plant of the machine with the chosen sensors (actuators, or both)."""
+        """Return the given plant with the chosen sensors (actuators, or both)."""
         return with_side(plant, self.side, self.ports)
 
 
@@ -294,11 +295,11 @@ class Problem:
     layouts : Layouts
         The candidates and the score of each set of them.
     count : int
-        How many to choose.
+        Number of candidates to choose.
     required : tuple of int
-        Indices of candidates that every choice holds.
+        Indices of candidates that every choice contains.
     rows : LinearRows
-        What every choice satisfies.
+        Linear constraints that every choice satisfies.
     """
 
     layouts: Layouts
@@ -308,12 +309,12 @@ class Problem:
 
     @property
     def total(self) -> int:
-        """How many candidates there are."""
+        """Number of candidates."""
         return len(self.layouts.candidates)
 
     @cached_property
     def units(self) -> list[tuple[int, ...]]:
-        """Candidates that may be left out, those that are chosen together as one."""
+        """Candidates that may be left out; candidates that are chosen together form one set."""
         shut = self.rows.shut(self.required)
         units = [u for u in self.rows.units() if not set(u) & set(self.required)]
         return [u for u in units if not np.any(shut[list(u)])]
@@ -325,7 +326,7 @@ class Problem:
 
     @cached_property
     def subsets(self) -> int:
-        """How many choices of units there are; some may be against other constraints."""
+        """Number of choices of `units`, including those that violate other constraints."""
         numbers = {size: len(units) for size, units in self._by_size.items()}
         return sum(prod(comb(numbers[s], n) for s, n in mix.items()) for mix in self._mixes())
 
@@ -340,7 +341,7 @@ class Problem:
 
     @property
     def root(self) -> Branch:
-        """All choices, apart from those constraints that exclude no single candidate."""
+        """All choices, where only constraints that exclude single candidates are used."""
         return Branch.containing(self.required, self.free, self.count)
 
     def bound(self) -> float:
@@ -349,14 +350,14 @@ class Problem:
         return relaxed[0] if relaxed else self.layouts.scorer.bound(self.count, self.required)
 
     def relaxed(self) -> tuple[float, FloatArray] | None:
-        """Return a lower bound and weights (N,) near the least relaxed cost, where it is convex."""
+        """Return a lower bound and weights (N,) near the minimum of a convex relaxation."""
         scorer, root = self.layouts.scorer, self.root
         if not isinstance(scorer, Convex) or self.layouts.missing(root.members.tolist()):
             return None
         return scorer.relaxation(root) if self.rows.possible(root) else None
 
     def rounded(self, weights: FloatArray) -> tuple[int, ...] | None:
-        """Return the choice with the largest weights (N,); None where it misses something."""
+        """Return the choice with the largest weights (N,); None if it is not feasible."""
         if self.rows.A.size:
             found = self.rows.best(weights, self.count, self.required)
         else:
@@ -375,8 +376,9 @@ class Problem:
     def start(self, random: np.random.Generator | None) -> tuple[int, ...]:
         """Return a choice that satisfies the constraints and sees every rigid-body mode.
 
-        By chance where there is a generator, else by relaxed weights; the nearest one when none
-        was found, and no index at all when no choice satisfies the constraints.
+        The choice is random if a generator is given; otherwise it is the same in each call.
+        If no such choice is found, the nearest one is returned. If no choice satisfies the
+        constraints, the result is empty.
         """
         if not self.rows.A.size:
             weights = None if random is None else random.uniform(0.1, 1.0, self.total)
@@ -413,8 +415,8 @@ class Problem:
     def spanning(self, weights: FloatArray | None = None) -> list[int]:
         """Return the required and those that add most to the rigid-body modes seen, one by one.
 
-        Orthogonalisation with pivoting: it reaches the highest rank that any choice of the size
-        has. Weights (N,) favour some candidates.
+        The method is orthogonalisation with pivoting, which reaches the highest rank of any choice
+        of this size. Candidates with larger weights (N,) are preferred.
         """
         chosen, shut = list(self.required), self.rows.shut(self.required)
         left = self.layouts.rigid.rows
@@ -440,7 +442,7 @@ class SearchResult:
     chosen : tuple of int
         Positions of the chosen candidates in the list of candidates, from 0.
     value, bound, evaluations, history, stopped
-        As those of a `Placement`.
+        The same as in `Placement`.
 
     Examples
     --------
@@ -473,9 +475,9 @@ class Search(Value):
         """Return the best choice that was found.
 
         A method uses `score(sets)`, `bound()`, `choices()` and `start` of the problem. It calls
-        functions through ``work.mapped`` and draws random numbers from ``work.rng``. Its result is
-        then the same to the bit on every executor, and a search that was stopped continues from
-        its checkpoint file.
+        functions through ``work.mapped`` and draws random numbers from ``work.rng``. With these two
+        rules its result is identical on every executor (pool of processes), and a search that was
+        stopped continues from its checkpoint file.
         """
 
 

@@ -109,30 +109,33 @@ def score_sensors(
 ) -> Scores:
     """Return the scores of layouts of sensors, each instead of the plant's own sensors.
 
-    Before any score the layout must see every rigid-body mode: one that does not would score best
-    by mistake. For `PoiVariance` only rows of C and R change, so that one layout takes about as
-    long as one Riccati equation by doubling; the best one is confirmed by `design_kalman`.
+    A layout that does not observe every rigid-body mode is infeasible and is not scored, because
+    its score could be the best one by mistake. For `PoiVariance`, layouts differ only in rows of
+    the output matrix C and of the noise covariance R. One score therefore takes about as long as
+    the solution of one Riccati equation by the doubling algorithm. The score of the best layout is
+    confirmed by `design_kalman`.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, assembled from a structure.
+        Sampled plant that was assembled from a structure.
     layouts : sequence of layouts
-        A layout is a sequence of `Sensor` values, or of names: of the plant's sensors, of
-        `candidates`, or of sensors in earlier layouts.
+        Layouts to be scored. A layout is a sequence of `Sensor` values or of names. A name may
+        refer to a sensor of the plant, of `candidates`, or of an earlier layout.
     criterion : PoiVariance or callable, optional
         Function of a plant that returns a float, smaller is better; by default `PoiVariance()`.
     candidates : sequence of Sensor
         Candidates that names may stand for, in addition to the plant's own sensors.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`: a layout that breaks one is infeasible. Sensors may lie on a POI
-        here unless OffPoi() is among them: layouts that are named are scored.
+        Constraints, as for `place_sensors`. A layout that violates one of them is infeasible.
+        Unlike in `place_sensors`, sensors may lie on a POI (point of interest), unless OffPoi() is
+        among the constraints.
     executor, progress : as for `place_sensors`
 
     Returns
     -------
     Scores
-        Sorted, the best first; infeasible layouts last, with the reason in words.
+        Layouts with their scores, the best first. Infeasible layouts are last, with the reason.
 
     Raises
     ------
@@ -142,7 +145,7 @@ def score_sensors(
     AssumptionError
         When the criterion has no meaning on this plant, whatever the sensors.
     CertificateError
-        When the best layout's score is not confirmed by the other route.
+        When a second calculation does not confirm the score of the best layout.
 
     Examples
     --------
@@ -175,14 +178,15 @@ def score_actuators(
     Parameters
     ----------
     plant, layouts, candidates, constraints, executor, progress
-        As for `score_sensors`, of `Actuator` values.
+        As for `score_sensors`, with `Actuator` values in place of `Sensor` values.
     criterion : PoiLqr or callable, optional
         Function of a plant that returns a float, smaller is better; by default `PoiLqr()`.
 
     Returns
     -------
     Scores
-        Sorted, the best first; layouts that leave a rigid-body mode alone are last, and say so.
+        Layouts with their scores, the best first. Layouts that do not move every rigid-body mode
+        are last, with the reason.
 
     Raises
     ------
@@ -269,7 +273,7 @@ class DeviceWorth(Value):
     value : float
         Value of the criterion with all devices.
     without : (n,) array
-        Value without each device; infinite where the others do not suffice.
+        Value without each device; infinite if the other devices miss a rigid-body mode.
     unit : str
         Unit of the square root of a value, if the values are mean squares of a motion.
 
@@ -357,7 +361,8 @@ class SensorMap(Value):
     values : (n,) array
         Scores with the sensor at each point; infinite if a rigid-body mode is still not observed.
     without : float
-        The score of the plant's own sensors alone (infinite when they do not suffice).
+        Score of the plant's own sensors alone; infinite if they do not observe every rigid-body
+        mode.
     criterion : str
         Name of the criterion.
     excluded : sequence of Rectangle or Disc
@@ -389,7 +394,7 @@ class SensorMap(Value):
 
     @property
     def ratio(self) -> FloatArray:
-        """Score with the sensor over score without it (n,): 1 where it is of no use."""
+        """Score with the sensor divided by the score without it (n,); 1 if it does not help."""
         if not np.isfinite(self.without):
             return np.where(np.isfinite(self.values), 0.0, 1.0)
         return np.asarray(self.values / self.without)
@@ -412,7 +417,7 @@ def sensor_map(
     Parameters
     ----------
     plant, criterion, executor, progress
-        As for `score_sensors`; the plant's own sensors stay.
+        As for `score_sensors`. The plant keeps its own sensors.
     points : (n, 3) array [m]
         Points on the structure.
     asd : float [m/sqrt(Hz), ...]

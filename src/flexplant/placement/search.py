@@ -143,8 +143,8 @@ def place_actuators(
     Parameters
     ----------
     plant, candidates, count, required, constraints, method, executor, checkpoint, progress, rng
-        As for `place_sensors`, of `Actuator` values; OffPoi holds only where it is among the
-        constraints.
+        As for `place_sensors`, with `Actuator` values in place of `Sensor` values. Actuators may be
+        placed on a POI (point of interest), unless OffPoi() is among the constraints.
     criterion : PoiLqr or callable, optional
         Function of a plant that returns a float, smaller is better; by default `PoiLqr()`.
 
@@ -279,12 +279,12 @@ def _solution(
 
 @dataclass(frozen=True, eq=False)
 class Exhaustive(Search):
-    """Every subset: the optimum, proven.
+    """A search that tries every subset, and therefore finds the optimum with a proof.
 
     Parameters
     ----------
     limit : int
-        More subsets than this are refused.
+        Largest number of subsets. If there are more, the search raises a ModelError.
 
     Examples
     --------
@@ -388,11 +388,11 @@ class ParetoCurve(Value):
     amounts : (n,) array
         Counts or budgets, ascending.
     placements : sequence of Placement
-        The best that was found for each.
+        The best choice that was found for each count or budget.
     bounds : (n,) array
         Lower bounds for every choice of that count (or within that budget).
     by_cost : bool
-        Whether amounts are budgets.
+        Whether the amounts are budgets; otherwise they are counts.
     """
 
     amounts: FloatArray
@@ -414,12 +414,12 @@ class ParetoCurve(Value):
 
     @property
     def values(self) -> FloatArray:
-        """The criterion (n,) of each."""
+        """Value of the criterion (n,) of each placement."""
         return np.array([one.value for one in self.placements])
 
     @property
     def unit(self) -> str:
-        """Unit of the root of a value, where it is a mean square of a motion."""
+        """Unit of the square root of a value, if it is a mean square of a motion."""
         return self.placements[0].unit
 
 
@@ -444,14 +444,16 @@ def pareto_curve(
     plant, candidates, criterion, required, constraints, method, executor, progress, rng
         As for `place_sensors` or `place_actuators`.
     amounts : sequence of int or float
-        Counts; budgets where there are costs. Those without any possible choice are left out.
+        Numbers of devices, or budgets if `costs` is given. Amounts for which no choice is possible
+        are left out.
     costs : mapping {str: float}, optional
-        Cost of candidates by name, 1 of others: for each budget every count that fits is tried.
+        Cost of candidates by name; the cost of the others is 1. For each budget, every number of
+        devices that the budget allows is tried.
 
     Returns
     -------
     ParetoCurve
-        `fx.plot.pareto_curve` draws it.
+        Best choice for each amount; ``fx.plot.pareto_curve`` draws it.
 
     Raises
     ------

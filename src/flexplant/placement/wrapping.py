@@ -65,7 +65,7 @@ class LeftOutModes(Criterion):
     Parameters
     ----------
     of : {"sensors", "actuators"}
-        Kind of the devices, when it is called on a plant.
+        Kind of the devices that count: the sensors or the actuators.
 
     Raises
     ------
@@ -267,12 +267,13 @@ class OverMachines(Several):
     Parameters
     ----------
     criterion : Criterion or callable
-        From plant to float.
+        Criterion, or function of a plant that returns a float; smaller is better.
     machines : sequence of StandardPlant
-        Such as `plant.uncertain(fit).machines.plants`, or one plant for each machine of a fleet;
-        sampled, each gets the devices of the plant that is scored.
+        Sampled plants, such as `plant.uncertain(fit).machines.plants`, or one plant for each
+        machine of a fleet. Each one gets the devices (sensors and actuators) of the plant that is
+        scored.
     measure : {"worst", "mean"}
-        Over the machines.
+        Whether the largest value over the machines counts, or their mean.
 
     Examples
     --------
@@ -297,27 +298,29 @@ class OverMachines(Several):
 class OverPositions(Several):
     """The worst or the mean of a criterion over the positions of a machine whose ports move.
 
-    Candidates may move as other ports do (`moves`): a head on the frame sees another point of the
-    stage at each position. Scores share the modes of the plant and cost one equation for each
-    position; a bound is the worst (or the mean) of those at the positions. A choice that misses a
-    rigid-body mode at any of them has no score. Constraints on places hold where the plant stands.
+    Ports are the sensors and actuators of a plant. Like other ports, candidates may move with the
+    position of the machine (argument ``moves``). For example, a sensor head on the frame measures
+    another point of the stage at each position. The modes of the plant are computed only once; a
+    score takes one Riccati equation for each position. The lower bound is the worst (or the mean)
+    of the bounds at the positions. A choice that misses a rigid-body mode at any position has no
+    score. Constraints on places are checked only at the position of the given plant.
 
     Parameters
     ----------
     criterion, measure
         As for `OverMachines`, over the positions.
     points : int or mapping {name: int or array}
-        Number of values of each position over its range, or the values [m or rad]. Nothing
-        is known between them: compare with more values.
+        Number of values of each position over its range, or the values [m or rad]. The criterion is
+        not computed between these values: repeat the calculation with more values and compare.
 
     Raises
     ------
     AssumptionError
-        In a search, when at a position even all candidates miss a rigid-body mode.
+        In a search, when all candidates together miss a rigid-body mode at a position.
     LabelError
         When it is called on a plant without positions, or a name is not one of them.
     ModelError
-        When the measure is neither; when called, where a value is out of its range.
+        When the measure is neither of these; when it is called and a value is out of its range.
 
     Examples
     --------
@@ -386,15 +389,16 @@ class LossScores(Scorer):
 class DeviceLoss(Wrapping):
     """The worst or the mean of a criterion after the loss of any one device.
 
-    It is infinite where the remaining devices do not suffice: choose at least one more than the
-    least number.
+    The devices are the sensors or the actuators. The value is infinite if the remaining devices
+    miss a rigid-body mode after a loss. Choose at least one device more than are needed to observe
+    (or to move) all rigid-body modes.
 
     Parameters
     ----------
     criterion, measure
-        As for `OverMachines`, over the devices.
+        As for `OverMachines`, with the losses of single devices in place of the machines.
     of : {"sensors", "actuators"}
-        Which devices may be lost.
+        Kind of the devices that may be lost.
 
     Examples
     --------
@@ -422,7 +426,7 @@ class DeviceLoss(Wrapping):
         return float(over(self.measure, values))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the scores by those of choices of one less."""
+        """Return the scores, which follow from those of choices with one device less."""
         inner = self.inner.scorer(plant, candidates)
         losable = tuple(side_of(port) == SIDES[self.of] for port in candidates)
         rigid = RigidPart.of(plant, sides_of(candidates), candidates)

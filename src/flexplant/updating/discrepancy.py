@@ -38,11 +38,12 @@ class Discrepancy(Value):
     Parameters
     ----------
     kind : str
-        ``"frequency"``, ``"damping"``, ``"mode shape"``, ...
+        Kind of the measured values, such as ``"frequency"``, ``"damping"`` or ``"mode shape"``.
     deviation : float
         Standard deviation relative to the measured value.
     dof : float
-        Degrees of freedom of its estimate, for Student's distribution of a further value.
+        Degrees of freedom of the estimated deviation. The model error of a further measured value,
+        divided by the deviation, follows Student's distribution with these degrees of freedom.
 
     Examples
     --------
@@ -204,7 +205,7 @@ _WIDE = 1.0
 class ModalUncertainty(Value):
     """Relative uncertainty of frequencies and damping ratios of the elastic modes of a model.
 
-    Made by ``fit.uncertainty(...)``; an argument of ``plant.uncertain(...)``.
+    It is the result of ``fit.uncertainty(...)`` and an argument of ``plant.uncertain(...)``.
 
     Parameters
     ----------
@@ -213,9 +214,10 @@ class ModalUncertainty(Value):
     share : (2 m,) array
         Half-widths of the 95 % intervals of frequencies, then of damping ratios.
     covariance : (2 m, 2 m) array
-        Joint covariance of the logarithms of frequencies, then of damping ratios: noise of the
-        measured poles, parameters and model error. The half-widths also include bias, drift, mesh
-        and Student's distribution.
+        Joint covariance of the logarithms of the frequencies, then of the damping ratios. It
+        includes the noise of the measured poles, the uncertainty of the parameters and the model
+        error. The half-widths `share` also include bias, drift, the mesh error and the quantile of
+        Student's distribution.
     poles : (m,) complex array [rad/s]
         Poles of the model.
 

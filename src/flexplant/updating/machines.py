@@ -44,32 +44,38 @@ class Draw(NamedTuple):
 class Machines(Value):
     """Uncertainty of a machine after an update: random draws of whole machines.
 
-    Made by ``fit.machines(measured)``; ``plant.uncertain(machines)`` passes it to a plant, and a
-    plant of ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal
-    coordinates of the plant's evaluation model, with frequencies Omega and unit mass:
+    A machine is the real structure, of which the model is an approximation. Each draw is one
+    machine that agrees with the measurement. The object is the result of ``fit.machines(measured)``
+    and is passed to a plant by ``plant.uncertain(machines)``. A plant of
+    ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal coordinates
+    of the plant's evaluation model, where the mass matrix is the unit matrix and Omega is the
+    diagonal matrix of the frequencies:
 
-    - deviation s, changes dp of the parameters and slope b from their posterior (`Trend`);
-    - trend ``t = sign(b) log(1 + 2 |b| g) / 2`` with g the frequency over the largest measured one;
-      a fraction r of it, uniform between 0 and 1, acts as mass and the rest as stiffness;
-    - ``M' = exp(-r t) (I + sum dp dM) exp(-r t)``, ``K' = Omega exp(E) Omega + sum dp dK``, E
-      symmetric with ``2 (s e + (1 - r) t)`` on its diagonal and deviations ``sqrt(2) s`` off it:
-      frequencies and shapes change together. The scatter between a mode below the measured band
-      and one in or above it is smaller by the ratio of their frequencies, since a body on isolators
-      strains other springs than the measured modes. Rigid-body masses have the deviation 2 s,
-      since they were not measured;
-    - poles of measured modes from their covariance; other dampings from Student's predictive
-      distribution of the measured ones.
+    - the deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
+      from their posterior distribution (`Trend`);
+    - the trend is ``t = sign(b) log(1 + 2 |b| g) / 2``, where g is the frequency of a mode divided
+      by the largest measured frequency. A fraction r of the trend, uniformly distributed between
+      0 and 1, changes the mass, and the rest changes the stiffness;
+    - the matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
+      ``K' = Omega exp(E) Omega + sum dp dK``. The matrix E is symmetric. Its diagonal elements are
+      ``2 (s e + (1 - r) t)`` with standard normal numbers e, and its other elements have the
+      standard deviation ``sqrt(2) s``. Frequencies and shapes therefore change together. For a mode
+      below the measured band and a mode in or above it, the element of E is smaller by the ratio of
+      their frequencies, because a body on isolators strains other springs than the measured modes.
+      The masses of rigid-body modes have the relative deviation 2 s, because they are not measured;
+    - the poles of measured modes are drawn from their covariance. The damping ratios of other modes
+      follow the predictive distribution (Student's) of the measured ratios.
 
     Parameters
     ----------
     fit : UpdateResult
-        The update.
+        Result of the update.
     measured : MeasuredModes
-        Measured modes with numbers of the fit's model.
+        Measured modes, with the mode numbers of the updated model.
     count : int
         Number of machines that are drawn for an interval.
     seed : int
-        Seed of the draws: machine i does not depend on `count`.
+        Seed of the random draws. Machine i is the same for every `count`.
 
     Examples
     --------
@@ -105,7 +111,7 @@ class Machines(Value):
 
     @cached_property
     def damping_changes(self) -> FloatArray:
-        """Logarithms of measured damping ratios over those of the model (of damped modes)."""
+        """Logarithms of the ratio of measured to computed damping ratios, for damped modes."""
         poles = self.measured.poles
         found = -poles.real / np.abs(poles)
         return np.log(found[found > TYPED] / self._own_damping[found > TYPED])

@@ -76,9 +76,9 @@ class _GivenParameter(Parameter):
 class MatrixParameter(_GivenParameter):
     """A parameter with given derivatives of the matrices: M + p dM, D + p dD, K + p dK.
 
-    For a group of elements (for example the stiffness of a region, with its relative change p) dK
-    is the sum of its element matrices. Matrices of the full structure are projected once,
-    ``T^T dK T``.
+    If p is the relative change of the stiffness of a group of elements, dK is the sum of their
+    element stiffness matrices. Matrices of the full structure are projected once by ``T^T dK T``
+    with the reduction matrix T of the model.
 
     Parameters
     ----------
@@ -120,14 +120,14 @@ class MatrixParameter(_GivenParameter):
     ) -> MatrixParameter:
         """Return the parameter p = v - value of a full model `build(v)`, by central differences.
 
-        It serves quantities that change elements affinely: a density, Young's modulus. Where the
-        matrices are not affine (a bending stiffness goes with thickness^3) this holds for small
-        changes only: `PolynomialParameter.from_build` is exact.
+        It is exact for quantities on which the matrices depend affinely, such as a density or
+        Young's modulus. If they do not (a bending stiffness is proportional to thickness^3), it
+        holds for small changes only. `PolynomialParameter.from_build` is exact for these.
 
         Parameters
         ----------
         name, unit, bounds, prior
-            See the class; bounds and prior are those of the change p.
+            As for the class. Bounds and prior refer to the change p.
         build : callable
             Function from the value to an FEModel, with the same DOFs at every value.
         value : float
@@ -166,14 +166,15 @@ class MatrixParameter(_GivenParameter):
 
         ``quantity = value (1 + p)`` in the region, by central differences of the full model; its
         matrices are projected through T once, when an update begins. Young's modulus and density
-        are exactly affine. A thickness is not: `PolynomialParameter.from_build` for each region.
+        are exactly affine. For a thickness use `PolynomialParameter.from_build` for each region.
 
         Parameters
         ----------
         build : callable
             Function from an array with the quantity of every element to an FEModel.
         regions : mapping {name: bool array}
-            Masks of the elements, in the shape of the argument of `build`. They may overlap.
+            Boolean masks that select the elements of each region. They have the shape of the
+            argument of `build` and may overlap.
         value : float or array
             Value in the model that is updated; an array has the shape of the regions.
         bounds, prior : optional
@@ -340,7 +341,7 @@ CHECKS = (-0.97, -0.77, 0.31)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialParameter(_GivenParameter):
-    """A parameter with powers: ``M(p) = M + p M_1 + p^2 M_2 + ...``, and so D and K.
+    """A parameter with powers: ``M(p) = M + p M_1 + p^2 M_2 + ...``, likewise D and K.
 
     Derivatives are exact at every p. A plate's thickness has K_1 to K_3 and M_1 (with rotary
     inertia M_3).
@@ -348,9 +349,10 @@ class PolynomialParameter(_GivenParameter):
     Parameters
     ----------
     dM, dD, dK : sequences of (k, k) or (n, n) arrays or sparse matrices
-        M_1, M_2, ...; D_1, ...; K_1, ...: as those of `MatrixParameter`; None stands for zero.
+        Matrices M_1, M_2, ..., then D_1, ... and K_1, ..., each as in `MatrixParameter`. None
+        stands for a zero matrix.
     name, unit, bounds, prior
-        As for `MatrixParameter`, as are errors.
+        As for `MatrixParameter`. The same errors are raised.
     missed : float
         Largest error of the polynomials relative to the largest change of a matrix.
 
@@ -400,10 +402,11 @@ class PolynomialParameter(_GivenParameter):
     ) -> PolynomialParameter:
         """Return the parameter p = v - value of a full model `build(v)`, by interpolation.
 
-        The matrices at degree + 1 Chebyshev points make the polynomials, three points more check
-        them. Exact where the matrices are polynomials of this degree (3 for a plate's thickness).
-        Where they are other smooth functions (a length, an angle), `missed` is the error of the
-        polynomials, and bounds limit the parameter to the compared range.
+        The polynomials interpolate the matrices at degree + 1 Chebyshev points and are checked at
+        three more points. They are exact if the matrices are polynomials of this degree (3 for a
+        plate's thickness). If the matrices are other smooth functions (of a length, an angle),
+        `missed` is the error of the polynomials, and bounds limit the parameter to the range in
+        which they were compared.
 
         Parameters
         ----------
@@ -416,8 +419,8 @@ class PolynomialParameter(_GivenParameter):
         Raises
         ------
         ModelError, ShapeError
-            When the polynomials miss the matrices by more than 1e-6 of their change between the
-            points, nothing changes, or the DOFs do.
+            When the polynomials differ from the matrices by more than 1e-6 of their change between
+            the points, the matrices do not change, or the DOFs change.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))

@@ -25,10 +25,11 @@ Derivatives: TypeAlias = tuple[Matrix | None, Matrix | None, Matrix | None]
 
 
 class Parameter(Value):
-    """One unknown p on which M, D and K depend, affinely (M(p) = M + p dM) unless stated.
+    """One unknown p on which the mass, damping and stiffness matrices M, D and K depend.
 
-    A subclass has a unique `name`, a `unit` and its `matrices`; `bounds` (lowest, highest) and
-    `prior` (mean, standard deviation) may state prior knowledge of p.
+    The dependence is affine (M(p) = M + p dM) unless stated otherwise. A subclass has a unique
+    `name`, a `unit` and its `matrices`. Prior knowledge of p may be given by `bounds` (lowest,
+    highest) and by a `prior` (mean, standard deviation).
 
     Examples
     --------
@@ -51,11 +52,11 @@ class Parameter(Value):
         return [self.matrices(model)]
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
-        """Return the sizes g_j of the terms at a value, and their derivatives."""
+        """Return the factors g_j of the terms at a value of p, and their derivatives."""
         return np.array([value]), np.ones(1)
 
     def change(self, model: FEModel | ReducedModel, value: float) -> Derivatives:
-        """Return the terms that the parameter at a value adds to M, D and K of the model."""
+        """Return the matrices that the parameter adds to M, D and K for a given value."""
         total: list[Any] = [None, None, None]
         for size, parts in zip(self.curve(value)[0].tolist(), self.terms(model), strict=True):
             for i, part in enumerate(parts):
@@ -64,7 +65,7 @@ class Parameter(Value):
         return total[0], total[1], total[2]
 
     def about(self, value: float) -> Parameter:
-        """Return the parameter counted from a value, of a model that has it already."""
+        """Return the parameter as a change from a value that the model already includes."""
         return self
 
     def _check_known(self) -> None:
@@ -148,7 +149,9 @@ class PointParameter(Parameter):
 
 
 class AddedMass(PointParameter):
-    """A point mass [kg] (about a rotation: inertia [kg m^2]) added at a place: M + p r r^T.
+    """A point mass [kg] or rotary inertia [kg m^2] added at a place: M + p r r^T.
+
+    r is the vector of interpolation weights of the place on the DOFs of the model.
 
     Parameters
     ----------
@@ -161,7 +164,8 @@ class AddedMass(PointParameter):
     name : str, optional
         Name in results; by default made from the place.
     to : str, (3,) array [m] or mapping, optional
-        The other end; the ground by default.
+        Place of the other end, for a parameter that acts between two places. By default the other
+        end is the ground.
     bounds : (lowest, highest), optional
         Limits of the parameter; None or infinity means unlimited.
     prior : (mean, standard deviation), optional
@@ -203,9 +207,9 @@ class AddedDamping(PointParameter):
 class AddedStiffness(PointParameter):
     """A spring [N/m] between a place and the ground, or another: K + p r r^T.
 
-    On a free structure a spring to the ground turns the rigid-body modes that move it into
-    suspension modes, with a frequency proportional to sqrt(p), so that they can only be fitted from
-    a start that is not zero.
+    On a free structure, a spring to the ground turns the rigid-body modes that move it into
+    suspension modes with a frequency proportional to sqrt(p). The derivative of sqrt(p) is infinite
+    at zero. These modes can therefore only be fitted from a start value that is not zero.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Sensitivities(Value):
     Parameters
     ----------
     modes : sequence of m int
-        Numbers from 1, rigid-body modes included.
+        Mode numbers, counted from 1 with rigid-body modes.
     poles : (m,) complex array [rad/s]
         Eigenvalues lambda_a.
     S : (m, q) complex array [rad/s per unit]
@@ -79,14 +79,15 @@ def eigenvalue_sensitivities(
     """Return the sensitivities of the complex eigenvalues of a model to parameters.
 
     ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)`` with right
-    and left eigenvectors x, y of ``lambda^2 M + lambda D + K`` (the paper, eq. (11)). Exactly
-    repeated modes are first rotated to the eigenvectors of the derivative, in the order of rising
-    frequency for growing parameters.
+    and left eigenvectors x, y of ``lambda^2 M + lambda D + K`` (the paper, eq. (11)). The
+    eigenvectors of exactly repeated modes are first replaced by those combinations along which the
+    modes split when a parameter changes. These modes are in the order of increasing frequency for
+    an increasing parameter.
 
     Parameters
     ----------
     model, parameters
-        As for `update`; an FEModel is treated densely.
+        As for `update`; full matrices are used for an FEModel.
     modes : sequence of int, optional
         Mode numbers from 1, rigid-body modes included; all elastic modes by default.
     values : (q,) array, optional
@@ -100,9 +101,9 @@ def eigenvalue_sensitivities(
     Raises
     ------
     LabelError, ModelError
-        When a mode number or a place is unknown, names are doubled, the matrices are indefinite at
-        `values`, or several parameters split repeated modes along different vectors, so that
-        derivatives with respect to all of them do not exist.
+        When a mode number or a place is unknown, two parameters have the same name, the matrices
+        are indefinite at `values`, or several parameters split repeated modes along different
+        vectors, so that derivatives with respect to all of them do not exist.
 
     References
     ----------

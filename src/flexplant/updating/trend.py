@@ -28,12 +28,14 @@ MIXED = 14.0
 class Trend(Value):
     """Residual of measured frequencies, regressed on the parameters and on frequency.
 
-    ``log(f_measured / f_model) = S dp + b g + s e`` of m measured modes: S are the derivatives of
-    the logarithms of the q parameters that move frequencies, g the measured frequency over the
-    largest, e standard normal. If a model only has errors of its parameters and scatter, b is zero,
-    and its estimate over its deviation follows Student's distribution with ``m - q - 1`` degrees of
-    freedom. A slope means that the model neglects an effect that grows with frequency: shear,
-    rotary inertia, smaller elements.
+    For m measured modes the regression is ``log(f_measured / f_model) = S dp + b g + s e``. S
+    contains the derivatives of the logarithms of the model's frequencies to the q parameters that
+    change them, and dp are changes of these parameters. g is the measured frequency divided by the
+    largest one, and b is the slope. e is standard normal, and s is the standard deviation of the
+    scatter. If the model has no errors except those of its parameters and the scatter, b is zero.
+    Its estimate divided by its standard deviation then follows Student's distribution with
+    ``m - q - 1`` degrees of freedom. A significant slope means that the model neglects an effect
+    that grows with frequency: shear, rotary inertia, or elements that should be smaller.
 
     Parameters
     ----------
@@ -100,12 +102,12 @@ class Trend(Value):
 
     @property
     def deviation(self) -> float:
-        """s, the remaining relative deviation of a frequency."""
+        """Relative standard deviation s of a frequency after the regression."""
         return self._regression[2]
 
     @property
     def slope(self) -> float:
-        """b, the relative error at the highest measured frequency that grows with frequency."""
+        """Slope b: relative error, at the highest measured frequency, that grows with frequency."""
         return float(self._regression[0][-1])
 
     @property
@@ -115,7 +117,7 @@ class Trend(Value):
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger slope of either sign for a correct model."""
+        """Probability that a correct model shows a slope of this or a larger size by chance."""
         from scipy.special import stdtr
 
         if self.dof < 1:
@@ -130,7 +132,7 @@ class Trend(Value):
 
     @property
     def unshaped_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Neighbouring modes that scatter may have swapped, without shapes to distinguish them."""
+        """Neighbouring modes that may be swapped, because no shapes distinguish them."""
         from scipy.special import stdtrit
 
         if self.shaped or self.dof < 1:
@@ -143,7 +145,7 @@ class Trend(Value):
 
     @property
     def half_measured_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Pairs that scatter mixes, a measured mode and one that was not measured."""
+        """Pairs of a measured and an unmeasured mode that are so close that they may mix."""
         if self.dof < 1:
             return ()
         near = MIXED * self.deviation
@@ -156,11 +158,12 @@ class Trend(Value):
 
     @cached_property
     def outlier(self) -> tuple[int, float] | None:
-        """The mode that is an outlier, and its error relative to the others; or None.
+        """The mode that is an outlier, and its relative error; None if there is no outlier.
 
-        By its externally studentised residual, which follows Student's distribution with one degree
-        of freedom less; the noise of the mode's own measurement adds to it. Chance alone names a
-        mode in 0.3 % of fits.
+        The test divides the residual of each mode by the deviation that is estimated from the other
+        modes (externally studentised residual). It follows Student's distribution with one degree
+        of freedom less than `dof`. The measurement noise of the mode is added to the deviation. In
+        a correct model an outlier is found by chance in 0.3 % of fits.
         """
         from scipy.special import stdtr
 
@@ -181,7 +184,7 @@ class Trend(Value):
 
     @property
     def missing(self) -> str:
-        """Reason why no statement about machines is possible, in one sentence, or empty."""
+        """Reason why the uncertainty of machines cannot be computed; empty if it can."""
         q = self.S.shape[1]
         if self.dof < 1:
             return (
@@ -215,7 +218,7 @@ class Trend(Value):
 
     @property
     def text(self) -> str:
-        """Text of the slope."""
+        """Slope in words."""
         return (
             f"{100 * self.slope:+.2g} +- {100 * self.slope_deviation:.1g} % at "
             f"{self.highest:.4g} Hz"
@@ -224,7 +227,8 @@ class Trend(Value):
     def posterior(self, rng: np.random.Generator) -> tuple[float, FloatArray, float]:
         """Return a draw of s, dp (q,) and b, given what was measured and a flat prior.
 
-        ``s^2 = dof s_hat^2 / chi^2_dof``, and dp and b normal about their estimates with s.
+        With the estimate s_hat, the draw of s is ``s^2 = dof s_hat^2 / chi^2_dof``. Given s, dp and
+        b are normally distributed about their estimates.
         """
         if self.dof < 1:
             raise ModelError(f"the posterior does not exist: {self.missing}.")

@@ -41,8 +41,9 @@ class History(Value):
     eigenvalues : (i + 1, m) complex array [rad/s]
         The model's eigenvalues, paired with the measured ones.
     error : (i + 1,) array
-        ``e_i`` of the paper's (12); with other residuals the sum of their whitened squares, without
-        priors.
+        Error ``e_i`` of equation (12) in the paper, if only eigenvalues are fitted. With other
+        residuals it is the sum of squares of the whitened residuals (divided by the standard
+        deviation of their noise), without priors.
     fraction : (i + 1,) array
         Fraction of the Gauss-Newton step; 1 unless it was halved, 0 for the start.
 
@@ -81,13 +82,14 @@ class Starts(Value):
     cost : (s,) array
         Half the sum of squares at the end, infinite where a search failed.
     reason : sequence of s str
-        Reason why each search ended or failed, for all tried methods.
+        Reason why each search ended or failed; it names all methods that were tried.
     minima : (r, q) array
-        Minima other than the best, by rising cost.
+        Parameters at the minima other than the best one, in the order of increasing cost.
     above : (r,) array
-        Increase of -2 ln of the likelihood relative to the best: the difference of chi-square where
-        noise explains the residual, else ``n ln(cost / least cost)``. It is negative where the
-        FEModel refuses that minimum (for example for a negative damper) but accepts the best.
+        Increase of ``-2 ln(likelihood)`` at each of these minima relative to the best one. It is
+        the difference of chi-square if noise explains the residual, otherwise
+        ``n ln(cost / least cost)`` for n residuals. It is negative if a minimum has a lower cost
+        than the best one but the FEModel refuses it, for example because of a negative damper.
 
     Examples
     --------
@@ -105,9 +107,10 @@ class Starts(Value):
 
     @property
     def rivals(self) -> list[tuple[FloatArray, float]]:
-        """Other minima that the data hardly distinguish from the best, and their distance.
+        """Other minima that the data hardly distinguish from the best, with their `above`.
 
-        A likelihood ratio that chance alone makes in one of 10 000 cases (`p_value`).
+        A minimum is included if noise alone could cause its value of `above` with a probability of
+        at least 1e-4, by the chi-square distribution with one degree of freedom.
         """
         return [
             (p, float(more))
@@ -139,25 +142,26 @@ class UpdateResult(Value):
     values : (q,) array
         Values of the parameters.
     covariance : (q, q) array or None
-        Covariance of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
-        ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], for any weights. Without:
+        Covariance of the estimate. S are the sensitivities, ``J = [Re S; Im S]``, W the weights. If
+        the covariance C of the measurement is known, the covariance is ``G C G^T`` with the linear
+        estimator ``G = (J^T W J)^-1 J^T W``, for any weights. If C is not known, it is
         ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which includes the
-        model error; None when 2 m = q. Where only some residuals have a covariance, s^2 is that of
-        the others. Where `chi2` exceeds noise (`p_value` below 1e-4) C includes the discrepancy, or
-        with responses is multiplied by ``chi2 / dof``.
+        model error; None when 2 m = q. If only some residuals have a known covariance, s^2 is the
+        variance of the others. If `chi2` exceeds noise (`p_value` below 1e-4), C includes the
+        discrepancy; with responses C is multiplied by ``chi2 / dof`` instead.
     correlation : (q, q) array
-        The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
-        there is one).
+        Correlation matrix of the estimate. It follows from `covariance` if the noise of all
+        residuals is known. Otherwise errors with the covariance W^-1 are assumed.
     model : ReducedModel or FEModel
         Updated model of the same type, with changed M, D and K.
     history : History
     converged : bool
-        Whether a tolerance was met and the data determine the parameters.
+        Whether a tolerance was met and the data determine all parameters.
     reason : str
         Reason why the iteration ended.
     at_bound : sequence of str
-        Names of the parameters that ended at one of their bounds: the data point beyond it, and the
-        covariance does not include it.
+        Names of the parameters that ended at one of their bounds, because the data suggest a value
+        beyond it. The covariance does not take these bounds into account.
     starts : Starts or None
         Results of all starts, including other minima.
     unknowns : sequence of Parameter
@@ -167,18 +171,19 @@ class UpdateResult(Value):
         when the model explains the measurement. Only residuals with known noise count; None without
         such residuals.
     dof : int
-        Degrees of freedom: number of counted residuals and priors, minus the part of the parameters
-        that did not end at a bound.
+        Degrees of freedom: number of residuals and priors that count in `chi2`, minus the number of
+        parameters that they determine. Parameters at a bound are not subtracted.
     rounds : (r, q) array or None
-        The estimate of the reduced model alone and after each round of defect correction.
+        Estimate with the reduced model alone, and estimate after each round of defect correction.
+        Defect correction removes the error of the reduction; see `update`.
     residuals : sequence of Residual
         Fitted residuals.
     discrepancy : sequence of Discrepancy
         Model error in each kind of residual, in addition to noise; empty where noise explains the
         residual.
     determined : sequence of str or None
-        None where the data determine all parameters. Else a text for each combination that they
-        determine to first order; other values have no meaning.
+        None if the data determine all parameters. Otherwise a text for each combination of
+        parameters that the data determine to first order. Other combinations have no meaning.
     prior_std : (q,) array or None
         Standard deviations of the used priors, infinite for a parameter without a prior; None if no
         prior was used.
@@ -229,7 +234,7 @@ class UpdateResult(Value):
 
     @property
     def discrepancy_text(self) -> str:
-        """Text of the discrepancy."""
+        """Description of the discrepancy in words."""
         return ", ".join(f"{d.deviation:.2g} of {d.kind}" for d in self.discrepancy)
 
     @property
@@ -294,7 +299,7 @@ class UpdateResult(Value):
         return [f"  {line}" for line in lines]
 
     def unlike_shapes(self, measured: MeasuredModes | None = None) -> list[str]:
-        """Return a sentence on each measured shape that is not the model's; see `likeness`."""
+        """Return a sentence for each measured shape that differs from the model; see `likeness`."""
         return [
             f"mode {mode} has another shape than measured (MAC {mac:.2f}): what is promised of it "
             "does not hold"
@@ -305,14 +310,15 @@ class UpdateResult(Value):
     def likeness(self, measured: MeasuredModes | None = None) -> dict[int, float]:
         """Return the MAC of each measured shape with that of the updated model.
 
-        Modes within 2 % of a frequency mix in any machine: of these it is the part of the measured
-        shape in the span of theirs.
+        Modes whose frequencies differ by at most 2 % mix differently in each machine. If several
+        such modes were measured, the result is the fraction of a measured shape that combinations
+        of their shapes in the model explain.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
-            Measured modes with shapes, of ``numbered(..., at=...)``; the poles that were fitted
-            when not given.
+            Measured modes with shapes, as returned by ``numbered(..., at=...)``; by default the
+            fitted poles.
 
         Returns
         -------
@@ -335,10 +341,10 @@ class UpdateResult(Value):
     def interval(self, level: float = 0.95) -> FloatArray:
         """Return confidence (credible) intervals (q, 2) of the parameters for a level in 0 .. 1.
 
-        The intervals follow the normal distribution, or Student's distribution if the discrepancy
-        was estimated, with the smallest degrees of freedom of any kind from the data: a common
-        error of all modes takes one, since no mode shows it. ModelError where the covariance is not
-        known.
+        The intervals follow the normal distribution. If the discrepancy was estimated, they follow
+        Student's distribution with the smallest degrees of freedom that the data of any kind of
+        residual give. One is subtracted, because no mode shows an error that is common to all
+        modes. A ModelError is raised if the covariance is not known.
         """
         from scipy.special import ndtri
 
@@ -347,10 +353,10 @@ class UpdateResult(Value):
         return np.column_stack([self.values - half, self.values + half])
 
     def widened(self, factor: float) -> FloatArray:
-        """Return the covariance (q, q) if that of all data is larger by a factor.
+        """Return the covariance (q, q) for data whose covariance is larger by a factor.
 
-        Priors do not change with the factor: every parameter is known at least as well as by its
-        prior. ModelError where the covariance is not known.
+        The covariance of priors is not multiplied: every parameter is known at least as well as by
+        its prior. A ModelError is raised if the covariance is not known.
         """
         std, factor = self._known_std(), positive(factor, "factor")
         wide: FloatArray = np.asarray(self.covariance) * factor
@@ -387,9 +393,10 @@ class UpdateResult(Value):
         return list((self._wider_std(INTERVAL) if rejected else std).tolist())
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
-        """Return draws (count, q), normal with `values` and `covariance` (Laplace's posterior).
+        """Return random draws (count, q) of the parameters.
 
-        ModelError where the covariance is not known.
+        They are normally distributed with the mean `values` and the `covariance` (Laplace's
+        approximation of the posterior). A ModelError is raised if the covariance is not known.
         """
         std = self._known_std()
         white = generator(rng).standard_normal(
@@ -418,8 +425,8 @@ class UpdateResult(Value):
         Parameters
         ----------
         model : FEModel or ReducedModel
-            Its DOFs contain the places of the parameters. One of its kind is returned; a sparse
-            model stays sparse.
+            Model whose DOFs contain the places of the parameters. The result has the same type, and
+            a sparse model remains sparse.
 
         Raises
         ------
@@ -439,8 +446,8 @@ class UpdateResult(Value):
     def calibrated(self, measured: Any) -> Any:
         """Return the updated model with the measured poles of some modes; see `ReducedModel`.
 
-        The parameters explain shapes, POIs and modes that were not measured; measured poles replace
-        those of the model. ModelError of an FEModel: calibrate its `modes()`.
+        Shapes, POIs (points of interest) and unmeasured modes follow from the parameters. Measured
+        poles replace those of the model. An FEModel raises a ModelError: calibrate its `modes()`.
 
         Parameters
         ----------
@@ -462,8 +469,8 @@ class UpdateResult(Value):
         Parameters
         ----------
         measured : MeasuredModes
-            All measured modes, with numbers of this fit's model; with shapes where they were
-            measured.
+            All measured modes, with the mode numbers of the updated model, and with their shapes if
+            they were measured.
         count : int
             Number of machines that are drawn for an interval.
         seed : int
@@ -492,22 +499,23 @@ class UpdateResult(Value):
     ) -> ModalUncertainty:
         """Return the uncertainty of frequencies and damping of modes, and their covariance.
 
-        The relative error of a mode is ``S dp + s (e + c)``: errors of the parameters, of each
-        mode, and common to all modes. Their deviation s, one for frequencies and one for damping,
-        follows from the residual of the measured modes by restricted likelihood; it is near 0.25 %
-        and 15 % where little was measured. All errors are conditioned on the measured poles, so
-        that the covariance of modes and parameters is joint.
+        The relative error of a mode is ``S dp + s (e + c)``. dp is the error of the parameters with
+        the sensitivities S, e an error of each mode, and c an error common to all modes. The
+        standard deviation s is estimated for frequencies and for damping ratios separately, from
+        the residual of the measured modes by restricted maximum likelihood. If few modes were
+        measured, it is near 0.25 % for frequencies and 15 % for damping ratios. The covariance of
+        modes and parameters is their joint covariance, given the measured poles.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
-            Modes with which the model is calibrated: the result holds for
-            ``fit.calibrated(measured)``, where a measured mode has an uncertainty of two
-            deviations, at least 0.1 % (damping 2 %). None: for `model`, whose measured modes have
-            the residual of the update as error, with the fitted poles.
+            Modes with which the model is calibrated. The result then holds for
+            ``fit.calibrated(measured)``, where the uncertainty of a measured mode is two standard
+            deviations, and at least 0.1 % (damping ratio: 2 %). None: the result holds for `model`
+            and uses the fitted poles. Measured modes then have the residual of the update as error.
         mesh : MeshError, optional
-            Result of ``modes.mesh_error(finer)``; 1.5 times the error counts for modes that were
-            not measured.
+            Result of ``modes.mesh_error(finer)``. For modes that were not measured, 1.5 times this
+            error is included.
 
         Raises
         ------
@@ -524,7 +532,8 @@ class UpdateResult(Value):
     def modes(self, *, count: int | None = None) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.
 
-        Modes of a reduced model are expanded by the paper's (7) and (4): ``phi_n = T phi_k``.
+        Mode shapes phi_k of a reduced model are expanded to all DOFs by ``phi_n = T phi_k``, with
+        the reduction matrix T (equations (7) and (4) of the paper).
 
         Parameters
         ----------

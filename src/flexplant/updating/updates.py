@@ -73,14 +73,15 @@ def update(
         `GaussNewton` or `TrustRegion`. None: the trust region; for poles without bounds and priors
         Gauss-Newton, and the trust region only where it fails.
     start : (q,) array [kg, N s/m, N/m], optional
-        Start values. None: zeros, or the means of priors, inside the bounds; then responses are
-        first fitted by the logarithm of their magnitude, and poles before shapes, since these
-        converge from farther away. Four other starts are always tried (two with more than 100
-        DOFs), to find other minima; print(fit) names those with a similar chi-square. Up to 20
-        starts (or 4) are tried if no start leads to an end, or if noise does not explain a residual
-        of a tenth of the power of responses or of 0.1 % of a pole (`UpdateResult.starts`). After an
-        end is found, other starts get ten steps, and more if their cost is close; the search stops
-        with eight starts in the best minimum.
+        Start values. None: zeros, or the means of priors, inside the bounds. Without start values,
+        responses are first fitted by the logarithm of their magnitude, and poles are fitted before
+        shapes, because these fits converge from farther away. Four other starts are always tried
+        (two with more than 100 DOFs) to find other minima, and print(fit) names those with a
+        similar chi-square. Up to 20 starts (or 4) are tried if no start leads to a solution. The
+        same holds if noise does not explain a residual of a tenth of the power of responses or of
+        0.1 % of a pole (`UpdateResult.starts`). After a solution is found, each further start gets
+        ten steps, and more if its cost is close to the best one. The search stops when eight starts
+        have reached the best minimum.
     starts : int or (s, q) array, optional
         Start values, or their number; a number of starts is drawn between the bounds (or from the
         priors), including `start`. The best result is kept. 1: only `start`.
@@ -93,8 +94,8 @@ def update(
     max_iterations : int, optional
         Largest number of steps from one start; by default 20 for Gauss-Newton, 200 for the others.
     tolerance : float
-        Relative change of every eigenvalue by a full step, or by the residual, at which the search
-        ends.
+        Relative tolerance of the search. The search ends when a full step changes every eigenvalue
+        by less than this fraction, or when the residual is smaller than this fraction.
     full : FEModel, optional
         FEModel of the reduced model. The reduction error may be larger than the noise, which
         chi-square does not always show. Defect correction removes it: the full model is solved at
@@ -117,19 +118,19 @@ def update(
     -----
     FlexplantWarning
         When the tolerance was not met; when the data, with active bounds and priors, do not
-        determine the parameters (the warning names the determined combinations); when an end is
-        found, but not from the given `start`; when the last round of defect correction changed the
-        estimate by more than half a standard deviation; when the residual exceeds known noise with
-        a p-value below 1e-4. In the last case parameters and the model error of each kind of
+        determine the parameters (the warning names the determined combinations); when a solution
+        is found, but not from the given `start`; when the last round of defect correction changed
+        the estimate by more than half a standard deviation; when the residual exceeds known noise
+        with a p-value below 1e-4. In the last case parameters and the model error of each kind of
         residual are estimated together (`UpdateResult.discrepancy`); with responses the covariance
         is multiplied by chi-square over its degrees of freedom, and no +- is printed.
 
     Raises
     ------
     ModelError
-        When the measured eigenvalues do not depend on a parameter or cannot distinguish some (S is
-        singular), the matrices are indefinite at `start`, or the FEModel refuses the result (for
-        example a negative damper: give it bounds).
+        When the measured eigenvalues do not depend on a parameter, or cannot distinguish several
+        parameters (the sensitivity matrix S is singular), the matrices are indefinite at `start`,
+        or the FEModel refuses the result (for example a negative damper: give it bounds).
     SolverError
         When every step makes the model unphysical, or no start leads to a solution.
 

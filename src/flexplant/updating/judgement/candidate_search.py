@@ -42,11 +42,12 @@ def localise(
     Arguments are as for `update`: ``found = fx.updating.localise(drawing, candidates, residuals)``,
     with a candidate for every place, for example
     ``[fx.AddedMass(at) for at in drawing.dofs.labels]``. `found.chosen` names up to `most` of them,
-    and is empty if nothing is wrong; `found.ranking` sorts all by their separate effect.
-    `found.alike_sets` are the sets that explain the data equally well, which are many on a
-    symmetric structure: pass each to `update`, or distinguish them with shapes or responses;
-    `found.alike` has all of their members. Errors of the whole structure (Young's modulus, damping)
-    belong into `nuisance`. The method is described in `algorithms`.
+    and is empty if no change explains the data better than the model itself. `found.ranking` sorts
+    all candidates by their separate effect. `found.alike_sets` are the sets that explain the data
+    equally well. On a symmetric structure there are many such sets: pass each of them to `update`,
+    or distinguish them by measured shapes or responses. `found.alike` contains all of their
+    members. Errors of the whole structure (Young's modulus, damping) are given as `nuisance`, which
+    are parameters that are fitted but are not candidates. The method is described in `algorithms`.
 
     Parameters
     ----------
@@ -58,12 +59,12 @@ def localise(
     residuals : sequence of Residual
         Residuals measured with the change.
     nuisance : sequence of Parameter, optional
-        Unknowns in addition to the candidates; their priors are not used.
+        Unknown parameters that are fitted in addition to the candidates; their priors are not used.
     most : int
-        Largest subset.
+        Largest number of candidates that are chosen together.
     screen : int
-        Largest number of fitted candidates: those with at least a quarter of the first-order effect
-        of the best one, and always ten.
+        Largest number of candidates that are fitted. Fitted are candidates with at least a quarter
+        of the first-order effect of the best one, and always ten.
     progress : bool, optional
         Whether to show a progress bar. None: on a terminal for work of more than two seconds.
 
@@ -79,15 +80,17 @@ def localise(
     Raises
     ------
     ModelError, LabelError
-        As for `update`; or when counts are not valid, a nuisance parameter is a candidate too, or
-        the data are at most as many as the nuisance parameters.
+        As for `update`; or when `most` or `screen` is not valid, a nuisance parameter is also a
+        candidate, or there are not more data than nuisance parameters.
 
     Notes
     -----
-    The rate of superfluous candidates is known. Another of c candidates joins k when it lowers
-    chi-square by more than ``ln n + 2 ln((c - k) / (k + 1))`` (the price) for n data. By chance the
-    best of the others does so with probability ``(c - k) P(chi2_1 > price)``: in 10 to 13 of 100
-    measurements with one change, for 12 to 25 candidates and 20 to 24 data. `margin` then is small.
+    The probability that a superfluous candidate is chosen is known. If k of c candidates are
+    chosen, another one is added if it lowers chi-square by more than the price
+    ``ln n + 2 ln((c - k) / (k + 1))``, where n is the number of data. By chance the best of the
+    others does so with the probability ``(c - k) P(chi2_1 > price)``, where chi2_1 follows the
+    chi-square distribution with one degree of freedom. For 12 to 25 candidates, 20 to 24 data and
+    one true change, this happens in 10 to 13 of 100 measurements. The `margin` is then small.
 
     References
     ----------
@@ -209,17 +212,19 @@ class Localisation(Value):
     values : (c,) array
         Value of each candidate if it were the only change; NaN if the fit failed.
     score : (c,) array
-        Fraction of the residual's sum of squares that each explains separately, at most 1.
+        Fraction of the residual's sum of squares that each candidate alone explains, at most 1.
     bic : (c,) array
-        Extended Bayesian information criterion of each candidate alone.
+        Extended Bayesian information criterion (BIC) of each candidate alone. It is chi-square plus
+        a penalty that grows with the number of parameters; smaller is better.
     chosen : sequence of str
-        Subset with the smallest BIC; empty when no change is best.
+        Set of candidates with the smallest BIC; empty if the model without a change has the
+        smallest one.
     chosen_values : array
         Values of the chosen candidates.
     chosen_bic, nothing_bic : float
-        BIC of the subset, and of no change.
+        BIC of the chosen set, and of the model without a change.
     nuisance : sequence of n str
-        Parameters that were fitted along with every candidate, and with none.
+        Names of the parameters that were fitted in addition, in every fit.
     nuisance_values : (n,) array
         Values of the nuisance parameters with the chosen subset.
     chi2 : float or None
@@ -229,13 +234,14 @@ class Localisation(Value):
     units : sequence of c str, optional
         Units of the candidates.
     next_best : sequence of str
-        The best fitted set without a place of the chosen one; empty for no change.
+        The best fitted set that does not contain the whole chosen set; empty if this is the model
+        without a change.
     next_bic : float
-        Its criterion, infinite where no other set was fitted.
+        BIC of `next_best`; infinite if no other set was fitted.
     alike_sets : sequence of tuples of str
-        The sets of the size of the chosen one that explain the data as well (BIC within 2 of the
-        least), the best first: on a symmetric structure all combinations of mirror images that the
-        data do not distinguish.
+        Sets of the same size as the chosen one that explain the data equally well (BIC within 2 of
+        the least), the best first. On a symmetric structure these are all combinations of mirror
+        images that the data do not distinguish.
     """
 
     candidates: tuple[str, ...]
@@ -257,11 +263,11 @@ class Localisation(Value):
 
     @property
     def margin(self) -> float:
-        """Difference of the criterion between the next set and the chosen one.
+        """Difference d of the BIC between the next set and the chosen one.
 
-        A difference d is a likelihood ratio of ``exp(d/2)``: below 10 the next set is possible too.
-        Where the residual exceeds noise (`p_value`), the ratio is that of errors of the model, and
-        the difference is divided by ``chi2 / dof``.
+        The chosen set is more likely than the next one by the factor ``exp(d/2)``. If d is below
+        10, the next set is possible too. If the residual exceeds noise (`p_value`), the residual is
+        caused by errors of the model, and the difference is divided by ``chi2 / dof``.
         """
         wrong = is_bad(self.p_value) and self.chi2 is not None
         size = (self.chi2 or 0.0) / max(self.dof, 1) if wrong else 1.0
@@ -293,8 +299,8 @@ class Localisation(Value):
     def alike(self) -> tuple[str, ...]:
         """Candidates of all `alike_sets`, the best set first: the true places are among them.
 
-        Where no change is chosen, single candidates that the data cannot distinguish from the best
-        one. On a symmetric structure poles alone leave all mirror images alike.
+        If no change is chosen, these are single candidates that the data cannot distinguish from
+        the best one. Poles alone do not distinguish mirror images on a symmetric structure.
         """
         if self.chosen:
             return tuple(dict.fromkeys(name for one in self.alike_sets for name in one))
@@ -314,7 +320,7 @@ class Localisation(Value):
 
     @property
     def table(self) -> str:
-        """The leading candidates in lines: value alone, share explained, BIC above the least."""
+        """Table of the leading candidates: value alone, explained fraction, BIC above the least."""
         least, rows = float(np.min(self.bic)), []
         for name in self.leading:
             i = self.candidates.index(name)

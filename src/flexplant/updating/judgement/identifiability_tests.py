@@ -28,19 +28,20 @@ class IdentifiabilityReport(Value):
     parameters : sequence of q str
         Names of the parameters.
     singular_values : (q,) array
-        Singular values of the sensitivities, with each column scaled to length one: sqrt(q) to
-        zero.
+        Singular values of the sensitivities, with each column scaled to length one. They are
+        between zero and sqrt(q).
     combinations : (q, q) array
-        Combinations of (scaled) parameters of each singular value, in columns.
+        Right singular vectors in columns: the combination of (scaled) parameters for each singular
+        value.
     std : (q,) array
         Expected standard deviations with known noise (otherwise for unit noise of the weighted
         residuals); infinite where a parameter cannot be determined.
     correlation : (q, q) array
         Correlation of the expected errors; zero for parameters that cannot be determined.
     unseen : sequence of str
-        Parameters that no residual depends on.
+        Names of the parameters on which no residual depends.
     mixed : sequence of (str, ...)
-        Groups of parameters of which a combination cannot be determined.
+        Groups of parameters. A combination of the parameters of a group cannot be determined.
     missing : mapping {str: (int, ...)}
         For parameters that are unseen or mixed: unmeasured modes whose eigenvalues would determine
         the lost combinations, those with the largest change first; empty where no eigenvalue helps,
@@ -97,8 +98,9 @@ def identifiability(
 ) -> IdentifiabilityReport:
     """Return which parameters the residuals determine at a start, before solving.
 
-    The singular values of the weighted sensitivities S, the correlation ``(S^T S)^-1`` of the
-    estimate, and which modes are missing. Priors are not used.
+    The report contains the singular values of the weighted sensitivities S, the correlation of the
+    estimate, which follows from ``(S^T S)^-1``, and the numbers of modes that should be measured in
+    addition. Priors are not used.
 
     Parameters
     ----------

@@ -100,8 +100,9 @@ def frac(H: Any, G: Any) -> FloatArray:
 def fdac(H: Any, G: Any) -> FloatArray:
     """Return the frequency domain assurance criterion of all pairs of lines, from -1 to 1.
 
-    ``Re(h_f^H g_g) / (|h_f| |g_g|)`` with h_f all channels of H at line f: a frequency shift shows
-    as a ridge next to the diagonal.
+    The criterion is ``Re(h_f^H g_k) / (|h_f| |g_k|)``, where h_f contains all channels of H at
+    frequency line f, and g_k those of G at line k. A frequency shift appears as a ridge next to
+    the diagonal.
 
     Parameters
     ----------
@@ -145,7 +146,7 @@ class Correlation(Value):
     freq_error : (m,) array [-]
         Relative error of the model's undamped frequencies.
     zeta_error : (m,) array [-]
-        Error of its damping ratios.
+        Damping ratios of the model minus the measured ones.
     mac : (m, m) array
         MAC of measured shapes (rows) with those of the model; empty without shapes.
     frac : (n_out, n_in) array
@@ -190,7 +191,8 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
     model : ReducedModel or FEModel
         Before or after an update (`UpdateResult.model`).
     residuals : sequence of Residual
-        Poles, shapes and responses are compared; of several of a kind the last.
+        Measurements. Poles, shapes and responses are compared. If there are several of a kind, the
+        last one is used.
 
     Returns
     -------
@@ -274,12 +276,15 @@ class Validation(Value):
         Update with the fitted data.
     fitted, unused : (2,) array
         RMS of the whitened residuals before and after the update, for fitted and for unused data.
-        Where the noise is known, 1 is the expected value from noise and parameter uncertainty:
-        after the update residuals of unused data are whitened by ``I + J C J^T``, of fitted data
-        counted per degree of freedom.
+        Whitened residuals are divided by the standard deviation of their noise. If the noise is
+        known, a value of 1 after the update is expected from noise and parameter uncertainty.
+        Residuals of unused data are whitened by their covariance ``I + J C J^T``, with the
+        sensitivities J and the covariance C of the parameters. For fitted data the sum of squares
+        is divided by the degrees of freedom.
     p_value : float or None
-        Probability of a larger residual of unused data by these alone; None where the noise is not
-        known. Below 1e-4 a change is missing or in the wrong place.
+        Probability of a larger residual of unused data by noise and parameter uncertainty alone;
+        None if the noise is not known. If it is below 1e-4, a change is missing or in the wrong
+        place.
     before, after : Correlation
         Correlation of the unused data with the model before and after the update.
     """
@@ -295,9 +300,10 @@ class Validation(Value):
     def helped(self) -> bool:
         """Whether the updated model predicts data that were not fitted.
 
-        The prediction must be better than before and, with known noise, agree within noise and
-        parameter uncertainty (`p_value` of at least 1e-4); with unknown noise the residual must
-        fall to half. A mass in the wrong place reduces the residual too, but does not predict.
+        The residual of unused data must decrease. With known noise it must also agree with noise
+        and parameter uncertainty (`p_value` of at least 1e-4). With unknown noise it must decrease
+        to less than half. A decrease alone is not enough, because a mass in the wrong place may
+        also reduce the residual, although it does not predict the data.
         """
         if self.p_value is None:
             return bool(self.unused[1] < HALF * self.unused[0])
@@ -323,14 +329,14 @@ def validate(
     rng: Rng = 0,
     prior: bool = True,
 ) -> Validation:
-    """Update with some data and report the error on others.
+    """Update a model with some data and report its error on other data.
 
     Parameters
     ----------
     model, parameters, method, start, starts, rng, prior : as for `update`
     residuals, unused : sequences of Residual
-        Fitted data, and data for the judgement. `Eigenvalues.select`, `ModeShapes.select` and
-        `FrfResidual.select` take parts, as does `split`.
+        Data to be fitted, and data that are only predicted. `Eigenvalues.select`,
+        `ModeShapes.select`, `FrfResidual.select` and `split` return parts of a measurement.
 
     Returns
     -------

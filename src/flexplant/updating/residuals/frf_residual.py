@@ -29,43 +29,47 @@ LEAST = 1.5
 class FrfResidual(Residual):
     """Residuals of measured frequency responses, complex or of the logarithm of their magnitude.
 
-    ``r = (H_exp - H(p)) / sigma`` as [Re; Im], or ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)``,
-    with ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B`` and ``sigma^2 = variance / 2``; of a
-    sampled machine, ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``, its exact equivalent
-    after a zero-order hold.
+    The residual is ``r = (H_exp - H(p)) / sigma`` with real and imaginary part as separate rows, or
+    ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)`` for magnitudes. ``sigma^2 = variance / 2`` is the
+    variance of one part. The model's response is
+    ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B``, where d is 0 for displacement, 1 for
+    velocity and 2 for acceleration. For a sampled machine the exact equivalent after a zero-order
+    hold is used, ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``. T is the sampling time and n
+    the delay in whole samples; Gamma_1 and Gamma_0 also describe a fractional delay.
 
     Parameters
     ----------
     measured : Frf
-        Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
-        (also when None), velocity or acceleration.
+        Responses of outputs to inputs [quantity / N]. `measured.quantity` is displacement, velocity
+        or acceleration; None means displacement.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        ``E|noise|^2`` of each entry; by default that of the Frf, times ``nu / (nu - 1)`` where it
-        was estimated with `freedom` nu; the correlation of lines follows from the window of the
-        Frf. Where neither is known, each entry is divided by the rms of its channel pair.
+        Variance ``E|noise|^2`` of each entry; by default the variance of the Frf. If that was
+        estimated with nu degrees of freedom (`freedom`), it is multiplied by ``nu / (nu - 1)``. The
+        correlation of neighbouring lines follows from the window of the Frf. If no variance is
+        known, each entry is divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: lines where the median over the channels of
         ``|H|^2 / variance`` is above 9 (all lines without a variance), except 0 Hz.
     places : mapping {channel: place}, optional
-        Places of channels; other channels are DOF labels themselves.
+        Places of channels by name. The name of any other channel is taken as a DOF label.
     direction : str
         Direction of motion and force at points.
     magnitude : bool
         Whether to compare ln |H| instead of H, which tolerates phase errors and converges from
         farther away.
     hold : float, optional [Hz]
-        Rate of the zero-order hold between the inputs and the machine, where the response is that
-        of the sampled machine (modes above half the rate then fold into the band).
+        Rate of the zero-order hold between the inputs and the machine, if the response was measured
+        on the sampled machine. Modes above half the rate then appear in the band as aliases.
     delay : float [samples]
-        Delay from the command to the held force, including fractions, if the measurement contains
-        it.
+        Delay from the command to the held force, if the measurement contains it. It may be
+        fractional.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
         When no line remains, the variance is not positive, channels are unknown, lines lie above
-        half the rate of the hold, a delay is given without a hold, or accelerations with a hold
-        (they jump at the sampling instants).
+        half the rate of the hold, a delay is given without a hold, or accelerations are given with
+        a hold (accelerations jump at the sampling instants).
 
     Examples
     --------
@@ -115,13 +119,13 @@ class FrfResidual(Residual):
 
     @property
     def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions of its channels."""
+        """Places and directions of the channels."""
         channels = [*self.measured.outputs, *self.measured.inputs]
         return tuple((place, self.direction) for place in channel_places(channels, self.places))
 
     @property
     def top(self) -> float:
-        """The highest frequency [rad/s] of its lines; of the hold, where there is one."""
+        """The highest frequency [rad/s] of the lines, or of the hold if there is one."""
         highest = float(np.max(self.measured.freq[self.lines]))
         return 2 * np.pi * max(highest, self.hold or 0.0)
 
@@ -132,7 +136,7 @@ class FrfResidual(Residual):
         return self.replace(lines=lines)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return _BoundFrf(self, family)
 
 

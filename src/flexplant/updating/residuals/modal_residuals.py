@@ -79,8 +79,8 @@ class _ModalResidual(Residual):
 class Eigenvalues(_ModalResidual):
     """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
 
-    The paper, eqs. (10) and (12): ``e = d lambda^H W d lambda`` with W real, positive and
-    diagonal.
+    The error is ``e = d lambda^H W d lambda``, where d lambda are the residuals and W is a real,
+    positive and diagonal matrix of weights (equations (10) and (12) of the paper).
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ class Eigenvalues(_ModalResidual):
         Diagonal of W. Default: one over the variance of each pole if `measured` has a covariance,
         else ones.
     clusters : float
-        Relative distance (such as 0.02) below which modes are compared by the mean of their
-        measured poles, which does not depend on how they mix. Zero: each mode is compared
-        separately.
+        Relative distance of poles (such as 0.02). Modes that are closer than this are compared by
+        the mean of their poles, which does not depend on how the modes mix. Zero: each mode is
+        compared separately.
 
     Raises
     ------
@@ -219,14 +219,16 @@ class BoundEigenvalues(Bound):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeShapes(_ModalResidual):
-    """Residuals of measured mode shapes psi at some places, scale and phase removed.
+    """Residuals of measured mode shapes psi at some places, without their scale and phase.
 
-    ``r = (I - P) psi``, P the projector on the model's shape there: the part that no complex factor
-    of the model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
-    ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared with
-    the subspace of their cluster, which does not change when they mix. While fitting, the model's
-    modes are assigned to the measured ones by MAC and frequency: the closest among those with
-    similar shapes at few places.
+    The residual is ``r = (I - P) psi``, where P is the projector on the model's shape at these
+    places. It is the part of the measured shape that no complex multiple of the model's shape
+    explains, and ``|r|^2 = (1 - MAC) |psi|^2`` with the modal assurance criterion MAC. The unknown
+    complex factor is thereby estimated by maximum likelihood. Modes whose measured poles are closer
+    than 2 % form a cluster. They are compared with the subspace of the model's shapes of the
+    cluster, which does not change when the modes mix. While fitting, the model's modes are assigned
+    to the measured ones by MAC and frequency f: the sum of ``1 - MAC + |ln(f_j / f_i)|`` over all
+    pairs is least. If shapes look similar at few places, the frequency thus decides.
 
     Parameters
     ----------
@@ -235,18 +237,19 @@ class ModeShapes(_ModalResidual):
     shapes : (m, modes) real or complex array, optional
         Shapes in the order of the poles, with any scale. None: those of `measured`.
     at : sequence of m places, optional
-        DOF labels, points or mappings. None: the labels of `measured`'s rows; a mapping
-        {row's label: place} where these are names of channels.
+        Places of the rows of the shapes: DOF labels, points or mappings. None: the labels of the
+        rows in `measured`. If these labels are names of channels, a mapping {label: place}.
     direction : str
         Direction of the motion at points.
     std : float or (m, modes) array, optional
-        Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in the scale of
-        each shape. None: equal and unknown.
+        Standard deviation of the noise n of the entries, in the scale of each shape. For a complex
+        entry ``E|n|^2 = std^2``. None: equal for all entries, and unknown.
     covariance : (modes, m, m) array, optional
         ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; its scale is not used, and
         it may be singular. Default: that of `measured` (`shape_covariance`), with its shapes.
     assign : bool
-        Whether modes are assigned by MAC with the measured shapes; False: by continuation.
+        Whether modes are assigned by the MAC with the measured shapes. False: modes are followed
+        from one step of the search to the next, starting with their numbers.
 
     Raises
     ------
@@ -490,7 +493,8 @@ class ShapeCorrelation(ModeShapes):
     ----------
     measured, shapes, at, direction, assign : as in `ModeShapes`
     std, covariance : optional
-        As in `ModeShapes`: weighs the entries in the MAC; the residuals have no known noise.
+        As in `ModeShapes`. They are used as weights of the entries in the MAC only. The noise of
+        the residuals is treated as unknown.
 
     Examples
     --------

@@ -49,23 +49,26 @@ class _PointResidual(Residual):
 class Antiresonances(_PointResidual):
     """Residuals of complex transmission zeros of one response, ``z_exp - z``.
 
-    Zeros of ``c (s^2 M + s D + K)^-1 b``: eigenvalues of ``[P(s) b; c 0]``, with
-    ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``. The measured zeros are paired with the nearest
-    of the model, one to one.
+    The zeros z of the response ``c P(s)^-1 b`` with ``P(s) = s^2 M + s D + K`` are the eigenvalues
+    of ``[P(s) b; c 0]``. Their derivatives are ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``, where
+    P_p is the derivative of P to p, and x and y are right and left eigenvectors. Each measured zero
+    is paired with the nearest zero of the model, one to one.
 
     Parameters
     ----------
     zeros : (m,) complex array [rad/s]
-        One zero of each conjugate pair, stored with Im > 0, with any sign of the real part.
+        Measured zeros, one of each conjugate pair. They are stored with Im > 0; the real part may
+        have any sign.
     output, input : place
         Places between which the response was measured.
     direction : str
         Direction of motion and force at points.
     std : float or (m,) array [rad/s], optional
-        ``E|noise|^2 = std^2`` of each.
+        Standard deviation of each zero, with ``E|noise|^2 = std^2``. None: not known.
     hold : float, optional [Hz]
-        Rate of the zero-order hold of a sampled measurement; its zeros are then ``ln(z) rate``,
-        which differ from the continuous ones. A delay of whole samples moves none.
+        Rate of the zero-order hold of a sampled measurement. The zeros are then ``ln(z) rate`` for
+        the zeros z of the sampled response, which differ from those of the continuous one. A delay
+        of whole samples does not change the zeros.
 
     Examples
     --------
@@ -104,7 +107,7 @@ class Antiresonances(_PointResidual):
 
     @property
     def top(self) -> float:
-        """The highest frequency [rad/s] of its zeros; of the hold, where there is one."""
+        """The highest frequency [rad/s] of the zeros, or of the hold if there is one."""
         return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
 
     def bound(self, family: Family) -> Bound:
@@ -186,8 +189,10 @@ class _BoundZeros(Bound):
 class StaticCompliance(_PointResidual):
     """Residuals of a static compliance, ``g_exp - c K^-1 b``.
 
-    For a free structure it is the elastic part (inertia relief): ``u`` of ``[K, M R; R^T M, 0]``
-    with the rigid-body motions R. A machine shows it between its suspension and its first mode.
+    c and b are the rows of the place of motion and of the place of force. For a free structure, the
+    compliance is that of the elastic modes (inertia relief): the displacements u solve the system
+    of the matrix ``[K, M R; R^T M, 0]`` with the rigid-body motions R. On a machine it is measured
+    at frequencies between the suspension modes and the first elastic mode.
 
     Parameters
     ----------
@@ -196,7 +201,7 @@ class StaticCompliance(_PointResidual):
     output, input, direction
         Places of motion and force, as for `Antiresonances`.
     std : float [m/N], optional
-        Standard deviation. None: not known; the residual is relative to `value`.
+        Standard deviation of `value`. None: not known; the residual is then divided by `value`.
 
     Examples
     --------

@@ -40,7 +40,7 @@ class Residual(Value):
 
     @abstractmethod
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to the rows of one family of models."""
+        """Return the residual for one family of models, as a `Bound`."""
 
 
 class Kind(NamedTuple):
@@ -54,10 +54,11 @@ class Kind(NamedTuple):
 
 
 class Bound(ABC):
-    """A residual tied to a family of models: its values, and their exact gradients.
+    """A residual for one family of models: its values, and their exact gradients.
 
-    The base class of what `Residual.bound` returns. Values have unit covariance where the noise of
-    the measurement is known.
+    A family is a model with its possible values of the parameters. This is the base class of the
+    objects that `Residual.bound` returns. If the noise of the measurement is known, the values are
+    scaled to unit covariance (whitened).
     """
 
     #: numbers of the modes that it follows
@@ -86,12 +87,12 @@ class Bound(ABC):
 
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
-        """Return their derivatives (m, q)."""
+        """Return the derivatives (m, q) of `values` to the parameters."""
 
     def kinds(self) -> list[Kind]:
-        """Return the kinds of errors of a model that show in the rows, empty where not described.
+        """Return the kinds of model errors that affect the rows; empty if none is described.
 
-        By default one error for each row, relative to its measured value.
+        By default each row has one independent error, relative to its measured value.
         """
         return [Kind(self.kind, np.diag(np.atleast_1d(self.size)), self.usual)]
 

@@ -45,15 +45,15 @@ class _ImpossibleError(Exception):
 class TrustRegion(UpdateMethod):
     """Levenberg-Marquardt steps in a trust region that keeps to the bounds of the parameters.
 
-    `scipy.optimize.least_squares` (method trf) with exact gradients.
+    The search is `scipy.optimize.least_squares` (method "trf") with exact gradients.
 
     Parameters
     ----------
     loss : {"linear", "huber", "soft_l1", "cauchy"}
-        Loss function rho(r^2) of each whitened residual; robust losses reduce the effect of
-        outliers.
+        Loss function rho(r^2) of each whitened residual r, which is the residual divided by its
+        standard deviation. All losses except "linear" reduce the effect of outliers.
     scale : float
-        Residuals above this many (standard deviations) count as outliers.
+        Number of standard deviations above which a residual counts as an outlier.
 
     References
     ----------
@@ -209,14 +209,16 @@ EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 class GaussNewton(UpdateMethod):
     """The paper's weighted Gauss-Newton iteration, (13) and (14), with step halving.
 
-    Eigenvalues alone are weighted by W of (12). It ends when a full step changes the fitted values
-    by less than the relative tolerance.
+    The equations are those of the paper that is cited below. If only eigenvalues are fitted, they
+    are weighted by the matrix W of equation (12). The iteration ends when a full step changes the
+    fitted values by less than the relative tolerance.
 
     Parameters
     ----------
     truncate : float
-        Truncated SVD: singular values of the (column-scaled) sensitivities below this fraction of
-        the largest are left out of a step. Zero: all are used, and a singular S raises an error.
+        Fraction of the largest singular value for a truncated SVD. Smaller singular values of the
+        (column-scaled) sensitivities S are left out of a step. With zero all are used, and a
+        singular S raises an error.
 
     References
     ----------
@@ -245,7 +247,7 @@ class GaussNewton(UpdateMethod):
 
     @property
     def penalised(self) -> bool:
-        """Whether directions are left out, in which the result stays at the start."""
+        """Whether the result stays at the start in some directions, which are left out."""
         return self.truncate > 0
 
     def search(

@@ -296,7 +296,7 @@ class SearchEnd:
 class UpdateMethod(Value):
     """The base class of methods that minimise the residuals.
 
-    A new method is a subclass with a `search`, in a separate module.
+    A new method is a subclass that defines `search`.
 
     Examples
     --------
@@ -340,7 +340,7 @@ class UpdateMethod(Value):
         start : (q,) array
             Start values of the parameters.
         most : int, optional
-            Largest number of steps; `steps` by default.
+            Largest number of steps; by default the attribute `steps` of the method.
         tolerance : float
             Relative change of the fitted values that counts as zero.
 
