@@ -150,7 +150,7 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlacedShape(Interpolation):
-    """The shapes of a component that was rotated and shifted.
+    """The shape functions of a component that was rotated and shifted.
 
     Parameters
     ----------
@@ -188,7 +188,8 @@ class PlacedShape(Interpolation):
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        After rotation it combines the directions of its node, which must all be known.
+        After a rotation of the component, the DOF combines several directions of its node. All of
+        these must be known.
         """
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
@@ -211,7 +212,7 @@ class PlacedShape(Interpolation):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JoinedShape(Interpolation):
-    """The shapes of all components of a joined machine.
+    """The shape functions of all components of a joined machine.
 
     Parameters
     ----------
@@ -222,7 +223,8 @@ class JoinedShape(Interpolation):
     expansion : (n_all, n) sparse array, optional
         Matrix that gives all DOFs of all components from the remaining ones. None: all remain.
     motions : (n_all, k) array, optional
-        All motions of a reduced machine, which show whether places of two components move together.
+        All motions that a reduced machine can make, one in each column. They show whether the
+        places of two components at one point move together.
 
     Examples
     --------
@@ -244,7 +246,8 @@ class JoinedShape(Interpolation):
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs in the motion `direction` at a point.
 
-        It must be on a component with this motion, and not on another one that moves independently.
+        The point must lie on a component that has this motion. If it also lies on another
+        component, both must move together there; otherwise a LabelError is raised.
         """
         found: dict[str, FloatArray] = {}
         failed: list[str] = []
@@ -308,8 +311,9 @@ class Pose(Value):
     shift : (3,) array [m]
         New position of its origin.
     rotation : (3,) array [rad] or (3, 3) array
-        Rotation vector about the origin of the component: its direction is the axis, its length the
-        angle. Or the matrix R.
+        Either the rotation vector or the rotation matrix R. The rotation vector gives a rotation
+        about the origin of the component: its direction is the axis of the rotation, and its length
+        is the angle.
 
     Raises
     ------
@@ -362,7 +366,9 @@ class Pose(Value):
     def own_ground(self) -> FloatArray:
         """Return the (6, 6) map of ground motion about the machine's origin to the component's.
 
-        Translation and rotation in the component: ``R^T (v + w x shift)`` and ``R^T w``.
+        The ground moves by the translation v and the rotation w, both in the machine's coordinates.
+        In the component these are the translation ``R^T (v + w x shift)`` and the rotation
+        ``R^T w``.
         """
         x, y, z = self.shift
         back = self.rotation.T

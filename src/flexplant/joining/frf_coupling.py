@@ -143,13 +143,15 @@ def uncoupled(
     """Return the responses of a machine without some of its components.
 
     The negative of a known component is coupled to the machine at its joints, so that the remainder
-    responds as if the component had never been joined (LM-FBS decoupling). Springs of such a
-    component stay at the remainder, with free ends.
+    responds as if the component had never been joined. This is decoupling by LM-FBS, Lagrange
+    multiplier frequency-based substructuring. A spring between the component and the remainder
+    stays attached to the remainder; its other end is then free.
 
     The result is a difference: where the component dominates the machine, errors of 1 % in the
-    responses may be larger than the result. Variances of the responses give the variance of the
-    result to first order, with errors that are assumed independent. Without variances the warning
-    assumes an error of 1 % in each response (state ``variance`` 0 for exact responses).
+    responses may be larger than the result. The variances of the responses give the variance of the
+    result to first order; the errors of different responses are assumed independent. If no response
+    has a variance, an error of 1 % in each response is assumed, and only for the warning below. For
+    exact responses, set their ``variance`` to 0.
 
     Parameters
     ----------
@@ -162,12 +164,14 @@ def uncoupled(
     joints : Joint or sequence of Joint
         Joints between these components and the rest.
     dofs : mapping {str: DofSet}, optional
-        Places of the channels of components, for patches and lever arms.
+        Positions of the channels of components. They are needed for patches and for joints with
+        lever arms.
     extended : bool
-        Whether to extend the interface to all channels of the known components that the machine has
-        too, as outputs or inputs. This gives more equations, solved by least squares with the rank
-        of the joints. It helps where the joints alone hardly determine their forces, and needs no
-        matched pairs.
+        Whether to use more channels than those of the joints: all channels of the known components
+        that are also outputs or inputs of the machine. This gives more equations than unknown
+        forces. They are solved by least squares, with a rank that is limited to that of the joints.
+        It helps where the channels at the joints hardly determine the forces of the joints. An
+        additional channel may be only an output or only an input.
 
     Returns
     -------

@@ -60,18 +60,21 @@ def joined(
 ) -> FEModel | ReducedModel | Frf:
     """Return a machine of components that are connected by joints.
 
-    ``q = T q_k`` fulfils the rigid joints, ``B q = 0``; the machine has ``T^T M T``,
-    ``T^T (K + b k b^T) T`` and ``T^T (D + b c b^T) T``, where M, K and D are those of all
-    components and b is the stretch of a spring or damper. The dependent coordinates are found by QR
-    with column pivoting, separately for groups of constraints that share coordinates. Joints that
-    repeat others are allowed.
+    The rigid joints are the constraints ``B q = 0`` on the coordinates q of all components. They
+    are fulfilled by ``q = T q_k``, where q_k are the coordinates that remain. The machine then has
+    the mass ``T^T M T``, the stiffness ``T^T (K + b k b^T) T`` and the damping
+    ``T^T (D + b c b^T) T``. M, K and D are the block-diagonal matrices of all components, ``b^T q``
+    is the stretch of a spring or damper, k its stiffness and c its rate. The dependent coordinates
+    are found by QR with column pivoting, separately for groups of constraints that share
+    coordinates. Joints that repeat others are allowed.
 
     Parameters
     ----------
     components : mapping {str: FEModel or ReducedModel}, or {str: Frf}
         Components by name. Labels of the machine begin with the name: "stage/41:z". Either all or
-        none are measured responses; these have joints between channels that are outputs "41:z" and
-        inputs "41:z" or "u 41:z".
+        none of the components are measured responses. A joint of measured responses needs, at each
+        of its ends, the motion as an output and the force as an input: the output is named "41:z",
+        the input "41:z" or "u 41:z".
     joints : Joint or sequence of Joint
         Joints between the components. The second end of a rigid joint follows the first.
     placed : mapping {str: Pose}, optional
@@ -81,18 +84,21 @@ def joined(
         Name of an FEModel, for display.
     dofs : mapping {str: DofSet}, optional
         Positions of the nodes of measured components in the coordinates of the machine, for joints
-        with lever arms and patches. The mean motion of a `Patch` is that of its outputs, and its
-        force acts on its inputs, which may be other channels (virtual point transformation).
+        with lever arms and patches. The mean motion of a `Patch` is computed from the outputs on
+        it, and its force is distributed over the inputs on it. The outputs and the inputs may be at
+        different places; this is the virtual point transformation.
 
     Returns
     -------
     FEModel, ReducedModel or Frf
-        A sparse FEModel from FEModels; a ReducedModel when a component is reduced. Dependent DOFs
-        stay known by their labels, as places. `joining` holds the checks: gaps, balance of forces,
-        inertia, rigid-body motions, errors of patches. Modes that the reduction of a component left
-        out are lost. From responses the result is ``Y - Y B^T (B Y B^T + Z)^-1 B Y``, where Z is
-        the compliance of springs and dampers (LM-FBS); variances of independent responses give
-        those of the machine to first order.
+        A sparse FEModel from FEModels; a ReducedModel when a component is reduced. DOFs that the
+        rigid joints remove can still be used as places, by their labels. The attribute `joining` of
+        a model holds the checks of `JoiningReport`. Modes that the reduction of a component left
+        out are lost. For measured responses the result is ``Y - Y B^T (B Y B^T + Z)^-1 B Y``. Here
+        Y is the block-diagonal matrix of the components' responses, B y the stretch of the joints
+        in the motions y, and Z the compliance of springs and dampers. This method is called LM-FBS,
+        Lagrange multiplier frequency-based substructuring. The variances of the responses give
+        those of the machine to first order; errors of different components are assumed independent.
 
     Raises
     ------
@@ -474,19 +480,21 @@ class JoiningReport(Value):
     Parameters
     ----------
     gap : float
-        Largest opening of a rigid joint over all motions of the machine, relative to the terms that
-        cancel there.
+        Largest opening of a rigid joint over all motions of the machine. The opening is a
+        difference of the motions of both ends; it is given relative to the sum of their magnitudes.
     balance : float
-        Largest relative resultant of the forces of a joint between two components. It is not zero
-        when a motion of the whole machine stretches the joint. Springs with a resultant lead to a
-        warning; rigid joints have no resultant.
+        Largest resultant on the machine of a unit force in a joint between two components. Moments
+        are divided by the size of the machine. The resultant is zero where the forces on both
+        components are equal and opposite. It is not zero when a rigid-body motion of the whole
+        machine stretches the joint. `joined` warns of springs with a resultant; rigid joints must
+        not have one.
     mass : float [kg]
-        Mass of the machine; NaN without displacements.
+        Mass of the machine; NaN if the machine has no displacement DOFs.
     inertia_error : float
         Largest relative difference between the inertia of the machine in the six rigid-body motions
         and the sum over its components.
     constraints, rank : int
-        Number of axes of rigid joints, and number of independent ones.
+        Number of axes of all rigid joints, and number of those that are independent of each other.
     rigid : mapping {str: int}
         Number of rigid-body motions of each component before joining.
     pieces : mapping {str: int}
@@ -495,11 +503,13 @@ class JoiningReport(Value):
     n_rigid : int
         Number of rigid-body motions of the machine.
     rigid_force : float
-        Largest elastic force of these motions, relative to the terms that cancel.
+        Largest elastic force K q in the rigid-body motions q of the machine, which should be zero.
+        It is given relative to the force without cancellation, |K| |q|.
     patches : mapping {str: float}
-        For each joint of a patch, the largest relative difference over its axes between the
-        compliance of its mean motion and that of a rigid patch. The error of either assumption is
-        smaller.
+        For each joint of a patch, the relative difference between two compliances of the joint:
+        that of a patch that may bend, and that of a rigid patch. The largest value over the axes of
+        the joint is given. The compliance of a bonded patch lies between the two, so that the error
+        of either assumption is smaller than this difference.
 
     Examples
     --------

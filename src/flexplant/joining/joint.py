@@ -43,10 +43,11 @@ class Joint(Value):
     rate : float or one for each axis [N s/m, N m s/rad], optional
         Damping of dampers.
     point : (3,) array [m], optional
-        Point where the joint acts; both ends reach it with lever arms, by their rotations. None:
-        the first end. DOFs have no lever arm. A node without rotations uses the rotation of its
-        neighbours, for arms up to 1e-4 of the machine's size, which come from coordinates with few
-        digits.
+        Point where the joint acts. Each end moves at this point as if a rigid lever arm connected
+        the two, so that the rotation of the end adds to its displacement. None: the point is the
+        first end. An end that is given as a DOF has no lever arm. A node without rotations uses the
+        rotation of its neighbours. This is allowed for lever arms up to 1e-4 of the machine's size,
+        which occur when coordinates are written with few digits.
 
     Examples
     --------
@@ -156,17 +157,18 @@ class Patch(Value):
     """Nodes of a component whose mean motion is joined, as by NASTRAN's RBE3.
 
     Displacements u of the nodes have the mean motion ``v = (A^T W A)^-1 A^T W u``, where A are the
-    rigid-body motions about the point of the patch: it is the closest rigid motion. A force on the
-    patch is distributed over its nodes with the same weights, and the patch may bend. A rigid patch
-    (RBE2) is too stiff; a bonded patch lies between the two, and the certificate of `joined` states
-    their difference.
+    rigid-body motions about the point of the patch: it is the closest rigid motion. W is the
+    diagonal matrix of the weights. A force on the patch is distributed over its nodes with the same
+    weights, and the patch may bend, so that it is too soft. A rigid patch (RBE2) is too stiff. The
+    stiffness of a real bonded patch lies between the two. `JoiningReport` states how far the two
+    differ.
 
     Parameters
     ----------
     component : str
         Component of the nodes; "machine/stage" for a component of a joined machine.
     nodes : sequence of int, optional
-        Node numbers; None: the nodes in the box.
+        Node numbers. None: all nodes of the component in the box.
     box : (2, 3) array [m], optional
         Lowest and highest corner, in the coordinates of the machine.
     at : (3,) array [m], optional

@@ -170,7 +170,8 @@ def coincident_joints(
 ) -> list[Joint]:
     """Return rigid joints of all coincident nodes of different components.
 
-    It serves meshes that match. Each joint connects the directions that both nodes have.
+    Use it for components whose meshes match at the interface. Each joint connects the directions
+    that both nodes have.
 
     Parameters
     ----------

@@ -29,12 +29,14 @@ class BalancedReduction(Value):
     system : StateSpace
         The reduced system: balanced states, then the unchanged rigid-body and unstable ones.
     hankel : (n_stable,) array [output unit / input unit]
-        Hankel singular values of the stable part (of the weighted one), the largest first.
+        Hankel singular values of the stable part, the largest first. With weights they are those of
+        the weighted stable part.
     bound : float [output unit / input unit]
         Twice the sum of the discarded values: no frequency has a larger error. NaN with weights,
         where no such bound holds.
     error : float [output unit / input unit]
-        H-infinity norm of the error that was made, computed from the error system (weighted).
+        H-infinity norm of the difference between the given and the reduced system, computed from
+        this difference. With weights it is the norm of the weighted difference.
     error_freq : float [Hz]
         Frequency of the largest error.
     n_kept : int
@@ -77,10 +79,11 @@ def balanced(
 ) -> BalancedReduction:
     """Return a system with fewer states by balanced truncation or residualisation.
 
-    ``|G - G_r| <= 2 (s_{r+1} + ... + s_n)`` in the H-infinity norm, s the Hankel singular values
-    of the stable part. Rigid-body and unstable modes are split off first and kept exactly. With
-    weights (Enns) the states are balanced as the weights see them, and ``W_o (G - G_r) W_i`` is
-    measured.
+    The error obeys ``|G - G_r| <= 2 (s_{r+1} + ... + s_n)`` in the H-infinity norm. Here G_r is the
+    reduced system, and s_{r+1} to s_n are the Hankel singular values of the stable part that are
+    discarded. Rigid-body and unstable modes are split off first and kept exactly. With weights, the
+    Gramians are those of the weighted system ``W_o G W_i`` (method of Enns), and the error is the
+    norm of ``W_o (G - G_r) W_i``.
 
     Parameters
     ----------
@@ -92,9 +95,10 @@ def balanced(
         Relative error: the result has the smallest order whose bound is at most this times the
         largest Hankel singular value.
     match_dc : bool
-        Whether to residualise: the gain at 0 Hz is kept instead of that at infinite frequency. The
-        discarded states are set to equilibrium (singular perturbation) instead of zero; the bound
-        is the same.
+        True keeps the gain at 0 Hz by residualisation (singular perturbation): the discarded states
+        are assumed to be at rest (their derivatives are zero). False keeps the gain at infinite
+        frequency by truncation: the discarded states themselves are set to zero. The error bound is
+        the same.
     input_weight, output_weight : StateSpace, optional
         Stable filters before the inputs and after the outputs, connected in order.
 
@@ -203,8 +207,9 @@ def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace:
 def hankel_values(sys: System) -> FloatArray:
     """Return the Hankel singular values, the largest first.
 
-    They are the square roots of the eigenvalues of P Q, computed from factors of the two Gramians,
-    so that values far below the largest stay accurate.
+    They are the square roots of the eigenvalues of P Q, where P is the controllability Gramian and
+    Q the observability Gramian. They are computed from factors of the two Gramians, so that values
+    far below the largest one are accurate too.
 
     Parameters
     ----------
@@ -280,7 +285,8 @@ class NormReport(Value):
     freq : float [Hz]
         Frequency of the peak of the response, or of the pole that makes the norms infinite.
     reasons : sequence of str
-        One sentence for each thing that makes a norm infinite; empty when all are finite.
+        Reasons why norms are infinite, one sentence for each reason; empty when all norms are
+        finite.
 
     Examples
     --------

@@ -134,13 +134,16 @@ def descriptor(
     """Return the state space of a descriptor system; equations without a derivative are solved.
 
     ``E dx/dt = A x + B u, y = C x + D u`` (or ``E x[k+1]``). A singular value decomposition of E
-    separates the equations ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, which give x_2.
+    divides the states into x_1, whose derivatives occur in the equations, and x_2, whose
+    derivatives do not occur. The equations without a derivative,
+    ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, give x_2.
 
     Parameters
     ----------
     A, B, C, D, E : (n, n), (n, m), (p, n), (p, m), (n, n) arrays
         E may be singular; D may be the number 0.
     dt : float [s]
+        Sampling time; 0 for continuous time.
 
     Returns
     -------

@@ -22,10 +22,10 @@ from .statespace import StateSpace, System, as_statespace
 class Delayed(Value):
     """``(G(s) + s F) e^(-s delay)``: a continuous system, a derivative and a delay.
 
-    The derivative is that of a PD law, or of another law with one more zero than poles. Such a law
-    has no state-space form. Its product with a strictly proper plant is an ordinary system.
-    `flexplant.loop.DelayedLoop` judges loops, `pade` gives a system with states where one is
-    needed.
+    The term s F is the derivative of a PD controller, or of another controller with one more zero
+    than poles. Such a controller has no state-space form. Its product with a strictly proper plant
+    is an ordinary system again. `flexplant.loop.DelayedLoop` judges loops, `pade` gives a system
+    with states where one is needed.
 
     Parameters
     ----------
@@ -151,7 +151,8 @@ class Delayed(Value):
     def pade(self, order: int) -> StateSpace:
         """Return the system with Pade's approximation of the delay, for designs that need states.
 
-        Its error is ``|1 - P(jw) e^(jw delay)|``: `pade_error` gives it at a frequency.
+        The order is the number of states of the approximation P of each delay. Its relative error
+        is ``|1 - P(jw) e^(jw delay)|``; `pade_error` returns it at a frequency.
         """
         if np.any(self.slope):
             raise ModelError(f"{self!r} has no state space: add a filter to its derivative.")

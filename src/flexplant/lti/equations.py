@@ -342,9 +342,10 @@ def symmetrised(X: FloatArray) -> FloatArray:
 def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
 
-    The method is doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``, in scaled states.
-    Entry (i, j) of the residual is at most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``, where
-    ``T = |A| |X| |A'| + |Q|`` is the size of the terms before cancellation.
+    The method is doubling (the squared Smith method). In scaled states, each step replaces X by
+    ``X + A X A'``, then A by ``A A``. Entry (i, j) of the residual is at most 1e-10 times
+    ``T_ij + (T_ii T_jj)^(1/2)``, where ``T = |A| |X| |A'| + |Q|`` is the size of the terms before
+    cancellation.
 
     Parameters
     ----------

@@ -48,7 +48,8 @@ def zpk(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt: float = 0.0
     Parameters
     ----------
     zeros, poles : sequences of complex [rad/s, or of z]
-        Complex ones with their conjugates; at most as many zeros as poles.
+        Zeros and poles; each complex number must be listed together with its conjugate. There are
+        at most as many zeros as poles.
     gain : float
         Factor of the products.
     dt : float [s]
@@ -253,7 +254,7 @@ def notch_filter(freq: float, *, depth: float = 0.05, width: float = 0.5) -> Sta
     Returns
     -------
     StateSpace
-        ``(p^2 + 2 depth width p + 1) / (p^2 + 2 width p + 1)``, p = s / w.
+        ``(p^2 + 2 depth width p + 1) / (p^2 + 2 width p + 1)`` with p = s / w and w = 2 pi freq.
 
     Raises
     ------
@@ -310,7 +311,7 @@ def inverse_sensitivity(
     Parameters
     ----------
     bandwidth : float [Hz]
-        Frequency at which the bound on |S| crosses 1.
+        Frequency at which the bound 1 / |W| on the sensitivity |S| crosses 1.
     peak : float
         Bound on |S| at high frequencies.
     floor : float

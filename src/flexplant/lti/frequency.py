@@ -188,8 +188,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     variance : (n_out, n_in, n_freq) array, optional
         Variance of a measurement, E|error|^2 of each entry.
     freedom : float, optional
-        Complex degrees of freedom nu of each variance, where it was estimated from few runs (R
-        runs: R - 1): the mean of |error|^2 / variance is then ``nu / (nu - 1)``.
+        Number nu of complex degrees of freedom of each variance. Give it when the variances were
+        estimated from few runs: R runs have ``nu = R - 1``. The estimated variance is then
+        uncertain, and the mean of |error|^2 / variance is ``nu / (nu - 1)`` instead of 1.
     correlation : (n_out, n_out, n_freq) complex array, optional
         Correlation of the errors of different outputs of a measurement under the same input (a
         disturbance reaches all of them), with ones on the diagonal.
@@ -197,9 +198,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Resolution of a measurement: inverse of the length of the transformed segment or period.
     window : str or tuple, optional
         Window of the segments over which a measurement was averaged, as `scipy.signal.get_window`
-        takes it; needs `resolution`. Such lines leak, and their errors are correlated
-        (`line_correlation`). None for responses without leakage: computed, or measured over whole
-        periods.
+        takes it; needs `resolution`. A window causes leakage between neighbouring frequency lines,
+        so that their errors are correlated (`line_correlation`). None is for responses without
+        leakage: those that were computed, or measured over whole periods.
     overlap : float
         Fraction of a segment that overlaps with the next one, from 0 to below 0.95.
     units : mapping {channel: unit}, optional
@@ -207,10 +208,11 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 
     Notes
     -----
-    Responses can be combined with numbers, responses on the same lines and systems. Errors of two
-    responses are assumed independent, so that variances add; the variance of a product is
-    ``|G2|^2 var G1 + |G1|^2 var G2`` to first order. A system adds no variance. Data of a single
-    measurement (coherence, correlation of outputs, segments) are left out of sums and products.
+    Responses can be added to and multiplied by numbers, systems, and other responses at the same
+    frequencies. Errors of two responses are assumed independent, so that variances add; the
+    variance of a product is ``|G2|^2 var G1 + |G1|^2 var G2`` to first order. A system adds no
+    variance. Data of a single measurement (coherence, correlation of outputs, segments) are left
+    out of sums and products.
 
     Raises
     ------
@@ -414,11 +416,12 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     def line_correlation(self) -> sp.csr_array | None:
         r"""Return the correlation (n_freq, n_freq) of errors of different lines, or None.
 
-        Lines averaged over windowed segments share data with their neighbours: under a Hann
-        window errors of neighbours are correlated by 4/9, of lines two apart by 1/36, so that a
-        mean over many lines has 1 + 2 (4/9 + 1/36) = 1.94 times the variance that independent
-        ones would give. The result is None if lines are independent: computed, or measured over
-        whole periods.
+        A line is the response at one frequency. Lines that are averaged over windowed segments
+        share data with their neighbours. Under a Hann window the errors of neighbours have the
+        correlation 4/9, and those of lines two apart 1/36. The mean over many lines then has 1 + 2
+        (4/9 + 1/36) = 1.94 times the variance that it has for independent lines. The result is None
+        if the lines are independent, which is the case for computed responses and for responses
+        that were measured over whole periods.
         """
         if self.window is None or self.resolution is None:
             return None
@@ -524,9 +527,10 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     """Return the frequency response ``C (s I - A)^-1 B + D``.
 
-    s = 2 pi i f, or exp(2 pi i f dt) when sampled. Where A has 1 x 1 and 2 x 2 diagonal blocks
-    each is solved in closed form, so that a frequency costs O(n) when A is block diagonal;
-    otherwise by its poles and residues, or its Schur form where eigenvectors are ill-conditioned.
+    s = 2 pi i f, or exp(2 pi i f dt) when sampled. If A has 1 x 1 and 2 x 2 diagonal blocks, each
+    block is solved in closed form; the cost of a frequency is then proportional to the number of
+    states when A is block diagonal. Otherwise the response is computed from the poles and residues,
+    or from the Schur form of A if its eigenvectors are ill-conditioned.
 
     Parameters
     ----------

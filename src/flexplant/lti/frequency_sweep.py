@@ -32,11 +32,12 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     """Return a grid [Hz] that follows the resonances and antiresonances of every channel.
 
     The grid extends from a decade below the slowest pole to a decade above the fastest (or half the
-    sampling rate), with points through every resonance. Its intervals are halved, the worst first,
-    until a line through the points shows the response. In the middle of each interval the logarithm
-    of every channel's magnitude is then within `tolerance` of the line between its ends, and no
-    phase changes by more than 0.6 rad. The grid has a gap at an undamped resonance, which has no
-    finite response.
+    sampling rate), with points through every resonance. Intervals between points are halved, the
+    worst first, until straight lines between the points represent the response. In the middle of
+    each interval, the logarithm of the magnitude of every channel then differs by at most
+    `tolerance` from the straight line between the ends of the interval. No phase changes by more
+    than 0.6 rad over an interval. The grid has a gap at an undamped resonance, which has no finite
+    response.
 
     Parameters
     ----------

@@ -134,8 +134,9 @@ def parallel(first: System, second: System) -> StateSpace:
 def lft(P: System, K: System) -> StateSpace:
     """Return the lower linear fractional transformation of P with ``u = K y``.
 
-    ``F_l(P, K) = P11 + P12 K (I - P22 K)^-1 P21``, connected by name: the inputs of K are outputs
-    of P, the outputs of K inputs of P; what remains of P stays open, in order.
+    ``F_l(P, K) = P11 + P12 K (I - P22 K)^-1 P21``, connected by name. Each input of K has the name
+    of an output of P, and each output of K the name of an input of P. The other inputs and outputs
+    of P are those of the result, in the same order.
 
     Parameters
     ----------
@@ -282,7 +283,8 @@ def connect(
 ) -> StateSpace:
     """Return the interconnection of systems by name.
 
-    A system's input is driven by the output or the outer input of the same name.
+    Each input of a system is driven by the output of another system, or by the outer input, that
+    has the same name. The systems are also called blocks below.
 
     Parameters
     ----------

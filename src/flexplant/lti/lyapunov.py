@@ -20,7 +20,7 @@ from .statespace import StateSpace, System, as_statespace
 def controllability_gramian(sys: System) -> FloatArray:
     """Return P (n, n): ``A P + P A' + B B' = 0``, or ``P = A P A' + B B'`` when sampled.
 
-    If A is block diagonal with 1 x 1 and 2 x 2 blocks, each block of P has a closed form.
+    A closed form gives each block of P if A is block diagonal with 1 x 1 and 2 x 2 blocks.
 
     Parameters
     ----------

@@ -31,10 +31,10 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
 
     Each mode is judged at its own frequency: it is removed if its peak is below `tol` times the
     response of the whole system there, independent of larger responses at other frequencies. Modes
-    with equal poles are judged together: their balanced states with Hankel singular values below
-    `tol` times the largest one are removed. Channels are scaled to equal size, so that units do not
-    decide. The responses at the frequencies of all kept modes are compared with those of `sys`,
-    which is returned unchanged if they do not agree.
+    with equal poles are judged together. Their states are balanced, and states with Hankel singular
+    values below `tol` times the largest one are removed. Channels are scaled to equal size, so that
+    units do not decide. The responses at the frequencies of all kept modes are compared with those
+    of `sys`, which is returned unchanged if they do not agree.
 
     Parameters
     ----------

@@ -24,13 +24,16 @@ class ModalForm(Value):
     Parameters
     ----------
     system : StateSpace
-        With 1 x 1 and 2 x 2 blocks; the system as given when `reason` is not empty.
+        System whose A has 1 x 1 and 2 x 2 diagonal blocks; the system as given when `reason` is not
+        empty.
     transformation : (n, n) array
         ``x = T x_modal``; the identity when `reason` is not empty.
     condition : float
-        Condition number of the eigenvectors for balanced states, by which rounding grows.
+        Condition number of the matrix of eigenvectors, for balanced states. Rounding errors grow by
+        this factor.
     residual : float
-        Norm of the part of ``T^-1 A T`` outside of the blocks, relative to A, for balanced states.
+        Norm of the entries of ``T^-1 A T`` outside of the blocks, relative to the norm of A, for
+        balanced states. It shows how exact the blocks are.
     reason : str
         Reason why the dense form was kept; empty if blocks were found.
 
@@ -56,9 +59,10 @@ class ModalForm(Value):
 def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     """Return a system with A in real blocks: [[s, w], [-w, s]] per pair, [p] per real pole.
 
-    Rigid-body modes (pairs of poles at 0, defective) become integrator pairs [[0, w], [0, 0]],
-    exactly at 0 (at 1 when sampled). States are balanced between input and output. Responses,
-    Gramians and sampling then cost O(n) per mode.
+    A rigid-body mode has two poles at 0 but only one eigenvector. It becomes a pair of integrators
+    [[0, w], [0, 0]], whose poles are exactly at 0 (at 1 when sampled). The states are scaled so
+    that inputs and outputs have gains of similar size. With such blocks, the cost of frequency
+    responses, Gramians and sampling grows only linearly with the number of modes.
 
     Parameters
     ----------
@@ -222,7 +226,8 @@ class StableSplit(Value):
     rest : StateSpace
         Part with the rigid-body, marginal and unstable modes, strictly proper.
     separation : float
-        Norm of the decoupling transformation, by which rounding grows; 0 if A had blocks.
+        Norm of the transformation that separates the two parts; rounding errors grow with it. It is
+        0 if A had diagonal blocks, which need no transformation.
     """
 
     stable: StateSpace

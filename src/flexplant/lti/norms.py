@@ -28,10 +28,10 @@ from .statespace import StateSpace, System, as_statespace
 def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     """Return the H-infinity norm: the largest gain over all frequencies and input directions.
 
-    The relative accuracy is 1e-8, or ``eps |A| / |Re p|`` where that is larger, with the pole p of
-    the peak: rounding moves the poles of a dense A by eps |A|. This matters for damping ratios
-    below 1e-8, but not in modal blocks, which `modal_form` and assembled plants have. See
-    `peak_gain`.
+    The relative accuracy is 1e-8, or ``eps |A| / |Re p|`` if that is larger. Here p is the pole
+    that causes the peak, and eps is the machine precision: rounding moves the poles of a dense
+    matrix A by about eps |A|. This matters only for damping ratios below 1e-8. It does not matter
+    for systems in modal blocks, which `modal_form` and assembled plants have. See `peak_gain`.
 
     Parameters
     ----------
@@ -65,12 +65,14 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
 def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, float]:
     """Return the largest gain over all frequencies, and the frequency of the peak.
 
-    Newton's steps lead from the resonances to a peak. A proof on intervals shows that no frequency
-    exceeds it by 1e-9: it uses the series of ``D + sum R_i / (s - p_i)``, whose remainder is
-    bounded by the distances to the poles. Where the eigenvectors of A are ill-conditioned or the
-    gain is flat, a level set takes its place: the Hamiltonian matrix of that level has no
-    eigenvalue on the imaginary axis. Sampled systems go through the bilinear map, which keeps
-    gains.
+    Newton steps start at the resonances and find the peak. Then a proof on intervals of frequency
+    shows that the gain exceeds this peak nowhere by more than a relative tolerance of 1e-9. The
+    proof uses Taylor series of ``D + sum R_i / (s - p_i)``, with poles p_i and residues R_i; the
+    distances to the poles bound the remainder. If the eigenvectors of A are ill-conditioned, or the
+    gain is flat, another test replaces this proof: no frequency has a larger gain if the
+    Hamiltonian matrix of that gain has no eigenvalue on the imaginary axis. A sampled system is
+    first transformed to a continuous one by the bilinear map, which does not change the largest
+    gain.
 
     Parameters
     ----------
@@ -110,9 +112,9 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
 def linf_norm(sys: System) -> float:
     """Return the L-infinity norm: the largest gain on the frequency axis, stable or not.
 
-    Equal to the H-infinity norm for a stable system. For an unstable one (a controller, a plant
-    with negative stiffness) it is the peak of the frequency response, not a gain from inputs to
-    outputs of bounded energy; use it for model errors and measured responses.
+    For a stable system it is equal to the H-infinity norm. For an unstable one (a controller, a
+    plant with negative stiffness) it is the peak of the frequency response, not a gain from inputs
+    to outputs of bounded energy; use it for model errors and measured responses.
 
     Parameters
     ----------
@@ -187,9 +189,9 @@ def h2_norm(sys: System) -> float:
     """Return the H2 norm: the rms of all outputs together for white inputs of unit intensity.
 
     ``trace(C P C')^(1/2)``, P the controllability Gramian (``trace(C P C' + D D')^(1/2)`` when
-    sampled). Exact in modal blocks. The observability Gramian Q gives it a second time,
-    ``trace(B' Q B) = trace(C P C')``: both agree to a relative tolerance of 1e-5, or to the
-    rounding of their terms.
+    sampled). For a system in modal blocks P has a closed form. The norm is computed a second time
+    from the observability Gramian Q, by ``trace(B' Q B) = trace(C P C')``. Both results must agree
+    to a relative tolerance of 1e-5, or within the rounding errors of their terms.
 
     Parameters
     ----------

@@ -50,12 +50,15 @@ class RiccatiSolution(Value):
     P : (n, n) array
         Symmetric.
     gain : (n, p) array
-        ``K = (A P C' + S) (C P C' + R)^-1`` (or ``(P C' + S) R^-1``): the filter's closed loop is
-        A - K C. For the control equations it is F (m, n), with the closed loop A - B F.
+        Gain of the filter or of the controller. A filter has the gain
+        ``K = (A P C' + S) (C P C' + R)^-1`` in discrete time, or ``K = (P C' + S) R^-1`` in
+        continuous time, and the closed loop A - K C. The control equations have the gain F (m, n),
+        with the closed loop A - B F.
     poles : (n,) array
         Eigenvalues of the closed loop.
     residual : float
-        Norm of the equation's residual relative to P, states scaled to unit variance.
+        Norm of the residual of the equation relative to the norm of its terms, computed in states
+        that are scaled to unit variance.
     iterations : int
         Number of doubling and Newton steps.
     """
@@ -88,9 +91,10 @@ def filter_dare(
 ) -> RiccatiSolution:
     """Return the stabilising solution of the discrete filter Riccati equation.
 
-    ``P = A P A' - (A P C' + S) (C P C' + R)^-1 (A P C' + S)' + Q`` is solved by
-    structure-preserving doubling in scaled states. Newton steps on the residual follow (each a
-    Stein equation), in states of unit variance.
+    ``P = A P A' - (A P C' + S) (C P C' + R)^-1 (A P C' + S)' + Q`` is solved by the
+    structure-preserving doubling algorithm in scaled states. Newton steps then refine the solution,
+    in states that are scaled to unit variance; each step solves a Stein equation (discrete Lyapunov
+    equation).
 
     Parameters
     ----------
@@ -99,7 +103,7 @@ def filter_dare(
     C : (p, n) array
         Outputs.
     Q : (n, n) array
-        Symmetric; covariance of the process noise for a filter.
+        Symmetric matrix; for a filter it is the covariance of the process noise.
     R : (p, p) array
         Symmetric, non-singular, possibly indefinite.
     S : (n, p) array, optional
@@ -138,9 +142,10 @@ def filter_care(
     """Return the stabilising solution of the continuous filter Riccati equation.
 
     ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q`` is solved by the stable subspace of the
-    Hamiltonian in scaled states. If the Hamiltonian has eigenvalues on the axis within rounding
-    (poles of 1e-12 times the fastest), a Cayley transform leads to the doubling of `filter_dare`
-    instead. Newton steps follow.
+    Hamiltonian in scaled states. Some problems have poles so slow, about 1e-12 times the fastest,
+    that eigenvalues of the Hamiltonian lie on the imaginary axis within rounding. A Cayley
+    transform then turns the problem into a discrete one, which the doubling of `filter_dare`
+    solves. In both cases Newton steps refine the solution.
 
     Parameters
     ----------
@@ -185,9 +190,9 @@ def control_dare(
     B : (n, m) array
         Inputs.
     Q : (n, n) array
-        Symmetric; cost of x.
+        Symmetric weight of the states x in the cost.
     R : (m, m) array
-        Symmetric, non-singular, possibly indefinite; cost of u.
+        Symmetric, non-singular weight of the inputs u in the cost; it may be indefinite.
     S : (n, m) array, optional
         Cross term; by default zero.
 

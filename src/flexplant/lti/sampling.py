@@ -26,8 +26,9 @@ def discretized(
 ) -> StateSpace:
     """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
 
-    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; exact, also for
-    delays that are not a multiple of h. Where A is block diagonal each block has a closed form.
+    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; this is exact,
+    also for delays that are not a multiple of h. If A is block diagonal, a closed form is used for
+    each block.
 
     Parameters
     ----------

@@ -61,9 +61,11 @@ class StateSpace(Value):
     inputs, outputs, states : sequences of str, optional
         Unique names; `u1`..., `y1`..., `x1`... when not given.
     name : str, optional
+        Name of the system, for display.
     blocks : sequence of int, optional
-        Sizes of the diagonal blocks of A where A is block upper triangular: a structure's modes
-        give 2 x 2 blocks. Poles, frequency responses and discretisation then cost O(n).
+        Sizes of the diagonal blocks of A, for an A that is block upper triangular. The modes of a
+        structure give 2 x 2 blocks. If A is block diagonal, the cost of poles, frequency responses
+        and discretisation grows only linearly with the number of states.
     units : mapping {channel: unit}, optional
         SI units of the inputs and outputs that have a known one, such as "m", "rad" or "N m".
 
@@ -303,7 +305,8 @@ class StateSpace(Value):
         Parameters
         ----------
         T : (n, n) array
-            Not singular; judged after scaling its columns, which only change units.
+            Matrix that is not singular. It is tested after its columns are scaled to equal length,
+            because the units of the states do not matter.
         states : sequence of str, optional
             Names of the new states; `x1`... when not given.
 
@@ -350,7 +353,8 @@ class StateSpace(Value):
     def zeros(self) -> ComplexArray:
         """Return the finite invariant zeros [rad/s, or z], where inputs have no effect on outputs.
 
-        They include the poles of uncontrollable and unobservable states.
+        At such a frequency there is an input that, with suitable states, leaves all outputs at
+        zero. The zeros include the poles of uncontrollable and unobservable states.
         """
         return invariant_zeros(self)
 
@@ -405,8 +409,8 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     Raises
     ------
     ModelError
-        When it is neither a system nor a (p, m) array, or is a StandardPlant, which contains four
-        systems.
+        When it is neither a system nor a (p, m) array. Also when it is a StandardPlant, because it
+        must be clear which of its parts is meant (from w or u to z or y).
     ShapeError
         When an array is empty.
 

@@ -125,8 +125,9 @@ def impulse(
 ) -> TimeResponse:
     """Return the responses to an impulse of area 1 at each input, from rest.
 
-    ``y(t) = C e^(A t) B``; the impulse that a direct gain D passes at t = 0 is not drawn. A sampled
-    system gets a pulse of one sample of height ``1 / dt``, and its D is seen.
+    ``y(t) = C e^(A t) B``; a direct gain D also passes the impulse itself at t = 0, which the
+    result leaves out. The input of a sampled system is a pulse of height ``1 / dt`` that lasts one
+    sample; the result then includes the effect of D.
 
     Parameters
     ----------
@@ -177,8 +178,8 @@ def lsim(
 ) -> TimeResponse:
     """Return the response to given signals at all inputs.
 
-    ``dx/dt = A x + B u, y = C x + D u``; exact where u is held from each instant to the next, or
-    runs straight from one to the next.
+    ``dx/dt = A x + B u, y = C x + D u`` is solved without an error of integration. Between two
+    instants u is held constant or is linear, as `between` says.
 
     Parameters
     ----------
@@ -240,9 +241,10 @@ class StepInfo(Value):
     steady : float
         The value at rest, from the static gain.
     rise : float [s]
-        Rise time from 10 % to 90 % of the way.
+        Rise time from 10 % to 90 % of the value at rest.
     settling : float [s]
-        Time until the response stays within 2 % of the way (or the `band` of `step_info`).
+        Time until the response stays within 2 % of the value at rest around this value. The
+        argument `band` of `step_info` replaces the 2 %.
     overshoot, undershoot : float [%]
         Overshoot beyond the value at rest, and undershoot on the other side of 0.
     peak : float

@@ -418,7 +418,7 @@ class AssumptionReport(Value):
 
     @cached_property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """All assumptions, in the order in which they matter."""
+        """All assumptions, the most important ones first."""
         return tuple(item for tests in _TESTS for item in self._found(tests))
 
     def _found(self, tests: _Tests) -> list[Assumption]:

@@ -40,6 +40,7 @@ class DrivenAxes(Value):
     channels : sequence of r str
         Channels of z (POIs) or y (sensors).
     actuators : sequence of m str
+        Actuators of the plant.
     freq : (r,) array [Hz]
         Frequencies of sigma = 2 pi freq at which each axis is decoupled.
     T : (m, r) array
@@ -75,8 +76,10 @@ def driven_axes(
 ) -> DrivenAxes:
     """Return the axes of a plant and their decoupling on the real axis.
 
-    ``T = pinv(G(sigma)) / sigma^2``. On the real axis no mode resonates: the sum of
-    phi phi' / (sigma^2 + omega^2) keeps its sign on mass and on stiffness lines, and T is real.
+    ``T = pinv(G(sigma)) / sigma^2``. G is the plant from the actuators to the channels, at a real
+    frequency s = sigma instead of an imaginary one. No mode resonates there: each mode with shape
+    phi contributes phi phi' / (sigma^2 + omega^2), which has the same sign below and above its
+    frequency omega. T is therefore real.
 
     Parameters
     ----------
@@ -87,11 +90,12 @@ def driven_axes(
         the rate, for a continuous plant a fifth of the frequency of its slowest
         oscillation.
     axes : sequence of str, optional
-        Channels of z or y. When not given all axes of the POIs where the actuators move them
-        independently, else those of the POIs that have a reference, else those with a reference.
-        A free motion that the actuators move and that none of these axes shows would drift. For
-        each such motion, the displacement sensor that shows it best is added as an axis without a
-        reference.
+        Channels of z or y. By default these are all axes of the POIs, if the actuators can move
+        them independently. Otherwise they are all axes of those POIs that have a reference, if the
+        actuators can move these independently. Otherwise they are only the axes that have a
+        reference themselves. A free motion that the actuators move and that none of these axes
+        shows would drift. For each such motion, the displacement sensor that shows it best is added
+        as an axis without a reference.
     poi : str, optional
         POI to whose axes the choice is limited when `axes` is not given.
 

@@ -75,9 +75,9 @@ class GravityAxes(Value):
 def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> GravityAxes:
     """Return the static transformations to and from the centre of gravity.
 
-    From the geometry of a free or suspended body: no mode shape is involved but the rigid-body
-    ones, so that a structure on weak springs is decoupled as if it were free. For the axes that the
-    actuators of any machine move, use `flexplant.decouple`.
+    They follow from the geometry of a free or suspended body. Only rigid-body motions are used and
+    no elastic mode shapes, so that a structure on weak springs is decoupled as if it were free. For
+    the axes that the actuators of any machine move, use `flexplant.decouple`.
 
     Parameters
     ----------

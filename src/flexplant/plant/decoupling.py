@@ -20,9 +20,10 @@ from .rest_expansion import followed_at_rest
 class Decoupling(Value):
     """Static transformations between the channels of a plant and its axes.
 
-    With G the plant u -> y, ``to_motions G to_actuators`` is approximately ``I / sigma^2`` at the
-    real frequency sigma = 2 pi freq, apart from hold and delay. Each axis on a mass line is then a
-    double integrator. At rest ``to_motions y`` gives the positions of the axes.
+    Let G be the plant from u to y. At the real frequency s = sigma = 2 pi freq,
+    ``to_motions G to_actuators`` is then approximately ``I / sigma^2``, apart from hold and delay.
+    An axis that moves as a mass at this frequency is therefore a double integrator. At rest
+    ``to_motions y`` gives the positions of the axes.
 
     Parameters
     ----------
@@ -31,8 +32,9 @@ class Decoupling(Value):
     to_actuators : StateSpace
         T: commands `die:z:command` of the axes [m/s^2, rad/s^2] to actuators.
     to_motions : StateSpace
-        T_y: sensors to motions of the axes `die:z` [m, rad], least squares weighted by the noise of
-        the sensors; the identity on axes that are sensors themselves.
+        T_y: from the sensors to the motions of the axes `die:z` [m, rad]. It is a least-squares
+        estimate, weighted by the noise of the sensors. An axis that is itself a sensor is that
+        sensor.
 
     Examples
     --------

@@ -31,8 +31,9 @@ class EvaluationModel(Value):
     Parameters
     ----------
     source : Modes, FEModel, ReducedModel or StandardPlant
-        A structure gets the plant's ports. The modes that a reduced model left out count as well.
-        A plant must have the same channels as the plant that is judged on it.
+        The larger model. If it is a structure, the ports of the plant are applied to it. If it is a
+        reduced model, the modes that it left out are included. If it is a plant, it must have the
+        same channels as the plant that is judged on it.
     ports : Ports, optional
         Ports that replaced those of the plant after its assembly; a plant as source gets them too.
 

@@ -41,6 +41,7 @@ class Disturbance(_PlacedForce):
     Parameters
     ----------
     name : str
+        Name of the disturbance, which is also its channel of w.
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     direction : str
@@ -82,17 +83,19 @@ class Disturbance(_PlacedForce):
 class BaseAcceleration(ForcePort):
     """An acceleration of the floor (or frame) under the whole structure, in w.
 
-    The load on the structure is ``-M r a``, with r its rigid-body motion in the direction. The
-    structure, POIs and sensors of displacement and velocity move relative to the base. For POIs and
-    sensors that are `absolute` (as accelerometers are), the motion of the base is added: its
-    acceleration r a, or the integrals of r a. The integrals are bounded if the `shape`, or the
-    `dynamics` of the sensor (those of a geophone), has as many zeros at 0 Hz as there are
-    integrals. A free structure stays at rest in space; springs to ground (`suspend`) and supports
-    make it bend.
+    The load on the structure is ``-M r a``. Here a is the acceleration, M the mass matrix, and r
+    the rigid-body motion of the structure in the direction of the acceleration. The structure, POIs
+    and sensors of displacement and velocity move relative to the base. For POIs and sensors that
+    are `absolute` (as accelerometers are), the motion of the base is added: its acceleration r a,
+    or the integrals of r a. The integrals are bounded if the `shape`, or the `dynamics` of the
+    sensor (those of a geophone), has as many zeros at 0 Hz as there are integrals. A free structure
+    stays at rest in space while the ground moves. Springs to ground (`suspend`) and supports
+    transmit the motion of the ground and make the structure bend.
 
     Parameters
     ----------
     name : str
+        Name of the acceleration, which is also its channel of w.
     direction : str
         Direction of the acceleration: x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
     asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
@@ -106,10 +109,11 @@ class BaseAcceleration(ForcePort):
 
     Notes
     -----
-    Modes and reduced models contain the inertia only of motions that their shapes can make, which
-    suffices for free or suspended structures. For a held structure pass the FEModel. A model that
-    was held by `fixed` keeps the mass that couples it to its held DOFs; matrices that were held
-    elsewhere have lost this mass.
+    Modes and reduced models contain only the inertia of motions that their mode shapes can
+    represent. This is sufficient for free or suspended structures. For a structure that is held at
+    some DOFs, pass the FEModel. An FEModel that was held by `fixed` keeps the part of the mass
+    matrix that couples its free DOFs to the held ones. Matrices from which another program removed
+    the held DOFs have lost this part.
 
     Examples
     --------
@@ -199,8 +203,8 @@ class Actuator(_PlacedForce):
     Parameters
     ----------
     name, at, direction, moves
-        Name, place, direction and motion as for `Disturbance`. A sum as place is a pair of forces,
-        or another combination.
+        Name, place, direction and motion as for `Disturbance`. If the place is a weighted sum, the
+        actuator drives several forces at once, for example a pair of opposite forces.
     dynamics : StateSpace, optional
         Stable system of amplifier and motor, from command to force. Its states are added to those
         of the plant.
@@ -313,7 +317,8 @@ class NarrowBand(_Spectrum):
 
     ``shape = 2 zeta omega s / (s^2 + 2 zeta omega s + omega^2)`` has the gain 1 at its frequency.
     At its output, white noise of density asd has the variance ``asd^2 zeta omega / 2``. The force
-    loses its phase within 1 / (2 pi zeta) periods.
+    is an oscillation whose amplitude and phase drift; its correlation decays by the factor e in
+    ``1 / (2 pi zeta)`` periods.
 
     Parameters
     ----------
@@ -357,7 +362,7 @@ class NarrowBand(_Spectrum):
 
 @dataclass(frozen=True, eq=False)
 class RandomWalk(_Spectrum):
-    """A force that drifts: a bias. Its rms after a time t is ``drift t^(1/2)``.
+    """A slowly drifting force (bias). Its change over a time t has the rms ``drift t^(1/2)``.
 
     First-order noise with a corner far below all other frequencies, so that it is stationary and
     all variances are finite. Above the corner it cannot be distinguished from a random walk.

@@ -30,9 +30,10 @@ _OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 class GeneralizedPlant(PartitionedSystem):
     """The plant of a synthesis: ``W_z P W_w`` with y read through a block.
 
-    Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Its w and
-    z stop being physical channels once weights are applied; `unweighted` is the way back to the
-    machine, which holds ports, modes, noise, uncertainty and evaluation model.
+    Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Once
+    weights are applied, w and z are no longer physical channels. The attribute `unweighted` is the
+    machine without weights and blocks; it holds the ports, modes, noise, uncertainty and evaluation
+    model.
 
     Parameters
     ----------

@@ -24,8 +24,11 @@ _SWEEPS = 5
 class SlowZeros(Value):
     """Poles of the inverse of a plant, ``F(s) = sum_i c_i / (s - p_i) + ...``, that are slow.
 
-    Beyond ``k_0 + ... + k_m s^m`` of the expansion at rest they add ``s^m`` times a filter that is
-    zero at rest: ``sum_i c_i / p_i^(m + 1) s / (s - p_i)``.
+    F is the response from a set-point to the forces that a feedforward needs. Its poles p_i are the
+    zeros of the plant, and c_i are its residues. A feedforward uses the power series
+    ``k_0 + ... + k_m s^m`` of F at s = 0. This series does not represent slow poles well. For them
+    the feedforward therefore adds the term ``s^m`` times a filter that is zero at s = 0:
+    ``sum_i c_i / p_i^(m + 1) s / (s - p_i)``.
 
     Parameters
     ----------

@@ -77,10 +77,11 @@ def fitted_response(plant: Any) -> MeasuredResponse | None:
 class PlantMachines:
     """The machines that a plant may be, with its channels and sampled like it.
 
-    Their modes come from the fit (`flexplant.updating.Machines`) where the plant has one and an
-    evaluation model, else from what is stated: frequencies with the shapes that move with them, and
-    dampings. Gains, delays and other stated Deltas are drawn as well. Machines have the modes of
-    the evaluation model, except where parameters or shapes of the plant's own model are stated.
+    If the plant has a fit (`flexplant.updating.Machines`) and an evaluation model, the modes of
+    these machines come from the fit. Otherwise they come from the uncertainty that the user states:
+    frequencies, with the changes of the mode shapes that belong to them, and dampings. Gains,
+    delays and other stated Deltas are drawn as well. Machines have the modes of the evaluation
+    model, except where parameters or shapes of the plant's own model are stated.
 
     Parameters
     ----------

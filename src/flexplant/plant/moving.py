@@ -33,7 +33,9 @@ class PortPath(Value):
     Parameters
     ----------
     name : str
+        Name of the port.
     points : (p, 3) array [m]
+        Points at which the port is placed.
     channels : sequence of str
         Channels of z for a POI, or the one input of an actuator or disturbance.
     C : (p, channels, n) array
@@ -226,10 +228,11 @@ class PositionMap(Value):
         The values of each position.
     decoupling : (..., 2) array
         Errors of the decoupling at each place of the grid, first of the sensors, then of the
-        actuators. The transformations of the plant at its present position (`decouple`) are applied
-        at that place; the error is the largest gain of the difference from the identity, 0 where
-        they agree. Each axis is weighted by the motion of the sensors that it causes. NaN where the
-        actuators cannot move the axes independently.
+        actuators. The transformations that `decouple` gives for the plant at its present position
+        are applied to the plant at each place of the grid. The error is the largest gain of the
+        difference between the result and the identity; it is 0 where the decoupling is still exact.
+        Each axis is weighted by the motion of the sensors that it causes. NaN where the actuators
+        cannot move the axes independently.
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str

@@ -27,7 +27,7 @@ class Assembled(Value):
     physical : StateSpace
         System from forces to motions, before noise, references and efforts are connected to it.
     noise_factor : (n, r) array, optional
-        G with G G' the covariance of x that disturbances add in one sample.
+        Factor G of the covariance G G' that the disturbances add to the states x in one sample.
     delay : float [samples]
         Delay of the inputs u.
     continuous : StandardPlant, optional
@@ -83,10 +83,10 @@ class PlantChannel(Value):
 
 @dataclass(frozen=True, eq=False)
 class Foreign(Value):
-    """Origin of a plant of foreign matrices: the names of its channels, without modes.
+    """Origin of a plant that was not assembled from a structure, so that its modes are not known.
 
-    It answers the same questions as `Assembled`, so that functions need not distinguish them; what
-    needs a structure asks `plant.assembled`.
+    It has the same attributes as `Assembled`, so that most functions treat both alike. A function
+    that needs a structure uses `plant.assembled`.
 
     Parameters
     ----------

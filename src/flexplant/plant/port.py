@@ -38,7 +38,8 @@ class MeasuredRow(NamedTuple):
         Coefficients of loads f at the model's DOFs, to which the channel responds directly.
     carried : (6,) array
         Coefficients of the rigid-body motions g of the ground about the origin (x, y, z, rx, ry,
-        rz), in the derivative that is measured; 0 for a motion relative to the ground.
+        rz). The motions g are displacements, velocities or accelerations, as the sensor measures.
+        The coefficients are 0 for a sensor that measures relative to the ground.
 
     Examples
     --------
@@ -123,15 +124,17 @@ class ForcePort(Value):
 class SensorPort(Value):
     """A port in y. A new kind has the fields below and defines by `row` or `see` what it measures.
 
-    `row` gives a displacement, for example of one point relative to another; with a `quantity` also
-    its velocity or acceleration. `see` gives anything that is linear in states and forces; `row` is
-    then what the sensor shows at rest. Coloured noise of a sensor is an `OutputDisturbance` in w.
+    Define `row` for a sensor of a displacement, for example of one point relative to another. With
+    a `quantity`, the sensor measures the velocity or the acceleration of this displacement instead.
+    Define `see` for any other signal that is linear in states and forces; `row` is then the signal
+    of the sensor at rest. Coloured noise of a sensor is an `OutputDisturbance` in w.
 
     Parameters
     ----------
     name : str
+        Name of the sensor, which is also its channel of y.
     at : str, (3,) array [m] or mapping
-        Place at which it is drawn, and which `StandardPlant.at` moves.
+        Place of the sensor, at which plots show it. `StandardPlant.at` moves it.
     asd : float
         One-sided amplitude spectral density of its white noise.
     dynamics : StateSpace, optional

@@ -96,6 +96,7 @@ class Poi(Value):
     Parameters
     ----------
     name : str
+        Name of the POI; its channels in z are `name:axis`.
     at : str, (3,) array [m] or mapping {place: weight}
         A DOF label (the axes replace its direction), any point of the structure, or a weighted sum
         of places, ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``, which has one axis.
@@ -192,6 +193,7 @@ class Reference(Value):
     Parameters
     ----------
     poi : str
+        Name of the POI.
     axes : sequence of str, optional
         Axes of the POI that get a set-point; by default its first axis.
 
@@ -369,9 +371,10 @@ class Ports(Value):
         Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
         sensors, unless a coloured noise states a `unit`; references, errors and estimates like
         their POI, efforts like their actuator. A weighted sum of displacements and rotations has
-        the unit of the group whose weights have length 1: that of displacements if the weights of
-        rotations are levers [m]. It has no unit if both groups or neither have such weights.
-        Filters of ports do not change units.
+        the unit of its displacements if the vector of their weights has the length 1, because the
+        weights of the rotations are then lever arms [m]. It has the unit of its rotations if the
+        vector of the rotations' weights has the length 1. It has no unit if this length is 1 for
+        both groups or for neither. Filters of ports do not change units.
         """
         found = {port.name: port.unit for port in self.physical}
         for port in self.w:

@@ -333,10 +333,12 @@ class ResidualForm(Value):
 
 @dataclass(frozen=True, eq=False)
 class FastStates(ResidualForm):
-    """Attachment vectors stay separate modes at their own high frequencies (the default).
+    """Residual attachment vectors are kept as additional modes of high frequency (the default).
 
-    The plant stays strictly proper between forces and displacements, so that it can be sampled
-    without delay, filtered for white forces and simulated; it costs two states a vector.
+    An attachment vector is the static deformation that the computed modes lack under a load. With
+    these modes, displacements do not respond to forces at once: the plant is strictly proper
+    between forces and displacements. It can then be sampled without a delay, simulated, and used in
+    a Kalman filter with white forces. Each vector costs two states.
 
     Examples
     --------
@@ -350,16 +352,19 @@ class FastStates(ResidualForm):
 class Feedthrough(ResidualForm):
     """Attachment vectors, or all modes above a frequency, become their static flexibility.
 
-    Displacements then respond to forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of
-    the modes that were left out. Velocities and accelerations of these modes are neglected: they
-    are zero below the frequencies of these modes. White forces then reach displacements directly,
-    and samples would have infinite variance: give the forces a `shape` for Kalman filters and
-    simulation. A simulation needs a delay of at least one sample, which every machine has.
+    An attachment vector is the static deformation that the computed modes lack under a load.
+    Displacements then respond to forces at once: the matrices D12, D22 and D11 contain the static
+    flexibility ``phi phi' / omega^2`` of the modes that were replaced. Velocities and accelerations
+    of these modes are neglected, because they are small at frequencies far below those of the
+    modes. White forces then reach displacements directly, and samples would have infinite variance:
+    give the forces a `shape` for Kalman filters and simulation. A simulation needs a delay of at
+    least one sample, which every machine has.
 
     Parameters
     ----------
     above : float [Hz], optional
-        Modes above this frequency are included; by default only the attachment vectors.
+        Frequency above which modes are replaced too. By default only the attachment vectors are
+        replaced.
 
     Examples
     --------

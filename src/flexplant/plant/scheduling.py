@@ -21,7 +21,7 @@ _POINTS = 21
 
 @dataclass(frozen=True, eq=False)
 class Position(Value):
-    """A scheduling variable: one coordinate of where the machine stands, within a range.
+    """A scheduling variable: one coordinate of the machine's position, within a range.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ class Position(Value):
     range : (2,) sequence [m or rad]
         Least and largest value.
     start : float, optional [m or rad]
-        Where a plant stands that was just assembled; 0 where that lies in the range, else its
-        middle.
+        Position of a plant just after it was assembled. By default 0 if the range contains 0,
+        otherwise the middle of the range.
 
     Raises
     ------

@@ -49,6 +49,7 @@ class StandardPlant(Partition):
     system : StateSpace
         ``[w; u] -> [z; y]``.
     w, u, z, y : sequences of str
+        Names of the channels of each group.
     asd : mapping {str: float}
         One-sided amplitude spectral density of the w channels that are white noise.
     origin : Assembled or Foreign
@@ -92,9 +93,9 @@ class StandardPlant(Partition):
         rate : float [Hz]
             Sampling rate.
         delay : float [samples]
-            Delay from a measurement to the reaction of the actuators, including
-            fractions. With at least one sample of delay the controller has the whole
-            interval to compute.
+            Delay from a measurement to the reaction of the actuators, including fractions. With a
+            delay of at least one sample, the controller has a whole sampling interval for its
+            computation.
 
         Returns
         -------
@@ -169,8 +170,8 @@ class StandardPlant(Partition):
     def with_ports(self, ports: Ports) -> StandardPlant:
         """Return the plant of the same structure, sampled alike, with other ports.
 
-        The modes are not solved again: this is what placement calls. ModelError when the plant was
-        not assembled from a structure.
+        The modes are not solved again, so that this is fast; the placement functions use it.
+        ModelError when the plant was not assembled from a structure.
         """
         return self._known(rebuilt(self, ports=ports))
 
@@ -305,7 +306,7 @@ class StandardPlant(Partition):
     def along(self, name: str, points: npt.ArrayLike) -> PortPath:
         """Return the rows of a POI (or the columns of a force) at many points at once.
 
-        For positions that change with time. Only the rows of C depend on the place of a POI, and
+        Use it for positions that change with time. Only rows of C depend on the place of a POI, and
         rows of D if the plant has a feedthrough.
 
         Parameters
@@ -448,6 +449,7 @@ def plant_of(given: AnyPlant | UncertainPlant[StandardPlant] | System) -> AnyPla
     Parameters
     ----------
     given : StandardPlant, GeneralizedPlant, UncertainPlant, StateSpace or control.StateSpace
+        The plant, or a system whose labels distinguish w, u, z and y.
 
     Raises
     ------
@@ -489,8 +491,9 @@ def assemble_plant(
     evaluation : Modes, FEModel, ReducedModel or StandardPlant, optional
         Larger model of the same machine, on which results are checked, with the modes that `model`
         lacks. Every plant made from this one has it too, and every filter, controller, loop, score
-        and budget accounts for it. A structure gets the ports; a plant must have their channels. By
-        default: the truncated modes that a reduced `model` still knows.
+        and budget accounts for it. If it is a structure, the ports are applied to it; if it is a
+        plant, it must have the channels of the ports. By default the larger model consists of a
+        reduced `model` and the modes that it left out, if it still knows them.
     residual : FastStates or Feedthrough, optional
         Form of residual attachment vectors of Modes: fast modes (the default), or a compliance that
         responds at once.
@@ -498,9 +501,10 @@ def assemble_plant(
     Returns
     -------
     StandardPlant
-        Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators;
-        z: POI axes `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references.
-        Delays of ports act once it is sampled. `plant.form` says whether A is in modal blocks.
+        Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators; z: POI axes
+        `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references. The latencies of
+        ports have an effect only after the plant is sampled. `plant.form` says whether A is in
+        modal blocks.
 
     Raises
     ------
@@ -514,9 +518,9 @@ def assemble_plant(
     -----
     FlexplantWarning
         When damping couples the modes so that blocks cannot hold it: an overdamped pair, two poles
-        that (nearly) coalesce, or a damper to ground that drags rigid-body motion at more than 1e-4
-        of the first elastic frequency (smaller drag is neglected: rigid-body modes are undamped by
-        convention). The undamped modes are then coupled by all of D (dense form).
+        that are (nearly) equal, or a damper to ground whose pole in a rigid-body motion is faster
+        than 1e-4 of the first elastic frequency (slower ones are neglected: rigid-body modes are
+        undamped by convention). The undamped modes are then coupled by all of D (dense form).
 
     References
     ----------

@@ -49,8 +49,8 @@ class StructureFrf(Frf):
         Frequencies at which ``(K - omega^2 M + i omega D) q = f`` was solved with the full
         matrices.
     error : (c,) array
-        Error of the worst channel there, relative to the largest magnitude of this channel over all
-        frequencies.
+        Error of the worst channel at each of these frequencies, relative to the largest magnitude
+        of this channel over all frequencies.
     error_there : (c,) array
         Error of the worst channel, relative to its own magnitude at this frequency.
 
@@ -113,10 +113,12 @@ def frequency_response(
 
     ``frequency_response(model, ports, freq)``: from all disturbances and actuators to all POIs and
     sensors, through their filters and latencies. A large FEModel is not solved frequency by
-    frequency: its modes up to 1.5 times the last one, and the static responses to all loads and at
-    all outputs, answer at any number of frequencies. They are checked by solutions with
-    ``K + i omega D - omega^2 M`` at a few: at resonances, antiresonances, the ends of the band, and
-    at random. Solutions that differ by more than `tolerance` are added to the basis.
+    frequency: its responses are computed in a basis of modes and static responses. The modes go up
+    to 1.5 times the last frequency of `freq`; the static responses are those to unit loads at all
+    inputs and outputs. This basis is checked by direct solutions with the full matrix
+    ``K + i omega D - omega^2 M`` at a few frequencies: at resonances, at antiresonances, at the
+    ends of the band, and at random ones. Where the two differ by more than `tolerance`, the direct
+    solution is added to the basis.
 
     ``frequency_response(system, freq)``: ``C (s I - A)^-1 B + D``; see
     `flexplant.lti.frequency_response`.

@@ -107,17 +107,19 @@ class _Springs(NamedTuple):
 def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) -> Suspended:
     """Return a structure on springs to ground.
 
-    ``K + sum_s k_s r_s' r_s``, D likewise, r_s the row of a spring's motion. Rigid-body motions
-    that stretch a spring become suspension modes, true oscillations at low frequency; those that
-    do not stay exactly at 0. Springs of negative stiffness turn these motions into pairs of real
-    poles, one of them unstable; such springs must not bend the structure.
+    The stiffness becomes ``K + sum_s k_s r_s' r_s``. Here k_s is the stiffness of spring s, and the
+    row r_s gives the motion at this spring. The damping matrix D changes in the same way.
+    Rigid-body motions that stretch a spring become suspension modes, true oscillations at low
+    frequency; those that do not stay exactly at 0. Springs of negative stiffness turn these motions
+    into pairs of real poles, one of them unstable; such springs must not bend the structure.
 
     Parameters
     ----------
     model : FEModel, ReducedModel or Modes
-        Modes and reduced models are suspended within their own shapes, which for springs much
-        softer than the structure is exact to the ratio of the two. Modes that a reduced model left
-        out are stiffened and damped one by one.
+        Modes and reduced models keep their own mode shapes when they are suspended. The relative
+        error of this is about the ratio of the stiffness of the springs to that of the structure,
+        so springs should be much softer than the structure. Modes that a reduced model left out are
+        stiffened and damped one by one.
     springs : GroundSpring or sequence
 
     Returns

@@ -52,8 +52,8 @@ _VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
 class ModeVisibility(Value):
     """How well w excites, u reaches, y and z see an elastic mode.
 
-    Where damping couples the modes (`plant.form` is dense) it is an undamped mode, with the
-    diagonal term of the damping.
+    If damping couples the modes (`plant.form` is then dense), the mode is one of the undamped
+    structure, and its damping is the diagonal entry of the modal damping matrix.
 
     Parameters
     ----------
@@ -62,12 +62,15 @@ class ModeVisibility(Value):
     freq : float [Hz]
         Frequency.
     zeta : float
+        Modal damping ratio.
     shares : mapping {"w", "u", "y", "z": float}
-        The best channel's modal force per unit force (or modal displacement per unit motion)
-        relative to that of the elastic mode where this channel is strongest: at most 1, 0 at a
-        node.
+        Visibility of the mode on each side of the plant, between 0 and 1. For each input, the modal
+        force per unit force is divided by its largest value over all elastic modes; for each
+        output, the same is done with the motion per unit modal displacement. The share is the
+        largest of these ratios over the channels of the side. It is 0 if all channels lie at nodes
+        of the mode.
     channels : mapping {"w", "u", "y", "z": str}
-        That channel.
+        Channel of each side that has this largest ratio.
 
     Examples
     --------

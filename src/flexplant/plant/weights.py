@@ -38,15 +38,17 @@ _IDLE = 0.03
 def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int = 0) -> StateSpace:
     """Return the static block from sensors and references to errors at the sensors.
 
-    ``y_i:error = y_i,ref - y_i``. Here y_i,ref is the signal of sensor i while the machine rests,
-    its POIs are at their references and the other axes (`driven_axes`) are at zero:
-    ``G_yu T (G_zu T)^-1 r`` at rest. On a free body this is its rigid-body motion. A controller
-    that reads these errors has one degree of freedom: it responds to a reference as to a
-    disturbance.
+    The error of sensor i is ``y_i:error = y_i,ref - y_i``. Here y_i,ref is the signal that the
+    sensor would have if the machine were at rest, its POIs were at their references r, and the
+    other axes (`driven_axes`) were at zero. It is ``G_yu T (G_zu T)^-1 r`` at zero frequency, where
+    G_yu and G_zu are the plant from u to y and to z, and T gives the actuator forces of the axes.
+    On a free body this is its rigid-body motion. A controller that reads these errors has one
+    degree of freedom: it responds to a reference as to a disturbance.
 
-    A move bends the machine, so that its sensors are not where they are at rest, and the controller
-    opposes the move. With an order the derivatives of the references correct y_i,ref: close the
-    loop with such errors and with the feedforward of the loop. Design with order 0.
+    While the machine moves it bends, so that its sensors differ from their values at rest, and the
+    controller opposes the move. With an order above 0, derivatives of the references correct
+    y_i,ref for this bending. Use order 0 to design the controller. Use a higher order when you
+    close the loop together with its feedforward.
 
     Parameters
     ----------
@@ -145,9 +147,9 @@ def stage_weights(
 
     ``plant.weighted(z=weights.z, w=weights.w)`` is what `flexplant.design_hinf` then takes; a
     controller with one degree of freedom reads `reference_errors`. `design_stage` does all three,
-    and finds the largest bandwidth. Below a gamma of 1 |T| at u is below `peak`. A table of
-    ``help(flexplant.plant)`` shows the effect of the arguments on one machine. How it works:
-    `algorithms`.
+    and finds the largest bandwidth. If the design reaches a gamma below 1, |T| at u is below
+    `peak`. A table of ``help(flexplant.plant)`` shows the effect of the arguments on one machine.
+    How it works: `algorithms`.
 
     Parameters
     ----------
@@ -156,16 +158,18 @@ def stage_weights(
     bandwidth : float [Hz]
         Frequency below which |S| shall be less than 1.
     poi : str, optional
-        The POI that counts; all axes that the actuators move independently when not given
-        (`driven_axes`). Other axes are left out of z, because they move with these. The first axis
-        sets the scale.
+        POI whose errors are weighted. By default these are all axes that the actuators move
+        independently (`driven_axes`). Other axes are left out of z, because they move together with
+        these. The scale of the weights is that of the first axis.
     peak : float
-        Bound on |T| at u where gamma is 1; value of 1/W_S at high frequencies (at f_c it is 1).
+        Value of the bound 1/W_S on |S| at high frequencies; at the frequency `bandwidth` the bound
+        is 1. If gamma is 1, this is also a bound on |T| at u.
     disturbance, effort : float, optional
-        Sizes of the weights W_d and W_u, relative to the actuator sizes f0 of `algorithms`. The
-        larger their product, the more gamma depends on |T| at u, and the less on |S|. By default 3
-        and 3; 20 and 10 where frequencies are uncertain, so that modes may be damped as much as
-        they are driven.
+        Sizes of the weights W_d of disturbances at the actuators and W_u of the efforts, relative
+        to the actuator sizes f0 that `algorithms` defines. The larger their product is, the more
+        gamma depends on |T| at u, and the less it depends on |S|. By default both are 3. If
+        frequencies are uncertain, they are 20 and 10, so that the controller may damp modes as
+        strongly as the disturbance drives them.
     noise : float
         Noise of a sensor, relative to its signal for a reference of one unit.
     uncertainty : UncertainPlant, float, (m,) array or {mode: float}, optional
@@ -356,9 +360,9 @@ def mixed_sensitivity(
     """Return the plant whose H-infinity norm is that of ``[W_S S; W_KS K S; W_T T]``.
 
     ``e = r - G u, u = K e``: S = (I + G K)^-1 from r to e, T = G K S. MATLAB's `augw` builds the
-    same plant; `design_hinf` designs K for it, as `mixsyn` does. A rigid-body mode or integrator in
-    G is an invariant zero on the limit of [G; weights] from r: add a disturbance at u instead, as
-    `stage_weights` does.
+    same plant; `design_hinf` designs K for it, as `mixsyn` does. If G has a rigid-body mode or an
+    integrator, this plant has an invariant zero on the stability limit from r to the outputs, which
+    the standard assumptions exclude. In this case add a disturbance at u, as `stage_weights` does.
 
     Parameters
     ----------

@@ -22,7 +22,8 @@ class Dampings(Uncertainty):
         Relative error of the damping at delta = 1: one number for all modes, one for each of
         `modes`, or a mapping by mode.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; by default all elastic ones.
+        Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
+        elastic modes are uncertain.
 
     Raises
     ------

@@ -44,6 +44,7 @@ class Delay(Uncertainty):
     Parameters
     ----------
     samples : float
+        Largest change of the delay, in samples; it is reached at delta = 1 or -1.
 
     Raises
     ------

@@ -17,12 +17,15 @@ from .channels import EvenUnits, Opened, with_parts
 class Delta(Value):
     """One real uncertainty, ``w = delta z`` with ``|delta| <= 1``.
 
-    A new kind defines `changed`, which returns the machine that is off by an amount, for example
-    with `MachineParts.with_port`. Its channels are computed from the plants at both ends of the
-    range. Therefore [A B; C D] must be affine or linear fractional in the amount. The row of a
-    sensor that moves is taken as linear between the ends:
-    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind with other channels overrides `opened`.
-    A change of M, D or K moves the modes, which is not affine: it is a parameter for `Parameters`.
+    The number delta says how far the machine differs from the nominal one. To add a new kind of
+    Delta, derive a class and define its method `changed`. This method returns the machine that
+    differs by a given amount, for example by means of `MachineParts.with_port`. The channels w and
+    z of the Delta are computed from the plants at both ends of its range. Therefore the matrix [A
+    B; C D] of the plant must be an affine or a linear fractional function of the amount. The row of
+    a sensor that moves is taken as linear between the ends:
+    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind whose channels are found in another way
+    overrides `opened`. A change of M, D or K changes the modes, and the plant is not an affine
+    function of it. State such a change by `Parameters`.
 
     Parameters
     ----------
@@ -67,7 +70,7 @@ class Delta(Value):
         return self.scale * drawn
 
     def of_matrices(self, plant: Partition) -> Delta:
-        """Return the Delta, one of modes as a Delta of M, D and K of the plant's model."""
+        """Return the Delta; a Delta of a mode as a change of M, D and K of the plant's model."""
         return self
 
     def require_in_range(self, deviations: float) -> None:

@@ -31,24 +31,27 @@ _TYPED_POLES = 0.1
 class Fit(Uncertainty):
     """Uncertainty of frequencies and dampings that a fit or a measurement of modes leaves.
 
-    Given to ``plant.uncertain`` as it is, an `UpdateResult`, `ModalUncertainty` or `MeasuredModes`
-    is understood as ``Fit(source)``. The covariance of the parameters goes to the modes by the
-    eigenvalue sensitivities, ``J C J'``; each mode's stiffness and damping becomes a Delta
-    `mode6:freq`, `mode6:damping`. Where damping couples the modes (a large damper to ground, an
-    overdamped pair), the parameters of the fit themselves are the Deltas, and act on all modes and
-    shapes. Drawn machines differ in the parameters; those of a calibrated plant differ in their
-    modes.
+    An `UpdateResult`, `ModalUncertainty` or `MeasuredModes` that is passed directly to
+    ``plant.uncertain`` is understood as ``Fit(source)``. If C is the covariance of the parameters,
+    and J contains the sensitivities of the eigenvalues to the parameters, the covariance of the
+    modes is ``J C J'``. The stiffness and the damping of each mode become the Deltas `mode6:freq`,
+    `mode6:damping`. If damping couples the modes (a large damper to ground, an overdamped pair),
+    the parameters of the fit themselves are the Deltas, and they act on all modes and mode shapes.
+    Machines that are drawn at random have different values of the parameters; machines of a
+    calibrated plant have different modes instead.
 
     Parameters
     ----------
     source : UpdateResult, ModalUncertainty or MeasuredModes
-        A fit whose `model` the plant was assembled from, as it is or calibrated. (A fit with a
-        discrepancy, or of a calibrated plant, is replaced by its `uncertainty`, in which a mode may
-        be off by two standard deviations.) Or the uncertainty of a calibrated model,
-        ``fit.uncertainty(measured)``; or measured poles with mode numbers and a covariance.
+        One of three sources. The first is a fit; the plant must have been assembled from the
+        `model` of this fit, directly or after calibration. If the fit has a discrepancy, or the
+        plant is calibrated, the `uncertainty` of the fit is used in its place; a mode may then
+        differ by two standard deviations. The second is the uncertainty of a calibrated model,
+        ``fit.uncertainty(measured)``. The third are measured poles with mode numbers and a
+        covariance.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
-        given.
+        Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
+        elastic modes, or all measured ones.
     parameters : sequence of Parameter, optional
         Parameters given to `update`, in the same order; by default those that the fit stores.
     deviations : float

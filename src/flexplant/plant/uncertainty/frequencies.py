@@ -23,7 +23,8 @@ class Frequencies(Uncertainty):
         `modes`, or a mapping by mode. For modes that were not measured, updated models seldom have
         errors below 0.005.
     modes : sequence of int, optional
-        Numbers from 1, rigid-body modes included; by default all elastic ones.
+        Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
+        elastic modes are uncertain.
 
     Raises
     ------

@@ -22,12 +22,14 @@ class Known(NamedTuple):
     Parameters
     ----------
     deltas : sequence of Delta
+        Deltas of this kind, m in number.
     covariance : (m, m) array
-        Covariance of the deltas as random numbers.
+        Covariance matrix of the deltas, which are random numbers when machines are drawn.
     drawn : sequence of Delta, optional
-        Deltas that are drawn for a machine instead: the parameters of a fit, which change all modes
-        and shapes.
+        Deltas that are drawn in place of `deltas` when a machine is drawn. They are the parameters
+        of a fit, which change all modes and mode shapes.
     drawn_covariance : (q, q) array, optional
+        Covariance of the Deltas in `drawn`.
 
     Examples
     --------
@@ -50,9 +52,9 @@ class Known(NamedTuple):
 class Uncertainty(Value):
     """A kind of uncertainty of a machine, for ``plant.uncertain(...)``.
 
-    A new kind defines `deltas`, the Deltas of a plant. It defines `known` instead if its Deltas are
-    correlated or if it draws something else for a machine. A kind of dynamics defines
-    `delta_blocks` and `with_blocks`.
+    To add a new kind, derive a class and define its method `deltas`, which returns the Deltas of a
+    plant. Define `known` instead if the Deltas are correlated, or if other numbers than the Deltas
+    are drawn for a machine. For uncertain dynamics define `delta_blocks` and `with_blocks`.
 
     Examples
     --------
@@ -92,5 +94,5 @@ class Uncertainty(Value):
         return system
 
     def larger(self, plant: Partition) -> Any:
-        """Return the plant with more modes that machines of a plant have, None where not known."""
+        """Return a plant with the modes that machines have in addition; None if not known."""
         return None

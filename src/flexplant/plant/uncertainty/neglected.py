@@ -16,8 +16,9 @@ from .neglected_dynamics import NeglectedModes, neglected_modes
 class Neglected(Uncertainty):
     """The modes that a plant lacks: one dynamic Delta with weights that bound their effect.
 
-    Drawn machines have these modes, and Deltas of modes act on the modes of the same numbers. Where
-    parameters are drawn, which belong to the plant's model, drawn machines do not have these modes.
+    Machines that are drawn at random have these modes, and Deltas of modes act on the modes with
+    the same numbers. An exception are parameters of the plant's own model: if these are drawn, the
+    drawn machines do not have the neglected modes.
 
     Parameters
     ----------

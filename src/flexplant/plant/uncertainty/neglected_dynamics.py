@@ -42,9 +42,11 @@ class NeglectedModes(Value):
     Parameters
     ----------
     weights : StateSpace
-        W, diagonal: a separate weight for each output, stable with a stable inverse; continuous.
+        Diagonal weight W, continuous, with a separate entry for each output. It is stable and has a
+        stable inverse.
     scales : (n_in,) array [input unit]
-        Sizes of the inputs that move the outputs equally.
+        Sizes of the inputs, chosen so that each input of its size moves the outputs by about the
+        same amount.
     inputs, outputs : sequences of str
         Channels that drive the neglected modes, and channels that these modes move.
     mirrored : mapping {str: str}
@@ -53,10 +55,13 @@ class NeglectedModes(Value):
     tightest : float
         Largest singular value of Delta over the frequencies that verified the bound: at most 1.
     looseness : float
-        Median of the inverse of that singular value, over the logarithm of frequency.
+        Median, over the logarithm of frequency, of 1 divided by the largest singular value of
+        Delta. A value of 2 means that the bound is typically twice as large as necessary.
     sampled : NeglectedModes, optional
-        The same bound for the sampled plant, delay and folding included: its weights are those of
-        the bilinear frequency ``tan(pi f dt) / (pi dt)``, in which a sampled plant is continuous.
+        The same bound for the sampled plant, which includes the delay and the aliasing of sampling.
+        The bilinear map turns the sampled plant into a continuous one, in which the frequency f
+        becomes ``tan(pi f dt) / (pi dt)``. The weights are continuous systems at this mapped
+        frequency.
     """
 
     weights: StateSpace
@@ -90,11 +95,14 @@ def neglected_modes(
 ) -> NeglectedModes:
     """Return weights that bound the difference of a whole model and a plant, (w, u) to (z, y).
 
-    ``sigma_max(W^-1 (G_whole - G) diag(scales)) <= 1`` from 0 Hz up. The square of each weight is
-    ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``, p by linear
-    programming: least mean looseness over the logarithm of frequency, above the difference at
-    every frequency. The resonances are those of the lowest modes neglected, further terms are well
-    damped. The bound is then verified on other frequencies, with points through every resonance.
+    The bound is ``sigma_max(W^-1 (G_whole - G) diag(scales)) <= 1`` at all frequencies, where W is
+    the diagonal matrix of the weights. The square of each weight is
+    ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``. Linear
+    programming finds the coefficients p: the weight must be above the difference at every
+    frequency, and as close to it as possible on average over the logarithm of frequency. The first
+    terms have the frequencies and damping ratios of the lowest neglected modes. The other terms are
+    well damped. The bound is then verified on other frequencies, with points through every
+    resonance.
 
     Rigid-body motions are the same in both and cancel, so that the difference is finite at 0 Hz.
 

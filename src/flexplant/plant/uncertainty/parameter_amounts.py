@@ -154,8 +154,9 @@ def require_matrices(plant: Partition) -> None:
 class Parameters(Uncertainty):
     """Parameters of the model, each known within an amount: they move all modes and shapes.
 
-    If a mode is uncertain too, it is the mode of the nominal plant: K changes by a fraction of
-    ``omega^2 (M phi)(M phi)'``, and D likewise.
+    The frequency or the damping of a mode may be uncertain at the same time. This changes K or D of
+    the nominal plant: an uncertain frequency adds a fraction of ``omega^2 (M phi)(M phi)'`` to K,
+    where phi is the mode shape and omega the natural frequency.
 
     Parameters
     ----------

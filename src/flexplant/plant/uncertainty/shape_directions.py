@@ -123,8 +123,9 @@ class Shapes(Uncertainty):
     Parameters
     ----------
     directions : (m, n, r) array
-        For each mode r directions over the n DOFs of the plant's modes, each an independent
-        standard deviation of the shape (`flexplant.identification.shape_deviations`).
+        Changes of the mode shapes: r directions for each of the m modes, over the n DOFs of the
+        plant's modes. Each direction is one standard deviation of the shape and is independent of
+        the others (`flexplant.identification.shape_deviations`).
     modes : sequence of m int
         Numbers of the modes, from 1, rigid-body modes included.
     deviations : float

@@ -46,8 +46,9 @@ class UncertainPlant(Value, Generic[P]):
                 z <---|  P  |<--- w
                 y <---|     |<--- u
 
-    Made by `StandardPlant.uncertain`. Each Delta is one channel; one that acts at several places
-    has further channels side by side, such as `mode6:freq:rate:w`, where accelerations need it.
+    Made by `StandardPlant.uncertain`. Each Delta is one uncertain real number with one channel in
+    w_Delta and one in z_Delta. A Delta that acts at several places has further channels, such as
+    `mode6:freq:rate:w`, which is needed for accelerations.
 
     Parameters
     ----------
@@ -205,7 +206,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def of_matrices(self) -> bool:
-        """Whether Deltas change M, D and K: those of parameters, and of modes next to them."""
+        """Whether Deltas of parameters exist, so that all Deltas of modes change M, D and K too."""
         found = any(isinstance(delta, ParameterDelta) for delta in self.deltas)
         if found:
             require_matrices(self.plant)
@@ -298,8 +299,8 @@ class UncertainPlant(Value, Generic[P]):
     def values(self, rng: np.random.Generator) -> list[tuple[Delta, float]]:
         """Return drawn values of the Deltas, each kind from its covariance.
 
-        The parameters of a fit take the place of the Deltas of its modes: they change all modes and
-        shapes.
+        For a fit, its parameters are drawn in place of the Deltas of its modes. These parameters
+        change all modes and mode shapes.
         """
         found: list[tuple[Delta, float]] = []
         for known in self._known:
@@ -311,7 +312,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def larger(self) -> Any:
-        """The plant with more modes that its machines have; None where none is known."""
+        """The plant with the modes that drawn machines have in addition; None if not known."""
         given = (kind.larger(self.plant) for kind in self.kinds)
         found = [one for one in given if one is not None]
         plant: Any = self.plant

@@ -47,8 +47,9 @@ class UnmodelledDynamics(Uncertainty):
         "inverse"       u or y is (I - W Delta)^-1 of what it was
         "coprime"       y = (M + W Delta_M)^-1 (N + W Delta_N) u,  G = M^-1 N normalised
 
-    The Delta is one full block over all channels that are named. Independent dynamics are several
-    values: ``plant.uncertain(UnmodelledDynamics(W, at="u1"), UnmodelledDynamics(W, at="u2"))``.
+    The Delta is one full matrix of dynamics over all channels that are named, so that it may couple
+    them. For dynamics that are independent of each other, pass several values:
+    ``plant.uncertain(UnmodelledDynamics(W, at="u1"), UnmodelledDynamics(W, at="u2"))``.
 
     Parameters
     ----------
@@ -58,9 +59,10 @@ class UnmodelledDynamics(Uncertainty):
     at : str or sequence of str
         Actuators, sensors, or both.
     form : {"inverse", "coprime"}, optional
-        Multiplicative at one side and additive between both when not given. "inverse" needs
-        channels of one side. "coprime" takes all u and y and no `at`; the units must give signals
-        of similar size (see `ncf_margin`).
+        Form of the uncertainty. By default it is multiplicative if `at` names only actuators or
+        only sensors, and additive if it names both. "inverse" needs channels of one side. "coprime"
+        takes all u and y and no `at`; the units must give signals of similar size (see
+        `ncf_margin`).
     name : str, optional
         Name of the Delta; by default from the channels: `u1:dynamics`.
 
