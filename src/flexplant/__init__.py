@@ -106,8 +106,8 @@ from run to run; other work on both cores made the quick calls of these up to 50
 | the same, commands saturated | 2.8 s | python-control (2000 of them) | 6 s | 2.1 |
 | H-infinity, 3 states: norm 0.137 | 22 ms | python-control, slycot: 0.137 | 20 ms | 0.91 |
 | H-infinity, 61 states of a stage: norm 0.901 | 0.63 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 20 ms | slycot ab13md, the upper one | 15 ms | 0.77 |
-| the upper bound alone | 11 ms | slycot ab13md, the upper one | 15 ms | 1.4 |
+| mu of 12 complex scalars, both bounds | 21 ms | slycot ab13md, the upper one | 14 ms | 0.7 |
+| the upper bound alone | 12 ms | slycot ab13md, the upper one | 15 ms | 1.2 |
 | poles of a close pair in noise: error 5e-07 | 0.58 s | scikit-rf: 7e-07 | 0.51 s | 0.88 |
 | a sparse OUTPUT4 file of Nastran | 16 ms | pyYeti | 36 ms | 2.3 |
 
