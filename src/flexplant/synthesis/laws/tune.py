@@ -51,15 +51,13 @@ def tune_loops(
     For a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds
     the law of each axis (PID, low-pass and notches), `design.report` its margins; `close_loop`
     takes `design.system`, and `write_c` exports it. ``before=`` and ``after=`` decouple several
-    axes; `decouple` computes them. At frequencies where the measured lines (frequency points) do
-    not resolve a resonance, or have a variance, the loop gain is kept small. The search is started
-    many times, and the result is the best one. There is no proof that it is optimal. A warning is
-    given if the peak is exceeded. The page `algorithms` describes the method.
+    axes; `decouple` computes them. The loop gain is kept small where the measured frequencies do
+    not resolve a resonance. The result is the best of many starts, without proof that it is
+    optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
 
-    The form of the law depends on how the response of the axis behaves: as that of a mass (falls
-    with 40 dB per decade), of a damper (20 dB per decade) or of a spring (constant). A plant with a
-    single axis that is unstable or has an odd number of integrators, such as a motor, gets the law
-    of `tune_pid`.
+    The law of an axis depends on its response: that of a mass (-40 dB per decade), of a damper
+    (-20) or of a spring (0). A single axis that is unstable, or integrates an odd number of times
+    as motors do, gets the law of `tune_pid`.
 
     Parameters
     ----------
