@@ -41,6 +41,11 @@ _SLACK = 1e-6
 #: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
 _MISSED = 0.1
 
+_LEAST = (
+    "rounding lets no controller of a smaller gamma be computed than that of least quadratic cost, "
+    "which is returned: poles that are too slow or too fast next to the loop's speed cost digits."
+)
+
 #: a search in a regular problem, scaled by the norm of its loop of least quadratic cost, and by
 #: which: the smallest gamma that is reached, and the largest that is refuted
 Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
@@ -218,11 +223,14 @@ def regular_controller(
     scaled = problem.measured_in(unit)
     high, low = search(scaled, unit)
     K, norm = _accepted(scaled, high, _REGULAR if back_off is None else back_off)
+    notes: tuple[str, ...] = ()
     if K is None:  # a gamma of the problem itself is below what is reached with much added to it
-        K = least.replace(C=least.C / unit)
+        K, notes = least.replace(C=least.C / unit), (_LEAST,)
         norm = _loop_norm(scaled, K)
     _require_finite_gain(scaled, K, unit * norm)
-    return SolvedController(K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm))
+    return SolvedController(
+        K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm), notes=notes
+    )
 
 
 def _accepted(problem: Prepared, high: float, step: float) -> tuple[StateSpace | None, float]:

@@ -165,6 +165,7 @@ class _Found(NamedTuple):
     level: float
     K: StateSpace
     gamma: float
+    notes: tuple[str, ...] = ()
 
     @property
     def speed(self) -> float:
@@ -213,7 +214,7 @@ def _with_level(
             "stabilise in rounding, or a mode that z and w miss stays on the edge of stability. "
             "Weight the efforts and that motion in z, and give each sensor noise in w."
         )
-    return _Found(regular.level, K, gamma)
+    return _Found(regular.level, K, gamma, found.notes)
 
 
 def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: Lacking) -> None:
@@ -245,7 +246,12 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
     if finer is not one and finer.gamma:
         cost = max(100.0 * (one.gamma / finer.gamma - 1.0), 0.0)
         note += f"; a tenth of it gives a gamma {cost:.2g} % smaller"
-    notes = [note + "."]
+    notes = [note + ".", *one.notes]
+    if len(found) < len(LEVELS) and one is finer:
+        notes.append(
+            f"with less than {one.level:.0e} added the equations are solved in rounding no more: "
+            "a smaller gamma may exist."
+        )
     if any(not a.settles(b) and b.speed > _GROWTH * a.speed for a, b in pairwise(found[-3:])):
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
