@@ -5,8 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexplant.errors import ModelError
-from flexplant.lti import StateSpace
+from flexplant.errors import ModelError, SolverError
+from flexplant.lti import StateSpace, hinf_norm, lft, tf
+from flexplant.plant import mixed_sensitivity
+from flexplant.synthesis.hinf.hinf_riccati import regular_controller
+from flexplant.synthesis.hinf.singular import lacking, made_regular
 from flexplant.synthesis.preparation import prepared
 from oracles_synthesis import closed_loop, gains, split, stability
 
@@ -193,3 +196,24 @@ def test_two_hundred_states_take_no_time():
     p = prepared(g, U, Y)
     assert time.perf_counter() - start < 2.0
     assert p.A.shape == (200, 200)
+
+
+def test_a_controller_that_rounding_leaves_says_so():
+    """Where no smaller gamma is reached, and where less noise and effort cannot be added."""
+    p = prepared(plant(), U, Y)
+    found = regular_controller(p, lambda scaled, unit: (1e-9, 0.0), None)
+    K = found.A, found.B, found.C, found.D
+    assert "that of least quadratic cost" in found.notes[0] and len(found.notes) == 1
+    loop = lft(p.system, StateSpace(*K, inputs=list(Y), outputs=list(U)))
+    assert found.gamma == pytest.approx(hinf_norm(loop), rel=1e-3)
+    mixed = mixed_sensitivity(tf([1], [1, 0]), S=tf([0.5, 0.3], [1, 3e-4]))  # no effort in z
+    singular, calls = prepared(mixed.system, list(mixed.u), list(mixed.y)), []
+
+    def once(problem):
+        calls.append(problem)
+        if len(calls) > 1:
+            raise SolverError("rounding")
+        return regular_controller(problem, lambda scaled, unit: (1.0, 0.0), None)
+
+    notes = made_regular(singular, once, lacking(singular)).notes
+    assert any("in rounding no more" in note for note in notes)
