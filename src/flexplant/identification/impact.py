@@ -209,10 +209,10 @@ def impact_frf(
     complex conjugate of F. Blows are the pulses of the force in long records. Each blow has a
     separate segment, in which the force outside of the pulse is set to zero (force window). Force
     and responses are multiplied by the exponential window ``exp(-t/decay)``. This moves all poles
-    by -1/decay (`ImpactTest.corrected` reverses it). Vibration that remains at the end of a segment
-    changes residues but no pole. Blows are left out if their segment contains another blow, if they
-    are clipped, or if the record ends too early. The machine is assumed to be at rest before a
-    record that begins with a blow.
+    by -1/decay (`ImpactTest.corrected` reverses it). A vibration that has not died out at the end
+    of a segment falsifies the residues, but not the poles. Blows are left out if their segment
+    contains another blow, if they are clipped, or if the record ends too early. The machine is
+    assumed to be at rest before a record that begins with a blow.
 
     Parameters
     ----------

@@ -38,8 +38,8 @@ class MeasuredModes(Value):
         One pole of each conjugate pair, with either sign of the imaginary part (the paper on which
         flexplant is based prints the negative one); stored with the positive one.
     modes : sequence of m int, optional
-        Number of each mode in the model, counted from 1 with rigid-body modes. The numbers are
-        needed to update a model.
+        Number of each mode in the model, counted from 1; rigid-body modes are counted too. The
+        numbers are needed to update a model.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
         Either the variance E|d lambda|^2 of each pole, whose real and imaginary parts are then
         equally uncertain and independent, or the covariance matrix of the vector [Re lambda; Im

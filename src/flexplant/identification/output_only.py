@@ -56,14 +56,14 @@ def identify_output_only(
     some basis of the states. A follows from O and O shifted by one block, and the poles are
     :math:`\lambda = rate\,\ln \mu` with the eigenvalues :math:`\mu` of A. This is repeated for
     several model orders (numbers of states). Poles that hardly change from order to order count as
-    stable. They are chosen at the lowest order that has most of them, since more states add noise.
-    White sensor noise is in :math:`R_0` only, which is not used. The covariance of each pole is
-    found by leaving out each block of the record in turn (a jackknife). With b blocks it is
-    multiplied by (b - 1)/(b - 3), so that squared errors relative to the variance (Student's
-    distribution) have a mean of 1. Poles whose frequency varies by more than 2 % or whose damping
-    varies by more than 60 % count as noise and are left out. A rotating part or mains hum appears
-    as a mode with almost no damping. Peaks in the spectrum of an excitation that is not white
-    appear as additional modes.
+    stable. They are taken from the lowest model order at which the number of stable poles is
+    largest, since more states add noise. White sensor noise is in :math:`R_0` only, which is not
+    used. The covariance of each pole is found by leaving out each block of the record in turn (a
+    jackknife). With b blocks it is multiplied by (b - 1)/(b - 3), so that squared errors relative
+    to the variance (Student's distribution) have a mean of 1. Poles whose frequency varies by more
+    than 2 % or whose damping varies by more than 60 % count as noise and are left out. A rotating
+    part or mains hum appears as a mode with almost no damping. Peaks in the spectrum of an
+    excitation that is not white appear as additional modes.
 
     Parameters
     ----------

@@ -68,8 +68,7 @@ class H2Estimator(SpectralMethod):
     Parameters
     ----------
     segment, overlap, window : optional
-        Length of the segments, their overlap and their window, as for `H1Estimator`. The
-        reference is the same too.
+        Length of the segments, their overlap and their window, as for `H1Estimator`.
 
     Examples
     --------

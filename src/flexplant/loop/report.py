@@ -50,8 +50,8 @@ class LoopMargins(Value):
     freq : float [Hz]
         Frequency at which the modulus margin occurs.
     gain_freq, phase_freq : float [Hz]
-        Frequency of the smaller (in dB) of `gain_margin` and `gain_reduction`, and frequency of the
-        phase margin; NaN if they do not exist.
+        Frequency of that of `gain_margin` and `gain_reduction` which is closer to 1, in dB, and
+        frequency of the phase margin; NaN if they do not exist.
     phases : tuple of float [deg]
         Change of phase at each crossover that moves the loop gain to the critical point: positive
         for a lag, negative for a lead.

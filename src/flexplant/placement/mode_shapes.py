@@ -130,7 +130,7 @@ class ModeInformation(ByShapes):
 
 @dataclass(frozen=True, eq=False)
 class RowSelection(Search):
-    """A search for `ModeInformation` that selects rows of mode shapes as `select_dofs` does.
+    """Selection of rows of mode shapes, as in `select_dofs`, for the criterion `ModeInformation`.
 
     Parameters
     ----------

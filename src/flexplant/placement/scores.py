@@ -264,7 +264,7 @@ def _score_layouts(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceWorth(Value):
-    """The value of a choice without each of its devices; prints as a table.
+    """The value of a choice when one device is left out, for each device; prints as a table.
 
     Parameters
     ----------

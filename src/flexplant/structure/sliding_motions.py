@@ -68,7 +68,7 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
 
 
 def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
-    """Return a model whose slides `solve_modes` accepts as modes at 0 Hz.
+    """Return a model whose free motions (slides) `solve_modes` accepts as modes at 0 Hz.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
         carriage on its guide.
     names : sequence of str, optional
         Labels of the accepted slides, as `slides` gives them; all by default. `solve_modes` refuses
-        each other slide as a mechanism.
+        every other free motion as a mechanism.
 
     Raises
     ------

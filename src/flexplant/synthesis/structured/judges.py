@@ -238,10 +238,10 @@ _CLOSE = 1e-7
 class Judge(Protocol):
     """One number of a stable loop, such as a norm, that `design_structured` minimises.
 
-    The search minimises the logarithm of this number and uses its gradient. The controllers that it
-    receives are in the user's units. The prepared problem p of an objective is scaled: one unit of
-    its time is ``1 / p.speed`` seconds. A judge that works on the matrices of p therefore has to
-    convert its number back into the user's units.
+    The search minimises the logarithm of this number and uses its gradient. The judge receives
+    controllers in the user's units. An objective makes its judge from the prepared problem p, which
+    is scaled: one unit of its time is ``1 / p.speed`` seconds. A judge that works on the matrices
+    of p therefore has to convert its number back into the user's units.
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:

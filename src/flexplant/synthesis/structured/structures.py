@@ -241,7 +241,7 @@ class ObserverGains(Value):
     """An observer of the plant's states with state feedback: the gains L and F are free.
 
     ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, where B2 is the input matrix of u, C2
-    the output matrix of y, and D22 the feedthrough from u to y, all of the plant with its weights.
+    the output matrix of y, and D22 the feedthrough from u to y, all three of the weighted plant.
     The search starts with the gains of LQG. For a sampled plant, the observer is that of its
     continuous equivalent by the bilinear transformation.
 
