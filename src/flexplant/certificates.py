@@ -15,21 +15,22 @@ from .store import Value
 
 @dataclass(frozen=True, eq=False)
 class Verified(Value):
-    """One figure that was computed to verify an answer.
+    """One number that was computed to verify a result.
 
     Parameters
     ----------
     what : str
-        What was checked, with its unit in brackets where it has one: "norm", "corner [Hz]".
+        Name of the checked quantity, with its unit in brackets if it has one, such as "norm" or
+        "corner [Hz]".
     figure : float
-        The figure that was found.
+        Number that was found.
     route : str
-        Method by which it was computed; empty if it is the method that gave the answer.
+        Method that computed the number. It is empty if the method is the one that gave the result.
     limit : float, optional
-        Largest allowed figure, or the smallest one if `at_least` is true. Without a limit the
-        figure is only information.
+        Largest allowed number, or the smallest allowed number if `at_least` is true. Without a
+        limit the number is only information.
     at_least : bool
-        Whether the limit is a lower one.
+        Whether the limit is a lower limit.
 
     Examples
     --------
@@ -46,14 +47,14 @@ class Verified(Value):
 
     @property
     def holds(self) -> bool | None:
-        """Whether the limit is kept; None without a limit."""
+        """Whether the number is within its limit; None if there is no limit."""
         if self.limit is None:
             return None
         return self.figure >= self.limit if self.at_least else self.figure <= self.limit
 
     @property
     def row(self) -> list[str]:
-        """What was checked, the figure, its limit and the route, in words."""
+        """One row of a table: texts of the checked quantity, number, limit and method."""
         sign = "at least" if self.at_least else "at most"
         limit = "" if self.limit is None else f"{sign} {figure(self.what, self.limit)}"
         failed = ", not kept" if self.holds is False else ""
@@ -62,14 +63,15 @@ class Verified(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Value, Mapping[str, float]):
-    """Verified figures of a result with their limits, computed by a second method.
+    """The numbers that verify a result, with their limits. A second method computes each of them.
 
-    ``certificate["norm"]`` is the figure of a check; ``certificate.checks`` holds all of them.
+    ``certificate["norm"]`` is the number that the check "norm" found. ``certificate.checks`` holds
+    all checks.
 
     Parameters
     ----------
     checks : sequence of Verified
-        Verified figures, each with its name, limit and method.
+        Checks, each with its name, number, limit and method.
 
     Examples
     --------
@@ -86,7 +88,7 @@ class Certificate(Value, Mapping[str, float]):
 
     @property
     def holds(self) -> bool:
-        """Whether all figures are within their limits."""
+        """Whether all numbers are within their limits."""
         return all(check.holds is not False for check in self.checks)
 
     def __getitem__(self, what: str) -> float:
@@ -106,7 +108,7 @@ class Certificate(Value, Mapping[str, float]):
         return self.extended(*other.checks) if isinstance(other, Certificate) else NotImplemented
 
     def extended(self, *checks: Verified) -> Certificate:
-        """Return the certificate with further checks, which replace those of the same name."""
+        """Return the certificate with further checks. They replace checks of the same name."""
         return Certificate((*self.checks, *checks))
 
     def __repr__(self) -> str:

@@ -40,29 +40,30 @@ RESIDUE = "set-point residue"
 class ErrorBudget(Value):
     """Contributions to the rms of one signal of a closed loop; prints as a table.
 
-    The sources are independent, so that their variances add. Made by `ClosedLoop.budget`.
+    The sources are independent, so that their variances add. `ClosedLoop.budget` makes this object.
 
     Parameters
     ----------
     channel, unit : str
         Name of the signal and its SI unit; the unit is empty if it is not known.
     names : sequence of str
-        Names of the sources: white disturbances, sensor noises, and the residue of a set-point,
-        which is the error that remains without noise.
+        Names of the sources: the white disturbances, the sensor noises and the residue of a
+        set-point. The residue is the error of a run without noise.
     variances : (n_source,) array [unit^2]
         Variance of each source.
     freq : (n_freq,) array [Hz]
-        Frequencies from 0 to half the rate; to infinity for a continuous loop.
+        Frequencies from 0 to half the sampling rate. For a continuous loop the last one is
+        infinite.
     cumulative : (n_source, n_freq) array [unit^2]
         Variance of each source below each frequency of `freq`.
     left_out : float [unit]
-        RMS on the plant with the truncated modes; NaN where these are not known, infinite where the
-        loop is unstable with them.
+        RMS with the truncated modes included. It is NaN if these modes are not known, and infinite
+        if the loop is unstable with them.
     certificate : Certificate
-        Relative differences between the variance and the same variance computed by other methods.
+        Relative differences between the variance and the results of other methods for it.
     interval : str
         Text of the interval of the rms over the machines that agree with a measurement, or the
-        reason why it does not exist; empty if the plant knows no such machines.
+        reason why there is no such interval. It is empty if the plant knows no such machines.
 
     Examples
     --------

@@ -119,7 +119,7 @@ class ClosedLoop(Value):
 
     @property
     def machine(self) -> StandardPlant:
-        """The plant of the machine; ModelError for a loop around a generalized plant."""
+        """The plant as a StandardPlant. A loop around a generalized plant raises ModelError."""
         return standard_plant(self.plant)
 
     @property
@@ -134,7 +134,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """The SI units of the channels that have a known one, estimates included."""
+        """SI units of the channels, estimates included; unknown units are left out."""
         blocks = {name: unit for block in self.blocks for name, unit in block.units.items()}
         return blocks | self.plant.units
 
@@ -158,7 +158,7 @@ class ClosedLoop(Value):
         return loop_poles(self._path.system, self._command)
 
     def poles(self) -> ComplexArray:
-        """Return the eigenvalues of the closed loop [rad/s or 1]."""
+        """Return the closed loop's poles: in rad/s if it is continuous, else in the z-plane."""
         return self._poles.copy()
 
     @cached_property
@@ -172,7 +172,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def system(self) -> StateSpace:
-        """The closed loop from w to z; states of the plant, then of the controller."""
+        """The closed loop from w to z. The plant's states come before the controller's."""
         return self.monitored.select(outputs=self.plant.z)
 
     def frequency_response(self, freq: npt.ArrayLike) -> Frf:
@@ -189,10 +189,10 @@ class ClosedLoop(Value):
         return Frf(grid, data, tuple(self.plant.w), tuple(self.plant.z), units=self.units)
 
     def gain(self, reference: str, error: str) -> Responder:
-        """Return a function of frequency [Hz]: the response from one channel of w to one of z.
+        """Return a function that computes the response from one channel of w to one of z.
 
-        Use it for many calls: it is prepared once and does not check frequencies. It returns an
-        array (1, 1, n_freq).
+        The argument of this function is an array of frequencies [Hz], which it does not check. It
+        returns an array (1, 1, n_freq) and is fast, because all else is prepared once.
         """
         return self._responses([reference], [error])
 
@@ -222,7 +222,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def broken(self) -> BrokenLoop:
-        """Plant and controller of the open loop, with u and only the outputs y that u moves."""
+        """The open loop: plant and controller between u and those outputs y that u can move."""
         read = self.controller.input_index(self.fed_back)
         return BrokenLoop(
             self.driven,
@@ -236,7 +236,7 @@ class ClosedLoop(Value):
 
     @property
     def spectral_radius(self) -> float:
-        """Largest magnitude of the closed loop's eigenvalues; stable below 1.
+        """Largest magnitude of the closed loop's eigenvalues. Below 1 the loop is stable.
 
         A continuous loop raises ModelError: use its `spectral_abscissa`.
         """
@@ -249,7 +249,7 @@ class ClosedLoop(Value):
 
     @property
     def spectral_abscissa(self) -> float:
-        """Largest real part of the closed loop's eigenvalues [rad/s]; stable below 0.
+        """Largest real part of the closed loop's eigenvalues [rad/s]. Below 0 the loop is stable.
 
         For a sampled loop it is ``log(spectral_radius) / dt``.
         """
@@ -272,12 +272,12 @@ class ClosedLoop(Value):
 
     @cached_property
     def obstacle(self) -> Obstacle | None:
-        """The pole that makes the loop unstable or marginal (to within rounding), or None."""
+        """The pole that makes the loop unstable or (within rounding) marginally stable, or None."""
         return obstacle(self.monitored)
 
     @cached_property
     def completed(self) -> ClosedLoop | None:
-        """The same controller around the plant with truncated modes; None if not known."""
+        """The loop of this controller and the plant with truncated modes; None if not known."""
         whole = self.plant.evaluation_plant
         return None if whole is None else self.around(whole)
 
@@ -302,21 +302,21 @@ class ClosedLoop(Value):
     def modulus_margin(self) -> float:
         """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
-        ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances. If actuators have different units, axes are scaled as in
-        `LoopReport.scaled_margin`. It is 0 for an unstable loop.
+        This is ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``. The frequencies f are
+        refined at the closed loop's resonances. If actuators have different units, axes are scaled
+        as in `LoopReport.scaled_margin`. It is 0 for an unstable loop.
         """
         return self.broken.margin()
 
     @cached_property
     def on_measurement(self) -> OnMeasurement | None:
-        """Stability and margin on the response of ``plant.measured(frf)``; None: not measured."""
+        """Stability and margin on the response of ``plant.measured(frf)``; None without one."""
         known = self.plant.machine.measurement or fitted_response(self.plant.machine)
         return None if known is None else judged(self, known)
 
     @cached_property
     def on_machines(self) -> MachineLoops:
-        """The same controller around machines that agree with the measurement.
+        """The loops of this controller with the machines that agree with the measurement.
 
         A plant that knows no such machines raises ModelError.
         """
@@ -335,16 +335,16 @@ class ClosedLoop(Value):
         *,
         unit: str = "",
     ) -> FigureInterval:
-        """Return the interval of a figure of the loop over machines with the same measurement.
+        """Return the interval of a number over the machines that agree with the measurement.
 
         Parameters
         ----------
         figure : str or callable
-            "modulus margin", "bandwidth" (Hz, the smallest of all axes that have a reference),
-            "spectral radius", or a signal for its `rms`. A function of a loop that returns a
-            positive number is evaluated on each machine, such as the MA of the error after a move:
-            ``lambda one: simulate(one, reference=move, duration=0.1, noise=False)
-            .exposure("die:error", start=0.05)[0]``.
+            The number: "modulus margin", "bandwidth" (in Hz, the smallest of all axes with a
+            reference), "spectral radius", or a signal for its `rms`. It may also be a function of a
+            loop that returns a positive number, such as the MA of the error after a move: ``lambda
+            one: simulate(one, reference=move, duration=0.1, noise=False).exposure("die:error",
+            start=0.05)[0]``.
         level : float
             Fraction of the machines, between 0 and 1.
         unit : str
@@ -353,8 +353,8 @@ class ClosedLoop(Value):
         Returns
         -------
         FigureInterval
-            ``(low, high, sentence)``; low and high are None if the interval does not exist or the
-            loop is unstable on a machine; the sentence gives the reason.
+            ``(low, high, sentence)``. If the interval does not exist or a machine's loop is
+            unstable, low and high are None and the sentence gives the reason.
 
         Raises
         ------
@@ -365,32 +365,32 @@ class ClosedLoop(Value):
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:
-        """Tolerances to errors of each mode; None for coupled modes or an unstable loop.
+        """Tolerances to errors of single modes; None if modes are coupled or the loop is unstable.
 
         If the plant has uncertain frequencies, truncated modes are included where they are known.
-        `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
-        or up to 2.5 times their uncertainty.
+        The range of changes is 1 %, or 2.5 times the uncertainty of the frequency. `interval`
+        covers simultaneous changes of all modes.
         """
         return reported_tolerances(self)
 
     def around(self, plant: AnyPlant) -> ClosedLoop:
-        """Return the loop of the same controller around a machine with the same u, y and rate."""
+        """Return the loop of this controller around another plant with the same u, y and rate."""
         return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
 
     def mode_tolerances(self, *, margin: float = MARGIN, known: Any = None) -> ModeTolerances:
         """Return the tolerance of the loop to errors of frequency and damping of each mode.
 
         One mode changes at a time. The results are the exact changes at which a pole crosses the
-        stability boundary, and at which the modulus margin falls to `margin`. A loop with a gain
-        above 1 at a mode of 0.1 % damping may tolerate less than 0.2 %, while the frequencies of
-        unmeasured modes of a model are seldom that accurate.
+        stability boundary, and at which the modulus margin falls to `margin`. If the loop gain is
+        above 1 at a mode with 0.1 % damping, the tolerance may be below 0.2 %. The frequencies of
+        an unmeasured model are seldom that accurate.
 
         Parameters
         ----------
         margin : float
             Required modulus margin, with the loop opened at u.
-        known : UncertainPlant, float, (m,) array or {mode: float}, optional
-            Relative uncertainty of the frequency of each elastic mode; by default that of the
+        Relative uncertainty of the frequency of each elastic mode; by default that stored in the
+        plant.
             plant.
 
         Raises
@@ -411,17 +411,17 @@ class ClosedLoop(Value):
         return found
 
     def rms(self, channel: str) -> float:
-        """Return the stationary rms of a signal under all white noises, in closed form.
+        """Return the stationary rms of a signal that all white noises together cause.
 
-        For a sampled loop it holds at the sample instants: disturbances act with their exact
-        covariance over a sample, which includes aliasing from above half the rate; the noise of a
-        sensor has the variance ``asd^2 rate / 2`` per sample. Truncated modes are not included:
-        `completed.rms(channel)` is the rms with them, if they are known.
+        It is computed without simulation. For a sampled loop it holds at the sample instants, and
+        includes aliasing from above half the rate. The noise of a sensor has the variance ``asd^2
+        rate / 2`` per sample. Truncated modes are not included. If they are known,
+        `completed.rms(channel)` is the rms with them.
 
         Parameters
         ----------
         channel : str
-            A z, y, driven u or monitored output; the rms is in its unit.
+            Name of a channel of z or y, a driven u or a monitored output. The rms has its unit.
 
         Raises
         ------
@@ -435,21 +435,21 @@ class ClosedLoop(Value):
         return float(np.sqrt(variances.sum()))
 
     def drawn_rms(self, channel: str) -> float:
-        """Return `rms` without its check by a second method, for variations of a verified loop."""
+        """Return `rms` without verification, to be used for variations of a verified loop."""
         variances = unverified_variances(self.monitored, *self._noises(channel))
         return float(np.sqrt(variances.sum()))
 
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
-        """Return the one-sided power spectral density of a signal under all white noises.
+        """Return the one-sided power spectral density that all white noises together cause.
 
-        For a sampled loop it is that of the samples, up to half the rate: motion above half the
-        rate is included by aliasing, so that its integral is the variance ``rms(channel)^2``.
+        For a sampled loop it is the density of the samples, up to half the rate. Motion above half
+        the rate is included by aliasing. The integral is therefore the variance ``rms(channel)^2``.
 
         Parameters
         ----------
         channel : as for `rms`
         freq : (n_freq,) array [Hz], optional
-            Frequencies up to half the rate, else ModelError; by default through all resonances.
+            Frequencies up to half the rate. The default frequencies resolve all resonances.
         """
         row, noises = self._noises(channel)
         grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)
@@ -462,21 +462,21 @@ class ClosedLoop(Value):
         ----------
         channel : as for `rms`
         residue : Response, mapping {channel: samples} or (n_time,) array, optional
-            A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``:
-            the remaining error of the set-point is a separate source, with its mean square.
+            A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``.
+            The error in it is an additional source, whose variance is the mean square.
         start : float [s]
             Samples of the residue before this time are left out.
 
         Returns
         -------
         ErrorBudget
-            Its repr is the table; `fx.plot.budget` draws it.
+            The budget; it prints as a table, and `fx.plot.budget` draws it.
 
         Raises
         ------
         LabelError, AssumptionError, ModelError, CertificateError
-            As for `rms`; or when the residue does not match the loop, or the integral of the
-            spectrum gives another variance.
+            As for `rms`; also when the residue does not match the loop, or when the integral of the
+            spectrum differs from the variance.
         """
         row, noises = self._noises(channel)
         left_out, whole = float("nan"), self.completed
@@ -508,23 +508,23 @@ def close_loop(
 
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
     applied command of an actuator (plant.u), or an output of another block. A block output with the
-    name of an actuator drives that actuator; several outputs with the same name are added. All
-    other outputs are monitored. A block may also read signals that are known in advance: the
-    derivatives of a reference (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`,
-    `die:ref:snap`), which `simulate` takes from the SetPoint, and forces (`u1:feedforward`), which
-    are given as references.
+    name of an actuator drives that actuator. Several outputs with the same name are added. All
+    other outputs are monitored. A block may also read the derivatives of a reference
+    (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`, `die:ref:snap`), which `simulate`
+    computes from the SetPoint. It may also read forces (`u1:feedforward`), which are given as
+    references.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
-        Plant; the loop is also checked on its evaluation model (`ClosedLoop.left_out`). For an
-        uncertain plant the nominal one is used, and the repr shows the tolerances of its modes
-        (`ClosedLoop.tolerances`). A system with channels named like those of an assembled plant
-        (see `StandardPlant.from_statespace`) is accepted too.
+        Plant of the loop. The loop is also checked on the plant's evaluation model, see
+        `ClosedLoop.left_out`. For an uncertain plant the nominal one is used, and the repr shows
+        `ClosedLoop.tolerances`. The channels of a StateSpace have the names of those of an
+        assembled plant, see `StandardPlant.from_statespace`.
     *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
-        Parts of the controller, in any number, sampled at the plant's rate, or static gains.
+        Parts of the controller. Each is sampled at the plant's rate, or is a static gain.
     idle : iterable of str
-        Actuators that are not driven on purpose.
+        Actuators that no block drives. Naming them here prevents an error.
 
     Returns
     -------

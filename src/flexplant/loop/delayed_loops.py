@@ -28,17 +28,18 @@ _MOST = 2_000_000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DelayedLoop(Value):
-    """The loop ``u = K y`` around a plant, where plant, controller or both have a delay.
+    """The loop ``u = K y`` around a plant, with a delay in the plant, the controller or both.
 
-    ``L = -G K`` is computed exactly at every frequency. Poles of the loop in the right half plane
-    are counted from the phase of ``det(I + L)`` along the imaginary axis (Nyquist). Points are
-    added until this phase changes by less than 0.5 rad between neighbours.
+    The loop gain ``L = -G K`` is computed exactly at every frequency. The number of poles in the
+    right half plane follows from the phase of ``det(I + L)`` along the imaginary axis (Nyquist
+    criterion). Frequencies are added until this phase changes by less than 0.5 rad between
+    neighbours.
 
     Parameters
     ----------
     plant, controller : StateSpace or Delayed, continuous
-        G and K; K includes the sign of the feedback. K may be improper (differentiate) if G has no
-        direct feedthrough.
+        Plant G and controller K; K includes the sign of the feedback. K may be improper
+        (differentiate) if G has no direct feedthrough.
 
     Raises
     ------
@@ -89,8 +90,8 @@ class DelayedLoop(Value):
     def unstable_poles(self) -> int:
         """Number of poles of the loop in the right half plane.
 
-        AssumptionError when there are infinitely many; SolverError when the contour needs too many
-        points.
+        AssumptionError is raised if there are infinitely many such poles, and SolverError if the
+        phase needs too many frequencies.
         """
         if self._at_infinity >= 1.0:
             raise AssumptionError(
@@ -138,7 +139,7 @@ class DelayedLoop(Value):
 
     @cached_property
     def lines(self) -> FloatArray:
-        """Frequencies [Hz] at which margins and norms are searched."""
+        """Frequencies [Hz] at which margins and norms are computed before they are refined."""
         low, high = self._slow, self._fast
         decades = np.log10(high / low)
         even = np.geomspace(low, high, int(_POINTS * decades) + 2)
@@ -188,7 +189,10 @@ class DelayedLoop(Value):
         return np.asarray(np.linalg.det(np.eye(L.shape[1]) + L))
 
     def response(self, which: Literal["S", "T", "L", "KS"], freq: npt.ArrayLike) -> ComplexArray:
-        """Return the exact response (p, m, n) at frequencies [Hz]: S, T or L at y, or -K S."""
+        """Return the exact response (p, m, n) at n frequencies [Hz].
+
+        S, T and L are those with the loop opened at y; "KS" selects -K S.
+        """
         one_of(which, "which", ("S", "T", "L", "KS"))
         s = 2j * np.pi * np.atleast_1d(real_array(freq, "freq"))
         K, G = (np.moveaxis(part.at(s), 2, 0) for part in (self.controller, self.plant))
@@ -201,8 +205,8 @@ class DelayedLoop(Value):
     def norm(self, which: Literal["S", "T", "KS"]) -> tuple[float, float]:
         """Return the H-infinity norm of S, T or K S and its frequency [Hz].
 
-        The largest peaks at the frequencies `lines` are refined. The norm of an unstable loop is
-        infinite.
+        The largest peaks of the response at the frequencies `lines` are refined. The norm of an
+        unstable loop is infinite.
         """
         if not self.is_stable:
             return np.inf, np.nan
@@ -219,11 +223,11 @@ class DelayedLoop(Value):
 
     @cached_property
     def margins(self) -> dict[str, tuple[float, float]]:
-        """Smallest gain, phase and delay margins of a loop with one channel, with frequencies.
+        """Smallest gain, phase and delay margins of a loop with one channel, and their frequencies.
 
-        ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``; a gain margin below 1
-        means that the loop becomes unstable when its gain is reduced by this factor. A margin that
-        does not exist is infinite.
+        The dictionary is ``{"gain": (factor, Hz), "phase": (degrees, Hz), "delay": (s, Hz)}``. With
+        a gain margin below 1 the loop becomes unstable when its gain is reduced by this factor. A
+        margin that does not exist is infinite.
         """
         if len(self.gain.inputs) != 1 or len(self.gain.outputs) != 1:
             raise ModelError(
@@ -249,18 +253,18 @@ class DelayedLoop(Value):
         }
 
     def lsim(self, reference: Callable[[float], float], time: npt.ArrayLike) -> FloatArray:
-        """Return y (p, n) of the loop that follows a reference from rest, by the method of steps.
+        """Return y (p, n) of the loop that starts at rest and follows a reference.
 
-        On each interval of one delay the delayed error is already known, so that an ordinary
-        differential equation remains. SciPy's solver of order 8 solves it with a relative tolerance
-        of 1e-9.
+        The method of steps is used. On each interval as long as the delay, the delayed error is
+        already known, so that an ordinary differential equation remains. SciPy's solver of order 8
+        solves it with a relative tolerance of 1e-9.
 
         Parameters
         ----------
         reference : function of the time [s]
             Reference of all channels. It must be smooth between multiples of the delay.
         time : (n,) array [s]
-            Instants, growing from 0 or later.
+            Time instants in increasing order, all at 0 or later.
         """
         from scipy.integrate import solve_ivp  # not loaded with the package
 

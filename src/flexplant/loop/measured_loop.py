@@ -31,33 +31,35 @@ def in_axes(
     delay: float = 0.0,
     hold: bool = True,
 ) -> Frf:
-    """Return the measured plant from the axes of `before` to those of `after`.
+    """Return a measured plant with its inputs and outputs transformed, such as to decoupled axes.
 
     The result is ``after G before``, where G is the measured response. If a `rate` is given, the
-    result is multiplied by the response of the delay and the zero-order hold of a sampled
-    controller, ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. Sampling folds the
-    response above half the rate to lower frequencies. The result is then
-    ``sum_k (G H)(f + k rate)`` over the measured frequencies.
+    result is multiplied by ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. H is the
+    response of the delay and the zero-order hold of a sampled controller. Sampling also folds the
+    response above half the rate to lower frequencies (aliasing). The result is then the sum ``sum_k
+    (G H)(f + k rate)`` over the measured frequencies.
 
     Parameters
     ----------
     frf : Frf
         Measured response from actuators to sensors.
     before, after : StateSpace or array, optional
-        Static transformations: `accelerations` (or `to_actuators`) and `to_motions` of a
-        `decouple`. The channel names of a StateSpace select the channels of the Frf.
+        Static transformations of the inputs and of the outputs. For a `decouple` result these are
+        `accelerations` (or `to_actuators`) and `to_motions`. The channel names of a StateSpace
+        select the channels of the Frf.
     rate : float [Hz], optional
-        Rate of the controller; the result ends below half of it.
+        Sampling rate of the controller. The result ends below half of it.
     delay : float
-        Delay between a measurement and its command, which the Frf does not contain.
+        Delay between a measurement and its command, in samples, that the Frf does not contain.
     hold : bool
-        Whether to add the hold; False for an Frf that was measured between samples and contains it.
+        Whether to add the zero-order hold. Use False if the Frf already contains it, because it was
+        measured from sample to sample.
 
     Returns
     -------
     Frf
-        Response with the variance of the measurement, where variance or coherence is known (see
-        `line_variance`), without other statistics.
+        Transformed response. It has the variance of the measurement if the variance or the
+        coherence is known, and no other statistics.
 
     Raises
     ------

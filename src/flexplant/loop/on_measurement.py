@@ -22,15 +22,14 @@ class OnMeasurement(Value):
     Parameters
     ----------
     margin : float
-        Modulus margin, with the loop opened at u; 0 if the loop is unstable, NaN if the measured
-        frequencies do not show whether it is stable.
+        Modulus margin, with the loop opened at u. It is 0 if the loop is unstable, and NaN if the
+        measured frequencies do not show whether it is stable.
     freq : float [Hz]
         Frequency at which the sensitivity |S| at u is largest.
     reason : str
         Reason why the stability is not known; empty if it is known.
-    added : float [samples]
-        Delay of the plant that was added to a response measured from sample to sample. Such a
-        response may already contain this delay.
+    Delay of the plant that was added to the response. This happens if the response was measured
+    from sample to sample, and such a response may already contain the delay.
 
     Examples
     --------

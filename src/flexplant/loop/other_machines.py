@@ -35,29 +35,27 @@ _HIGH, _LARGER = 2.5, 1.1
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SpillOver(Value):
-    """The check of a loop on the plant with truncated modes, with the same sampling and delay.
+    """The check of a loop on the plant with truncated modes. Sampling and delay stay the same.
 
     Parameters
     ----------
     stability : float
-        Spectral radius of the sampled closed loop on that plant, below 1 when stable; for a
-        continuous loop the largest real part [rad/s], below 0 when stable.
+        Spectral radius of a sampled closed loop on that plant, below 1 when stable. For a
+        continuous loop it is the largest real part of the poles [rad/s], below 0 when stable.
     sampled : bool
         Whether the loop is sampled.
     modulus_margin : float
         Modulus margin on that plant, with the loop opened at u; 0 when unstable.
     without : float
         Modulus margin on the plant without the truncated modes; 0 when unstable.
-    peak_freq : float [Hz]
+    Frequency at which |S| at u is largest with the truncated modes; NaN when unstable.
         Frequency at which |S| at u is largest with these modes; NaN when unstable.
     states : int
         Number of states of the plant with the truncated modes.
-    modes : sequence of int
-        Numbers (from 1, rigid-body modes included) of the modes of that plant with the largest
-        participation in the instability, or in the peak of |S| at u if `is_high` is true; empty
+    Numbers of the modes that take the largest part in the instability, or in the peak of |S| at u
+    if `is_high` is true; otherwise empty. Counting starts at 1 and includes rigid-body modes.
         otherwise.
-    freq : sequence of float [Hz]
-        Frequencies of the instability or peak, one for each of these modes.
+    Frequency of the instability or of the peak, one value for each of these modes.
 
     Examples
     --------
@@ -88,7 +86,7 @@ class SpillOver(Value):
 
     @property
     def is_fine(self) -> bool:
-        """Whether the truncated modes need no warning."""
+        """Whether the loop is stable with the truncated modes and |S| at u stays low enough."""
         return self.is_stable and not self.is_high
 
     @property
@@ -204,25 +202,26 @@ BEYOND = 1.25
 class ModeTolerances(Value):
     """The smallest change of each mode, with the others unchanged, at which a loop fails.
 
-    Each array with two columns holds the change downwards (negative) and the change upwards;
-    infinite if the loop does not fail up to `limit`. In the printed table, ">5" means that it does
-    not fail up to 5 %. A frequency is changed through the stiffness of the mode, while its damping
-    force stays the same.
+    Each array with two columns holds the change downwards (negative) and the change upwards. A
+    change is infinite if the loop does not fail up to `limit`. In the printed table, ">5" means
+    that it does not fail up to 5 %. A frequency is changed through the stiffness of the mode, so
+    that its damping force stays the same.
 
     Parameters
     ----------
     modes : (m,) array
-        Numbers of the modes, from 1, with rigid-body modes counted.
+        Numbers of the modes. Counting starts at 1 and includes rigid-body modes.
     freq : (m,) array [Hz]
         Frequencies of the modes in the plant.
     stable : (m, 2) array
         Relative changes of frequency at which the loop becomes unstable.
     within : (m, 2) array
-        Relative changes of frequency at which its modulus margin falls to `margin`.
+        Relative changes of frequency at which the modulus margin of the loop falls to `margin`.
     damping : (m, 2) array
-        Relative changes of damping at which it becomes unstable, from -1 to 2.
+        Relative changes of damping at which the loop becomes unstable. Changes from -1 to 2 are
+        examined.
     margin : float
-        Modulus margin for `within`, with the loop opened at u.
+        Modulus margin that defines `within`, with the loop opened at u.
     limit : (m,) array
         Largest relative change of frequency examined.
     known : (m,) array, optional
@@ -252,12 +251,12 @@ class ModeTolerances(Value):
 
     @property
     def least(self) -> FloatArray:
-        """The smallest relative change of each frequency (m,) that leads to `margin` or beyond."""
+        """Smallest change (m,) of each frequency at which the loop fails or reaches `margin`."""
         return np.asarray(np.abs(np.hstack([self.within, self.stable])).min(axis=1))
 
     @property
     def critical(self) -> tuple[int, ...]:
-        """Modes with a tolerance below twice their uncertainty; empty if this is not known."""
+        """Modes with a tolerance below twice their uncertainty; empty if that is not known."""
         if self.known is None:
             return ()
         return tuple(self.modes[self.least < DEVIATIONS * self.known].tolist())

@@ -31,33 +31,37 @@ _LEVEL = 0.5
 class LoopMargins(Value):
     """Margins of one loop, opened at one channel while the other loops stay closed.
 
+    All loop gains here have the critical point +1.
+
     Parameters
     ----------
     name : str
         Channel where the loop is opened.
     crossovers : tuple of float [Hz]
-        Frequencies at which the loop gain crosses 1; the first is the bandwidth, resonances may add
-        more.
+        Frequencies at which the magnitude of the loop gain crosses 1. The first is the crossover
+        frequency of the loop, and resonances may add more. They differ from `bandwidth`, at which
+        |S| crosses 1.
     gain_margin, gain_reduction : float
-        Factor above 1 and factor below 1 by which the gain can be multiplied until the loop gain
-        reaches the critical point; infinite and 0 if no such factor exists.
+        Smallest factor above 1 and largest factor below 1 that move the loop gain to the critical
+        point when they multiply it. They are infinite and 0 if no such factor exists.
     phase_margin : float [deg]
-        Smallest phase margin at the crossovers, for added lead or lag; 180 without a crossover. For
-        an unstable loop this and the other figures are distances to the critical point, not
-        margins.
+        Smallest phase change, lead or lag, that moves the loop gain to the critical point at a
+        crossover. It is 180 without a crossover. For an unstable loop, this and the other numbers
+        are distances to the critical point, not margins.
     modulus_margin : float
-        Smallest distance of the loop gain to the critical point, 1 / max |S|.
+        Smallest distance of the loop gain to the critical point. It equals 1 / max |S|.
     freq : float [Hz]
         Frequency at which the modulus margin occurs.
     gain_freq, phase_freq : float [Hz]
-        Frequency of that of `gain_margin` and `gain_reduction` which is closer to 1, in dB, and
-        frequency of the phase margin; NaN if they do not exist.
+        Frequencies that belong to the gain margin and to the phase margin. The first one belongs to
+        `gain_margin` or `gain_reduction`, whichever is closer to 0 dB. They are NaN if no such
+        margin exists.
     phases : tuple of float [deg]
-        Change of phase at each crossover that moves the loop gain to the critical point: positive
-        for a lag, negative for a lead.
+        Phase of the loop gain at each crossover. If it is positive, a lag of this size moves the
+        loop gain to the critical point; if it is negative, a lead does.
     gains : tuple of (float [Hz], float)
-        Frequencies at which a change of the gain moves the loop gain to the critical point, each
-        with the factor.
+        Pairs of a frequency and a factor. The loop gain reaches the critical point at this
+        frequency if it is multiplied by the factor.
 
     Examples
     --------
@@ -81,7 +85,10 @@ class LoopMargins(Value):
 
     @property
     def delay_margin(self) -> float:
-        """The least delay [s] that reaches the critical point; infinite without a crossover."""
+        """Smallest additional delay [s] that makes the loop gain reach the critical point.
+
+        It is infinite without a crossover.
+        """
         pairs = zip(self.phases, self.crossovers, strict=True)
         return min((phase % 360.0 / (360.0 * freq) for phase, freq in pairs), default=float("inf"))
 
@@ -103,29 +110,31 @@ class LoopMargins(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopReport(Value, Mapping[str, LoopMargins]):
-    """Result of `report_loops`: `report["u1"]` is one loop.
+    """Result of `report_loops`. `report["u1"]` holds the margins of the loop at u1.
 
     Parameters
     ----------
     loops : tuple of LoopMargins
         Margins of each channel where the loops are broken.
     modulus_margin : float
-        Modulus margin of all loops together, ``1 / max sigma_max(S)`` with S where they are broken;
-        0 when unstable. If the channels have different `units`, a singular value would mix them,
-        and this is the `scaled_margin`.
+        Modulus margin of all loops together, ``1 / max sigma_max(S)``, with S at the channels where
+        the loops are broken. It is 0 when unstable. If the channels have different `units`, a
+        singular value would mix them, and this number is the `scaled_margin`.
     unstable : int, optional
         Number of poles of the closed loop outside the stability region; None if not known.
     reason : str
-        Reason why it is not known.
+        Reason why the number of unstable poles is not known; empty if it is known.
     narrowest, near : float [Hz]
-        Only for a measured plant: a mode that is narrower than the distance of the measured
-        frequencies may be hidden between them. The loop is stable if no hidden mode has a
-        half-power width below `narrowest`; `near` is the frequency of such a mode. Both are 0 if
-        the frequencies are close enough to show all modes, and for a model.
+        Width and frequency of a mode that the measured frequencies could miss; only for a measured
+        plant. Such a mode lies between two measured frequencies. The loop is stable if no hidden
+        mode has a half-power width below `narrowest`. A mode of this width would be near the
+        frequency `near`. Both are 0 for a model, and if the frequencies are close enough to show
+        all modes.
     scaled_margin : float
-        Modulus margin of all loops together with scaled axes, ``1 / max min_D sigma_max(D S D^-1)``
-        (from the upper bound of the structured singular value mu with an uncertainty for each
-        axis). Its relative tolerance is 2 %. It does not depend on units.
+        Modulus margin of all loops together with scaled axes, ``1 / max min_D sigma_max(D S
+        D^-1)``. D is a diagonal scaling that is optimised at each frequency, so that the result
+        does not depend on units. It is the upper bound of the structured singular value mu with one
+        uncertainty for each axis. Its relative tolerance is 2 %.
     units : tuple of str
         Units of the channels, if they differ.
     """
@@ -141,9 +150,9 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
 
     @property
     def is_stable(self) -> bool | None:
-        """Whether the closed loop is stable; None where it cannot be judged.
+        """Whether the closed loop is stable; None if this is not known.
 
-        For a measured plant, this holds if no mode narrower than `narrowest` is hidden.
+        For a measured plant, the answer assumes that no mode narrower than `narrowest` is hidden.
         """
         return None if self.unstable is None else self.unstable == 0
 
@@ -189,27 +198,29 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
 def report_loops(
     loop: Loop, *, at: Literal["u", "y"] = "u", rigid: int = 0, unstable: int = 0
 ) -> LoopReport:
-    """Return crossovers, gain, phase and modulus margin of each loop, and whether all are stable.
+    """Return crossovers and margins of each loop, and whether the closed loop is stable.
 
-    Each loop is broken while the others stay closed: ``L_i = 1 - 1 / S_ii`` with
-    ``S = (I - L)^-1``. Stability of a model follows from its poles; that of a measured plant
-    follows from the number of Nyquist encirclements. This count uses the poles of the controller
-    and those of the plant that `rigid` and `unstable` state. The measured frequencies are called
-    lines. Modes between the lines are included if neighbouring lines show them. Otherwise the
-    result is conditional, "stable unless a mode between the lines near 80 Hz is narrower than 0.02
-    Hz", or stability is not judged.
+    Each loop i is broken while the others stay closed. Its loop gain is ``L_i = 1 - 1 / S_ii``,
+    where S_ii is a diagonal entry of ``S = (I - L)^-1``. The stability of a model follows from its
+    poles. The stability of a measured plant follows from the number of Nyquist encirclements, the
+    poles of the controller, and the poles of the plant that `rigid` and `unstable` state. A mode
+    between two measured frequencies ("lines") may be missed if it is narrow. The result then names
+    a condition: "stable unless a mode between the lines near 80 Hz is narrower than 0.02 Hz". If
+    too few lines were measured, stability is not judged.
 
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`; the plant may be a measured Frf, in decoupled axes by `in_axes`.
+        Loop, as for `loop_gain`. The plant may be a measured Frf, also in decoupled axes (see
+        `in_axes`).
     at : {"u", "y"}
         Where the loops are broken.
     rigid : int
-        Number of rigid-body modes of a measured plant (two poles at zero each), including those on
-        springs when the suspension frequency lies below the lines.
+        Number of rigid-body modes of a measured plant (two poles at zero each). It includes those
+        on springs whose suspension frequency is below the measured frequencies.
     unstable : int
-        Number of poles of a measured plant outside the stability region (negative stiffness).
+        Number of poles of a measured plant outside the stability region, for example due to
+        negative stiffness.
 
     Returns
     -------
@@ -328,14 +339,15 @@ LOW = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LoopFigures(Value):
-    """Figures of one closed loop; S is the response from the reference to the error at the POI.
+    """Figures of one closed loop. S is its response from the reference to the error at the POI.
 
     Parameters
     ----------
     stable : bool
         Whether all eigenvalues are strictly inside the stability region.
     decay : float
-        The spectral radius of a sampled loop, the spectral abscissa [rad/s] of a continuous one.
+        Spectral radius of a sampled loop, or largest real part of the poles [rad/s] of a continuous
+        one.
     bandwidth : float [Hz]
         Frequency at which |S| first crosses 1 from below; NaN without a reference or when unstable.
     peak, peak_freq : float [1], [Hz]
@@ -345,7 +357,7 @@ class LoopFigures(Value):
     low_freq : float [Hz]
         Frequency of `low`, equal for all loops of a comparison.
     margin : float
-        Modulus margin, broken at u: ``1 / max_f sigma_max(S_u)``; 0 when unstable.
+        Modulus margin with the loop opened at u, ``1 / max_f sigma_max(S_u)``; 0 when unstable.
 
     Examples
     --------
@@ -376,16 +388,16 @@ class LoopComparison(Value):
     rows : mapping {name: LoopFigures}
         Figures of each loop.
     channel : str
-        Input and output of S, such as ``die:ref to die:error``; empty when the loops have no
-        reference.
+        Input and output of the sensitivity S, such as ``die:ref to die:error``. Empty when the
+        loops have no reference.
     sampled : bool
         Whether `decay` of the rows is a spectral radius.
     unjudged : sequence of str
         Names of the loops whose plants have no evaluation model.
     intervals : mapping {name: str}
         Text of the intervals of margin and bandwidth over the machines that agree with a
-        measurement, or the reason why they do not exist; only for loops whose plants know such
-        machines.
+        measurement, or the reason why there are no intervals. Only loops whose plants know such
+        machines are included.
     """
 
     rows: Mapping[str, LoopFigures]
@@ -421,8 +433,8 @@ def compare_loops(
     Parameters
     ----------
     loops : mapping {name: ClosedLoop}
-        Loops to compare: designs on one machine, or one design on a model and the machine. Each is
-        judged on the evaluation model of its plant, if it has one.
+        Loops to compare, such as several designs for one machine, or one design on a model and on
+        the machine. Each loop is judged on the evaluation model of its plant, if the plant has one.
     reference : str, optional
         Reference (channel of w) for which S is compared; needed if there are several.
     error : str, optional
@@ -431,8 +443,8 @@ def compare_loops(
     Returns
     -------
     LoopComparison
-        Table of the figures. Its |S| at low frequency is that at a tenth of the largest bandwidth
-        of all loops.
+        Table of the figures. Its column for low frequency shows |S| at a tenth of the largest
+        bandwidth of all loops.
 
     Raises
     ------

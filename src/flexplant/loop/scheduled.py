@@ -25,8 +25,8 @@ class ScheduledLoop(Value):
     """Closed loops of one machine at several positions; made by `schedule_loops`.
 
     Between these positions the matrices of the controller are interpolated linearly. All designs
-    have the same states in the same coordinates (for observers, those of the plant's modes). The
-    commands therefore stay continuous while the machine moves.
+    have the same states in the same coordinates. The commands therefore stay continuous while the
+    machine moves.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class ScheduledLoop(Value):
 
     @cached_property
     def stacked(self) -> tuple[FloatArray, ...]:
-        """Matrices A, B, C and D of the controllers, stacked along a first axis of length k."""
+        """Matrices A, B, C and D of the k controllers. The first axis of each has length k."""
         systems = [loop.controller for loop in self.loops]
         return tuple(np.array([getattr(one, part) for one in systems]) for part in "ABCD")
 
@@ -103,7 +103,7 @@ class ScheduledLoop(Value):
         return tuple((1.0 - share) * part[i] + share * part[i + 1] for part in self.stacked)
 
     def at(self, x: float) -> ClosedLoop:
-        """Return the loop of the machine at rest at a position."""
+        """Return the loop of the machine that stands still at a position."""
         loop = self.loops[0]
         # references with derivatives in its blocks are read there too
         plant = with_known(loop.plant.at(None, **{self.position: x}), loop.blocks)
@@ -138,9 +138,10 @@ def schedule_loops(
     plant : StandardPlant
         Plant with positions (`Ports(positions=[...])`).
     design : callable
-        Function from the plant at a position to the blocks that run there, such as a Kalman filter,
-        a servo and a feedforward. The blocks must have the same channels and states at all
-        positions. Fix choices that a design makes automatically, such as the number of notches.
+        Function that takes the plant at a position and returns the blocks that run there, such as a
+        Kalman filter, a servo and a feedforward. The blocks must have the same channels and states
+        at all positions. Therefore fix choices that a design makes automatically, such as the
+        number of notches.
     position : str, optional
         The scheduling variable; by default the only position.
     places : (k,) array [m or rad]
@@ -165,8 +166,8 @@ def schedule_loops(
     Notes
     -----
     Stability is checked with the machine at rest, at the places and half way between them.
-    Stability while the machine moves is checked for one repeated trajectory by ``rms_along(...,
-    repeats=True)``.
+    ``rms_along(..., repeats=True)`` checks stability while the machine moves, for one repeated
+    trajectory.
 
     Examples
     --------

@@ -37,25 +37,29 @@ Loop: TypeAlias = "ClosedLoop | tuple[Any, Any] | StateSpace | Frf"
 
 
 def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u") -> Frf:
-    """Return the loop gain L = K P (broken at u) or P K (broken at y); the critical point is +1.
+    """Return the loop gain L = K P (broken at u) or P K (broken at y).
+
+    The feedback is ``u = K y``, so that the critical point is +1.
 
     Parameters
     ----------
     loop : ClosedLoop, (plant, controller), or StateSpace or Frf
-        The plant is a StandardPlant, a StateSpace (also of python-control) or a measured Frf with
-        the delay of the loop. The controller is a system from y to u that contains the sign of the
-        feedback. It may also be a ClosedLoop, whose controller is then used with this plant. A
-        single system or Frf is a loop gain with negative feedback, ``S = (I + L)^-1``.
+        In ``(plant, controller)``, the plant is a StandardPlant, a StateSpace (also of
+        python-control) or a measured Frf that includes the delay of the loop. The controller is a
+        system from y to u that contains the sign of the feedback, or a ClosedLoop, whose controller
+        is used. A single system or Frf G is a loop gain for negative feedback; the result is then
+        ``L = -G``, and ``S = (I + G)^-1``.
     freq : (n_freq,) array, optional [Hz]
-        Frequencies; by default a grid refined at resonances, or, for a measured plant, its measured
-        frequencies above 0 Hz (at 0 Hz the responses of free bodies and integrators are infinite).
+        Frequencies. By default, a grid refined at resonances; for a measured plant, its frequencies
+        above 0 Hz. Frequency 0 is left out because free bodies and integrators respond infinitely
+        there.
     at : {"u", "y"}
         Where the loop is broken.
 
     Returns
     -------
     Frf
-        Loop gain from the channels of `at` to the same channels.
+        Loop gain from the channels of u (or y, see `at`) back to the same channels.
 
     Raises
     ------
@@ -80,7 +84,10 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
 def sensitivity(
     loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u"
 ) -> Frf:
-    """Return the sensitivity S = (I - L)^-1 of the loop to a disturbance at u or y.
+    """Return the sensitivity S = (I - L)^-1 to a disturbance at u or y.
+
+    L has the critical point +1, as in `loop_gain`. If a single loop gain G for negative feedback is
+    given, as in the example, then L = -G and S = (I + G)^-1.
 
     Parameters
     ----------
@@ -112,6 +119,8 @@ def complementary_sensitivity(
 ) -> Frf:
     """Return the complementary sensitivity T = I - S = -L (I - L)^-1.
 
+    The loop gain L has the sign of `loop_gain`, with the critical point +1.
+
     Parameters
     ----------
     loop, freq, at : as for `loop_gain`
@@ -138,7 +147,7 @@ def complementary_sensitivity(
 
 
 def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf:
-    """Return K S: from noise on the measurements y to the commands u.
+    """Return the control sensitivity K S, the response from noise on y to the commands u.
 
     Parameters
     ----------
@@ -147,7 +156,7 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
     Returns
     -------
     Frf
-        From y to u: ``(I - K P)^-1 K``.
+        Response from y to u: ``(I - K P)^-1 K``, with plant P and controller K.
 
     Raises
     ------
@@ -286,36 +295,38 @@ def _loop_frf(freq: FloatArray, data: ComplexArray, parts: BrokenLoop, to: str, 
 
 
 def modulus_margin(loop: Loop) -> float:
-    """Return ``1 / max_f sigma_max(S_u)``, the smallest distance to the critical point at u.
+    """Return the modulus margin ``1 / max_f sigma_max(S_u)``, with the loop opened at u.
+
+    It is the smallest distance of the loop gain to the critical point.
 
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`. Stability is judged first: for a model by its poles, and for a measured
-        plant by a Nyquist count as in `report_loops`. The count assumes that the plant has no
-        unstable poles. If a response is proportional to 1/f^2 at the lowest frequencies, the motion
-        counts as a free rigid-body motion. For a measured plant, S is evaluated at its frequencies,
-        and between them at the modes that are visible in the data. If the actuators have several
-        units (N and N m), the result is the margin with scaled axes, `LoopReport.scaled_margin`.
+        Loop, as for `loop_gain`. Stability is judged first: for a model by its poles, and for a
+        measured plant by a Nyquist count as in `report_loops`. The count assumes that the plant has
+        no unstable poles. It assumes free rigid-body modes if the response is proportional to 1/f^2
+        at the lowest frequencies. For a measured plant, S is evaluated at its frequencies, and
+        between them at the modes that the data show. If the actuators have several units (N and N
+        m), the result is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------
     float
-        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5. For an unstable loop the
-        result is 0, with a FlexplantWarning.
+        Modulus margin. A margin above 0.5 means that |S| stays below 6 dB. For sampled loops it is
+        at most 1. For an unstable loop it is 0, and a FlexplantWarning is given.
 
     Raises
     ------
     AssumptionError
-        When the measured frequencies of a plant do not show whether the loop is stable, so that the
-        distance to the critical point is not a margin. In `report_loops` the numbers of rigid-body
-        modes and of unstable poles can be given.
+        When the measured frequencies do not show whether the loop is stable. The distance to the
+        critical point is then not a margin. Use `report_loops`, which takes the numbers of
+        rigid-body modes and of unstable poles.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
 
     References
     ----------
-    [Skogestad2005]_, section 2.4 (its inverse, the peak of S).
+    [Skogestad2005]_, section 2.4, describes the peak of S, which is the inverse of the margin.
 
     Examples
     --------
@@ -344,9 +355,9 @@ def modulus_margin(loop: Loop) -> float:
 def bandwidth(loop: Loop) -> float:
     """Return the frequency [Hz] at which |S| first crosses 0 dB from below.
 
-    |S| is the largest singular value of S with the loop opened at u. With more actuators than
-    controlled motions, some combinations of actuators are never used, and S = 1 for these. Only the
-    combinations in which the loop acts at low frequency are therefore counted.
+    S is the sensitivity with the loop opened at u, and |S| its largest singular value. With more
+    actuators than controlled motions, some combinations of actuators are never used, and S = 1 for
+    these. Therefore only the combinations that the loop uses at low frequency are counted.
 
     Parameters
     ----------
@@ -355,7 +366,7 @@ def bandwidth(loop: Loop) -> float:
     Returns
     -------
     float [Hz]
-        Infinite when |S| stays below 0 dB.
+        Bandwidth. It is infinite when |S| stays below 0 dB at all higher frequencies.
 
     Raises
     ------
