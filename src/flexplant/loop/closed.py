@@ -389,8 +389,8 @@ class ClosedLoop(Value):
         ----------
         margin : float
             Required modulus margin, with the loop opened at u.
-        Relative uncertainty of the frequency of each elastic mode; by default that stored in the
-        plant.
+        known : UncertainPlant, float, (m,) array or {mode: float}, optional
+            Relative uncertainty of the frequency of each elastic mode; by default that of the
             plant.
 
         Raises
@@ -449,7 +449,7 @@ class ClosedLoop(Value):
         ----------
         channel : as for `rms`
         freq : (n_freq,) array [Hz], optional
-            Frequencies up to half the rate. The default frequencies resolve all resonances.
+            Frequencies up to half the rate, else ModelError. The default ones resolve resonances.
         """
         row, noises = self._noises(channel)
         grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)

@@ -28,8 +28,9 @@ class OnMeasurement(Value):
         Frequency at which the sensitivity |S| at u is largest.
     reason : str
         Reason why the stability is not known; empty if it is known.
-    Delay of the plant that was added to the response. This happens if the response was measured
-    from sample to sample, and such a response may already contain the delay.
+    added : float [samples]
+        Delay of the plant that was added to the response. It is added to a response measured from
+        sample to sample, which may already contain it.
 
     Examples
     --------

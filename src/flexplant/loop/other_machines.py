@@ -48,14 +48,16 @@ class SpillOver(Value):
         Modulus margin on that plant, with the loop opened at u; 0 when unstable.
     without : float
         Modulus margin on the plant without the truncated modes; 0 when unstable.
-    Frequency at which |S| at u is largest with the truncated modes; NaN when unstable.
-        Frequency at which |S| at u is largest with these modes; NaN when unstable.
+    peak_freq : float [Hz]
+        Frequency at which |S| at u is largest with the truncated modes; NaN when unstable.
     states : int
         Number of states of the plant with the truncated modes.
-    Numbers of the modes that take the largest part in the instability, or in the peak of |S| at u
-    if `is_high` is true; otherwise empty. Counting starts at 1 and includes rigid-body modes.
-        otherwise.
-    Frequency of the instability or of the peak, one value for each of these modes.
+    modes : sequence of int
+        Numbers of the modes that take the largest part in the instability, or in the peak of |S|
+        at u if `is_high` is true; otherwise empty. Counting starts at 1 and includes rigid-body
+        modes.
+    freq : sequence of float [Hz]
+        Frequency of the instability or of the peak, one value for each of these modes.
 
     Examples
     --------
