@@ -27,10 +27,10 @@ _MANY = 24
 
 @dataclass(frozen=True, eq=False)
 class Exchange(Search):
-    """Greedy choice, then exchanges of one candidate at a time; again from other starts.
+    """Greedy choice, followed by exchanges of one candidate at a time, from several starts.
 
     Each start ends when no exchange of one candidate lowers the score. If the criterion has a lower
-    bound, exchanges that the bound shows to be worse are not scored.
+    bound, an exchange is not scored when its bound is above the present score.
 
     Parameters
     ----------
@@ -179,18 +179,19 @@ _ALL = 20_000
 class Screened(Search):
     """A search that ranks choices by a fast criterion and scores the best with the slow one.
 
-    All choices are ranked if there are at most 20 000. Otherwise exchanges by the fast criterion
-    find one choice, and this choice is ranked with all that differ from it by one candidate. An
-    example for a plant with many modes is the fast criterion ``OverMachines(PoiVariance(),
-    [plant_with_few_modes])``. The slow criterion is then `PoiVariance` on a plant with an
-    evaluation model, which treats truncated modes as noise.
+    All choices are ranked if there are at most 20 000. Otherwise exchanges find one good choice by
+    the fast criterion. Then this choice and all choices that differ from it by one candidate are
+    ranked. As an example, the slow criterion is `PoiVariance` on a plant whose evaluation model
+    treats truncated modes as noise. The fast criterion is then ``OverMachines(PoiVariance(),
+    [plant_with_few_modes])``.
 
     Parameters
     ----------
     by : Criterion or callable
         The fast criterion.
     keep : int
-        Number of choices that are scored by the slow criterion, that of `place_sensors`.
+        Number of choices that are scored by the slow criterion, which is the argument `criterion`
+        of `place_sensors`.
     starts : int
         Number of starts of the exchanges.
 
@@ -245,7 +246,7 @@ _PART = "It is a part of the value, below 1: try 0.05."
 
 @dataclass(frozen=True, eq=False)
 class BranchAndBound(Search):
-    """Branch and bound with convex relaxations: the optimum with a proof, or a gap.
+    """Branch and bound with convex relaxations. It proves the optimum, or states its gap.
 
     The candidates are divided into groups of similar candidates. A branch is the set of all choices
     that take a given number of candidates from each group. A branch is discarded when its lower
@@ -255,13 +256,13 @@ class BranchAndBound(Search):
     Parameters
     ----------
     gap : float
-        Relative gap at which the search ends: no choice is better by more than this fraction of the
-        value. If the value is a variance, the relative gap of the rms is about half of it. 0 finds
-        the optimum.
+        Relative gap at which the search ends. At a gap of 0.01, no choice is better by more than 1
+        % of the value. If the value is a variance, the relative gap of the rms is about half of it.
+        With 0 the search finds the optimum.
     branches : int
         Largest number of branches to open. When it is reached, the search ends with a warning and
-        reports its gap. With 0, the result is that of the exchanges, with the lower bound of the
-        relaxation.
+        reports its gap. With 0 no branch is opened: the result is the best choice of `Exchange`,
+        with the lower bound of the relaxation.
     starts : int
         Number of starts of the exchanges, as in `Exchange`.
 

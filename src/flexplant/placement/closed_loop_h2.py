@@ -85,7 +85,7 @@ def confirmed(cost: float, found: float) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoiLqr(MotionAndEffort):
-    """Smallest mean square of POI motion and effort by state feedback (LQR): for actuators.
+    """Smallest mean square of POI motion and effort with state feedback (LQR), to place actuators.
 
     The cost is ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state feedbacks,
     where z_a is a POI motion, f_a its factor and u the vector of actuator forces. E is the expected
@@ -95,14 +95,15 @@ class PoiLqr(MotionAndEffort):
     Parameters
     ----------
     poi : str, sequence of str or mapping {name: factor}, optional
-        Names of the POIs, with factors if they differ. By default all POIs whose first axis has the
-        same unit as the first axis of the first POI.
+        Names of the POIs, with factors if they differ. By default it is all POIs whose first axis
+        has the same unit as the first axis of the first POI.
     axes : str, sequence of str or mapping {axis: factor}, optional
         Axes of each POI; by default all of them. A rotation without a factor is multiplied by 1 m.
         Together the axes must observe every rigid-body mode.
     effort : float [m/N]
-        Weight of the actuator forces: POI motion that costs as much as a force of 1 N. With a small
-        value the disturbance is rejected as well as the structure and the delay allow.
+        Weight of the actuator forces. It is the POI motion that costs as much as a force of 1 N.
+        With a small weight, the disturbance is suppressed as far as the structure and the delay
+        allow.
 
     Examples
     --------
@@ -131,12 +132,12 @@ class PoiLqr(MotionAndEffort):
         return confirmed(cost, found)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the cost as a function of the actuators alone; all else is computed once.
+        """Return the cost as a function of the chosen actuators.
 
-        With a delay of d whole samples, no controller can influence the motion during these
-        samples. Their cost is the constant ``sum_{i<d} |C1 A^i W|^2``. The control acts on the
-        state that is predicted d samples ahead. Only a fractional delay adds a state for each
-        actuator.
+        All terms that do not depend on the choice are computed once. With a delay of d whole
+        samples, no controller can influence the motion during these samples. Their cost is the
+        constant ``sum_{i<d} |C1 A^i W|^2``. The control acts on the state that is predicted d
+        samples ahead. Only a fractional delay adds a state for each actuator.
         """
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)
@@ -169,23 +170,25 @@ class PoiLqr(MotionAndEffort):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoopH2(MotionAndEffort):
-    """Smallest mean square of POI motion and effort in closed loop with an LQG controller.
+    """Smallest mean square of POI motion and effort in a closed loop with an LQG controller.
 
-    The cost is ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising controllers from
-    y to u, with the factor f_a of each POI motion z_a. It is the square of an H2 norm. With the
-    solution S and the state feedback gain F of the control Riccati equation, the process noise W,
-    the covariance P of the estimation error and the input matrix B::
+    A POI (point of interest) is a point whose motion matters. The cost is the minimum of
+    ``E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising controllers from y to u. Here z_a
+    is a POI motion, f_a its factor and u the vector of actuator forces. The minimum is the square
+    of an H2 norm. In its formula, S and F are the solution and the state feedback gain of the
+    control Riccati equation, W is the covariance of the process noise, P that of the estimation
+    error, and B the input matrix::
 
         J = tr(S W) + tr(F' (effort^2 I + B' S B) F P)
 
-    More sensors or actuators never increase the cost. It is at least `PoiLqr`, which assumes that
-    the state is known, and at least `PoiVariance`, which assumes unlimited control.
+    More sensors or actuators never increase the cost. The cost is never below `PoiLqr`, which
+    assumes that the state is known, nor below `PoiVariance`, which assumes unlimited control.
 
     Parameters
     ----------
     poi, axes : as for `PoiLqr`
     effort : float [m/N]
-        Weight of the actuator forces: POI motion that costs as much as a force of 1 N.
+        Weight of the actuator forces. It is the POI motion that costs as much as a force of 1 N.
 
     Examples
     --------
@@ -221,7 +224,7 @@ class ClosedLoopH2(MotionAndEffort):
         return confirmed(cost, found)
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Raise AssumptionError when a rigid-body mode is missed or a filter does not exist."""
+        """Raise AssumptionError if a rigid-body mode is missed or no Kalman filter exists."""
         super().check(plant, candidates)
         seeing = [port for port in candidates if side_of(port) == "y"]
         if candidates and not seeing:  # the plant's own are those of the loop
@@ -233,7 +236,7 @@ class ClosedLoopH2(MotionAndEffort):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the function from a choice of candidates to its cost.
 
-        The parts that all choices share are computed once. With a delay of d whole samples the
+        Matrices that all choices share are computed once. With a delay of d whole samples the
         control acts on the state predicted d samples ahead, and the motion in these samples is
         added to the cost. With a fractional delay, or ports with filters or delays, the plant is
         assembled again for each choice.

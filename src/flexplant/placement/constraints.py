@@ -158,10 +158,10 @@ class Constraint(Value):
 
     @abstractmethod
     def rows(self, places: Places) -> LinearRows:
-        """Return linear inequalities in x, which is 1 for chosen candidates and 0 for others."""
+        """Return linear inequalities in a vector x. x_i is 1 if candidate i is chosen, else 0."""
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
-        """Return zones without candidates, seen from above, for pictures."""
+        """Return zones of the x-y plane without candidates, for drawing."""
         return ()
 
 
@@ -205,7 +205,7 @@ class JointGroups(Constraint):
         self._set(groups=listed)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return ``x_i - x_j = 0`` within each group, with x_i = 1 for a chosen candidate."""
+        """Return ``x_i - x_j = 0`` for candidates of a group; x_i is 1 if candidate i is chosen."""
         pairs = []
         for group in self.groups:
             at = places.index(group, "candidate of a group")
@@ -215,14 +215,16 @@ class JointGroups(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class CountLimits(Constraint):
-    """Limits on how many of some named candidates are chosen, such as two accelerometers at most.
+    """Limits on the number of chosen candidates among some named ones.
+
+    For example, at most two of the candidates that are accelerometers are chosen.
 
     Parameters
     ----------
     names : sequence of str
         Names of these candidates.
     at_least, at_most : int, optional
-        Least and largest number of them in a choice.
+        Smallest and largest number of these candidates in a choice.
 
     Examples
     --------
@@ -323,7 +325,7 @@ class Excluded(Constraint):
     zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="an excluded zone"))
 
     def rows(self, places: Places) -> LinearRows:
-        """Return ``x_i <= 0`` for each candidate inside, with x_i = 1 for a chosen candidate."""
+        """Return ``x_i <= 0`` for each candidate i in a zone; x_i is 1 if it is chosen."""
         return LinearRows.closed(places.inside(_zone_list(self.zones)) > 0)
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
@@ -333,7 +335,13 @@ class Excluded(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class OffPoi(Constraint):
-    """Excludes candidates on a POI (point of interest), where motion cannot be measured.
+    """Excludes candidates on a POI (point of interest), at which no sensor can be mounted.
+
+    A sensor that the plant already has at a POI stays allowed if the radius is 0. A POI may be
+    relative, such as ``at={"tip:x": 1, "frame:x": -1}``. Such a POI lies at its points of positive
+    weight. It lies at its points of negative weight if the plant's own relative sensors touch only
+    the positive ones. All other points of a relative POI are not excluded, because sensors may
+    measure against the frame.
 
     Sensors are never placed at a POI, except those that the plant already has there. A radius
     excludes the whole die; a negative radius allows all places. A relative POI such as
@@ -344,8 +352,9 @@ class OffPoi(Constraint):
     Parameters
     ----------
     radius : float [m]
-        Largest distance from a POI at which a candidate is excluded. A candidate with several
-        points is excluded if any of them is within this distance.
+        Distance from a POI up to which candidates are excluded, for example half the size of the
+        die. A candidate with several points is excluded if any of them is within this distance.
+        With a negative radius nothing is excluded.
 
     Examples
     --------
@@ -360,7 +369,7 @@ class OffPoi(Constraint):
     radius: float = field(default=0.0, metadata=checked(number))
 
     def rows(self, places: Places) -> LinearRows:
-        """Return ``x_i <= 0`` for each candidate near a POI, with x_i = 1 for a chosen one."""
+        """Return ``x_i <= 0`` for each candidate i near a POI; x_i is 1 if it is chosen."""
         if self.radius < 0 or not places.pois:
             return LinearRows.closed(np.zeros(places.total, dtype=bool))
         near = places.from_pois() <= self.radius + places.same
@@ -379,14 +388,14 @@ class OffPoi(Constraint):
 class ZoneLimits(Constraint):
     """Limits on the number of chosen candidates in zones of the x-y plane.
 
-    Without limits, all chosen candidates must lie in the zones.
+    If no limit is given, all chosen candidates must lie in the zones.
 
     Parameters
     ----------
     zones : Rectangle, Disc or sequence of them
         Zones, at least one. A candidate in any of them counts once.
     at_least, at_most : int, optional
-        Least and largest number of chosen candidates inside. A candidate is inside if any of its
+        Smallest and largest number of chosen candidates inside. A candidate is inside if any of its
         points is inside.
 
     Examples
@@ -407,7 +416,7 @@ class ZoneLimits(Constraint):
         check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the limits on the number inside, or ``x_i <= 0`` for candidates outside."""
+        """Return limits on the number inside, or ``x_i <= 0`` for each candidate i outside."""
         inside = places.inside(_zone_list(self.zones))
         if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)
@@ -425,9 +434,8 @@ class MinimumDistance(Constraint):
     Parameters
     ----------
     distance : float [m]
-        Distance between the nearest points of two candidates. Two candidates may measure
-        against the same reference: distances between points of negative weight do not
-        count.
+        Distance between the nearest points of two candidates. Points of negative weight
+        (references) do not count, because two relative sensors may use the same reference.
 
     Examples
     --------
@@ -441,7 +449,7 @@ class MinimumDistance(Constraint):
     distance: float = field(metadata=checked(positive))
 
     def rows(self, places: Places) -> LinearRows:
-        """Return x_i + x_j <= 1 for each pair that is too close."""
+        """Return ``x_i + x_j <= 1`` for each pair of candidates that are too close."""
         close = places.between() < self.distance - places.same
         first, second = np.nonzero(np.triu(close, 1))
         pairs = np.eye(places.total)[first] + np.eye(places.total)[second]

@@ -34,7 +34,7 @@ class Scorer:
     """
 
     def value(self, chosen: Sequence[int]) -> Any:
-        """Return the score of one choice, smaller is better; FlexplantError if none exists."""
+        """Return the score of one choice (smaller is better); FlexplantError if it has no score."""
         return float(self.score([chosen])[0])
 
     def outcome(self, chosen: Sequence[int]) -> tuple[float, str]:
@@ -54,11 +54,14 @@ class Scorer:
         return number, "" if np.isfinite(number) else "the criterion is infinite."
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return the scores (n,) of several choices, at once where the criterion allows it."""
+        """Return the scores (n,) of several choices. Some criteria compute them all at once."""
         return np.array([self.outcome(chosen)[0] for chosen in sets])
 
     def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return a number below the score of every choice of `count`; -inf when none is known."""
+        """Return a lower bound on the scores of all choices of `count` candidates.
+
+        The bound is minus infinity if none is known.
+        """
         return -np.inf
 
 
@@ -113,9 +116,9 @@ class OnBoth(Scorer):
 
 
 class Criterion(Value):
-    """A function from a plant to a number, smaller is better; the base class of criteria.
+    """The base class of criteria. A criterion is a function from a plant to a number to minimise.
 
-    A new criterion defines `__call__`. It may also define `check`, and a faster `scorer`.
+    A new criterion defines `__call__`. It may also define `check`, and a `scorer` that is faster.
 
     Examples
     --------
@@ -137,7 +140,7 @@ class Criterion(Value):
         """Raise AssumptionError if no choice among the candidates satisfies the assumptions."""
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return an object that scores many choices; common results are computed once.
+        """Return an object that scores many choices and computes common results only once.
 
         The plant is sampled and was assembled from a structure. The candidates are sensors,
         actuators or both.
@@ -145,14 +148,14 @@ class Criterion(Value):
         return OnPlant(plant, sides_of(candidates), tuple(candidates), self)
 
     def unit(self, plant: StandardPlant) -> str:
-        """Return the unit of the square root of a mean square of a motion; else ""."""
+        """Return the unit of the root of the value if it is a mean square of a motion, else ""."""
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the interval of the ratio of the error to that of another plant, over machines.
+        """Return the text of an interval of the error of a plant divided by that of another plant.
 
-        The text is empty if the plant has no sampled machines, or if the value of the criterion is
-        not a mean square.
+        The interval is taken over the sampled machines of the plant. The text is empty if there are
+        none, or if the value of the criterion is not a mean square.
         """
         return ""
 

@@ -232,14 +232,15 @@ class ModalGramian(Criterion):
 class ModalObservability(ModalGramian):
     """Negative measure of the observability Gramian of the elastic modes, for sensors.
 
-    It is negative because criteria are minimised. The signal of each sensor is divided by its noise
-    density, if it has noise. `ModalGramian` defines the Gramian.
+    The sign is negative because criteria are minimised. The signal of each sensor is divided by its
+    noise density, if it has noise. The Gramian is that of the plant in continuous time, without
+    filters and delays, see `ModalGramian`.
 
     Parameters
     ----------
     measure : {"trace", "log det", "least"}
-        Measure of the Gramian: the sum of its eigenvalues, the sum of their logarithms, or the
-        least eigenvalue.
+        Measure of the Gramian: "trace" is the sum of its eigenvalues, "log det" (the default) the
+        sum of their logarithms, and "least" the smallest eigenvalue.
 
     References
     ----------
@@ -259,8 +260,8 @@ class ModalObservability(ModalGramian):
 class ModalControllability(ModalGramian):
     """Negative measure of the controllability Gramian of the elastic modes, for actuators.
 
-    It is negative because criteria are minimised. The input of each actuator is a force in N or a
-    torque in N m. `ModalGramian` defines the Gramian.
+    The sign is negative because criteria are minimised. The unit of each input is 1 N or 1 N m. The
+    Gramian is that of the plant in continuous time, without filters and delays, see `ModalGramian`.
 
     Parameters
     ----------

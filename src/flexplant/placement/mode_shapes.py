@@ -85,19 +85,21 @@ class ModeRows(LogDetOfSum):
 
 @dataclass(frozen=True, eq=False)
 class ModeInformation(ByShapes):
-    """Minus log det of the Fisher information of mode amplitudes, ``sum_i phi_i phi_i' / asd_i^2``.
+    """Minus log det F, with the Fisher information F of mode amplitudes.
+
+    The Fisher information is ``F = sum_i phi_i phi_i' / asd_i^2``.
 
     phi_i is the row of mode shapes at sensor i, and asd_i is the noise density of this sensor. The
     criterion finds choices that distinguish the mode shapes best. It assumes that the amplitudes of
     the modes are estimated from one sample of all sensors, and ignores dynamics and disturbances.
-    `RowSelection` is a search for this criterion, by effective independence or pivoted QR. A lower
-    bound of the criterion is known. With fewer sensors than modes, the amplitudes of all modes
-    cannot be estimated.
+    The number of sensors must be at least the number of modes. `RowSelection` is a search for this
+    criterion, by effective independence or pivoted QR. Searches have a lower bound of the
+    criterion.
 
-    The criterion hardly tells how accurately the motion of a POI (point of interest) is estimated.
-    In trials on plates, layouts were ranked by classical criteria (this one, Gramians, indices,
-    energy, MAC) and by the exact variance at the POI. The Spearman rank correlation of the two
-    rankings was between -0.45 and 0.56. Where the POI matters, use `PoiVariance`.
+    The criterion is a poor measure of the accuracy at a POI (point of interest). In trials on
+    plates, layouts were ranked by this criterion, by Gramians and by other classical criteria, and
+    also by the exact variance at the POI. The Spearman rank correlation of the two rankings was
+    between -0.45 and 0.56. If the motion at the POI matters, use `PoiVariance`.
 
     Parameters
     ----------
@@ -135,15 +137,16 @@ class RowSelection(Search):
     Parameters
     ----------
     method : SelectionCriterion
-        Method of the selection. `EffectiveIndependence` (the default) repeatedly removes the
-        candidate i with the least ``E_i = phi_i' F^-1 phi_i``, where ``F = sum phi_i phi_i'`` is
-        the information on the modes and phi_i the row of the candidate. Removing a candidate
-        multiplies the determinant of F by ``1 - E_i``. `PivotedQr` and `Greedy` add one candidate
-        after the other. When the number of chosen candidates reaches the number of modes, they
-        start again with the remaining candidates.
+        Method of the selection. `EffectiveIndependence` (the default) starts with all candidates
+        and repeatedly removes the candidate i with the smallest ``E_i = phi_i' F^-1 phi_i``. Here
+        phi_i is the row of candidate i, and ``F = sum phi_i phi_i'`` is the information on the
+        modes. Removing a candidate multiplies the determinant of F by ``1 - E_i``. `PivotedQr` and
+        `Greedy` add one candidate after the other. After as many candidates as there are modes,
+        these two methods begin a new round: they ignore the chosen candidates and select again
+        among the others.
     driving_point : bool
-        Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
-        that places that move little are left out first (EfI-DPR).
+        Whether E_i is multiplied by the driving-point residue ``sum_j phi_ij^2 / omega_j^2`` over
+        the modes j (EfI-DPR). Places that move little are then removed first.
 
     References
     ----------

@@ -165,34 +165,35 @@ Lag: TypeAlias = Predictor | Filter | FixedLag
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoiVariance(Criterion):
-    """Variance of the error of the stationary Kalman estimate at POIs, for sensors.
+    """Variance of the error of the stationary Kalman estimate at POIs, to place sensors.
 
-    A POI is a point of interest, whose motion is estimated. The value is the sum
-    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, or the largest of these terms. f_a is the factor
-    of an axis, C1_a its row of the output matrix, and P the error covariance after the measurement,
-    at the sample instants. The square root of the value is `design_kalman(plant).rms(...)`.
+    A POI is a point of interest, whose motion is estimated. The value is the sum of the terms
+    ``f_a^2 C1_a P C1_a'`` over the axes a, or the largest of these terms. f_a is the factor of an
+    axis, and C1_a is the row of the output matrix for it. P is the covariance of the error at the
+    sample instants, after the measurement was used. For one axis with factor 1, the square root of
+    the value is `design_kalman(plant).rms(...)`.
 
-    If only the plant's own modes count, additional sensors never increase the value, each score
-    takes one Riccati equation, and searches have a lower bound. If the plant has an evaluation
-    model with truncated modes, the value is the error on the plant with these modes. Then a filter
-    is computed for each choice, and no lower bound is known.
+    The value is computed for the plant's own modes, or for the evaluation model with truncated
+    modes if the plant has one. With the plant's own modes, additional sensors never increase the
+    value, each score takes one Riccati equation, and searches have a lower bound. With truncated
+    modes, a filter is computed for each choice, and no lower bound is known.
 
     Parameters
     ----------
     poi : str, sequence of str or mapping {name: factor}, optional
-        Names of the POIs, with factors if they differ. By default all POIs whose first axis has the
-        same unit as the first axis of the first POI.
+        Names of the POIs, with factors if they differ. By default it is all POIs whose first axis
+        has the same unit as the first axis of the first POI.
     axes : str, sequence of str or mapping {axis: factor}, optional
         Axes of each POI, with factors if they differ; by default its first axis. A factor in m
         turns a rotation into a displacement, for example half the width of the die.
     measure : {"sum", "max"}
-        Whether the sum or the largest of the terms counts.
+        Whether the value is the sum or the largest of the terms.
     lag : Predictor, Filter or FixedLag, optional
         Time at which the estimate is made: before the measurement (Predictor), with the measurement
         (Filter, the default), or some samples later (FixedLag). For Predictor and FixedLag only the
         plant's own modes count.
     own_modes : bool
-        Whether only the plant's own modes count, even if the plant has an evaluation model with
+        Whether to use only the plant's own modes, even if the plant has an evaluation model with
         more modes.
 
     References
@@ -225,11 +226,11 @@ class PoiVariance(Criterion):
         return float(np.sum(terms) if self.measure == "sum" else np.max(terms))
 
     def unit(self, plant: StandardPlant) -> str:
-        """Return the unit of the square root."""
+        """Return the unit of the square root of the value."""
         return unit_of(plant, self._factors(plant))
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Raise AssumptionError when w misses a rigid-body mode or a candidate fits no filter."""
+        """Raise AssumptionError if the plant or a candidate allows no stationary filter."""
         self._factors(plant)
         _ = plant.noise_factor
         plant.check().require(("excited",), "a stationary Kalman filter")
@@ -243,7 +244,10 @@ class PoiVariance(Criterion):
             _check_direct(plant, candidates)
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the interval of the rms error over that of other sensors, machine by machine."""
+        """Return the text of an interval of the rms error divided by that of another plant.
+
+        The ratio is computed for each sampled machine.
+        """
         machines = plant.machine.machines
         if machines is None or self._own:
             return ""
@@ -260,13 +264,14 @@ class PoiVariance(Criterion):
         ).sentence
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the variance as a function of the sensors alone; all else is computed once.
+        """Return the variance as a function of the chosen sensors.
 
-        Delay lines of u are left out, because their states are known exactly. If ports have filters
-        or delays, each choice has different states. With truncated modes, the noise of the sensors
-        of a choice is correlated. A separate filter is computed for each choice in these cases.
-        The variance of a prediction is ``rows A X+ A' rows' + rows Q rows'``. For a fixed lag, the
-        motions of the POI some samples ago are additional states.
+        All terms that do not depend on the choice are computed once. Delay lines of u are left out,
+        because their states are known exactly. A separate filter is computed for each choice in two
+        cases: if ports have filters or delays, and with truncated modes, because these make the
+        noise of the chosen sensors correlated. The variance of a prediction is ``C1 (A P A' + Q)
+        C1'``, with the covariance P after the measurement and that of the process noise, Q. For a
+        fixed lag, the motions of the POI some samples ago are additional states.
         """
         chosen = OnPlant(plant, "y", tuple(candidates), self)
         judge = None if self._own else chosen.whole.evaluation_plant

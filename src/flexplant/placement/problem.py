@@ -166,7 +166,7 @@ class RigidPart:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placement(Value):
-    """The best choice that was found, and how good any choice could be.
+    """The best choice that was found, and a lower bound on all choices.
 
     Parameters
     ----------
@@ -175,13 +175,13 @@ class Placement(Value):
     value : float
         Value of the criterion.
     bound : float
-        Lower bound on the value of every choice of the same number of candidates. It is the value
-        itself if the optimum is proven, by trying every subset or by branch and bound. Otherwise it
+        Lower bound on the value of every choice of the same number of candidates. If the optimum is
+        proven, by trying every subset or by branch and bound, it is the value itself. Otherwise it
         follows from a convex relaxation, in which each candidate has a weight between 0 and 1. The
         relaxation exists for log det, and, if no port has a filter or delay, for mean squares. Mean
         squares are `PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, and criteria
-        that wrap them. For other sums the bound is the value with all candidates together. For a
-        callable it is minus infinity.
+        that wrap them. For other sums the bound is the value with all candidates together. If the
+        criterion is a plain function, the bound is minus infinity.
     evaluations : int
         Number of choices that were scored.
     history : tuple of tuples of float
@@ -191,21 +191,21 @@ class Placement(Value):
     ports : tuple of Sensor or Actuator
         Chosen sensors or actuators.
     side : {"y", "u", "yu"}
-        Whether they are sensors, actuators, or both.
+        Whether the ports are sensors, actuators, or both.
     stopped : str
         Reason why the search ended early; empty if it was completed.
     unit : str
         Unit of the square root of the value, if the value is a mean square of a motion.
     unjudged : str
-        Remark that the value does not include truncated modes; empty where the plant has an
+        Remark that the value does not include truncated modes. It is empty if the plant has an
         evaluation model.
     left_out : tuple of str
-        Sensors or actuators of the plant that were not among the candidates: none of them is part
-        of the choice, and the value is that without them.
+        Sensors or actuators of the plant that were not among the candidates. They are not part of
+        the choice, and the value is computed without them.
     interval : str
-        Interval that contains, for 95 % of the uncertain plant's sampled machines, the error
-        divided by the error with the plant's own sensors; or the reason why it does not exist.
-        Empty if the plant has no sampled machines.
+        Text of an interval for the error divided by the error with the plant's own sensors. It
+        contains this ratio for 95 % of the uncertain plant's sampled machines. If the interval does
+        not exist, the text is the reason. It is empty if the plant has no sampled machines.
 
     Examples
     --------
@@ -268,7 +268,7 @@ class Placement(Value):
 
     @property
     def gap(self) -> float:
-        """Largest fraction of the value by which a choice could be better; infinite if unknown.
+        """Fraction of the value by which a better choice could be lower; infinite if unknown.
 
         If the value is a mean square, the rms could be better by about half this fraction.
         """
@@ -278,7 +278,7 @@ class Placement(Value):
 
     @property
     def proven(self) -> bool:
-        """Whether no choice is better, apart from rounding."""
+        """Whether it is proven that no choice is better, apart from rounding."""
         return self.gap <= 1e-8  # ten times what rounding adds to a bound
 
     def on(self, plant: StandardPlant) -> StandardPlant:
@@ -341,16 +341,19 @@ class Problem:
 
     @property
     def root(self) -> Branch:
-        """All choices, where only constraints that exclude single candidates are used."""
+        """The branch that contains all choices. It uses only constraints on single candidates."""
         return Branch.containing(self.required, self.free, self.count)
 
     def bound(self) -> float:
-        """Return a number below the score of every choice; minus infinity when none is known."""
+        """Return a lower bound on the score of every choice; minus infinity if none is known."""
         relaxed = self.relaxed()
         return relaxed[0] if relaxed else self.layouts.scorer.bound(self.count, self.required)
 
     def relaxed(self) -> tuple[float, FloatArray] | None:
-        """Return a lower bound and weights (N,) near the minimum of a convex relaxation."""
+        """Return a lower bound from a convex relaxation, and weights (N,) near its minimum.
+
+        The result is None if there is no relaxation.
+        """
         scorer, root = self.layouts.scorer, self.root
         if not isinstance(scorer, Convex) or self.layouts.missing(root.members.tolist()):
             return None
@@ -413,10 +416,12 @@ class Problem:
         return (mix for mix in mixes if sum(s * n for s, n in mix.items()) == more)
 
     def spanning(self, weights: FloatArray | None = None) -> list[int]:
-        """Return the required and those that add most to the rigid-body modes seen, one by one.
+        """Return a choice that observes as many rigid-body modes as possible.
 
-        The method is orthogonalisation with pivoting, which reaches the highest rank of any choice
-        of this size. Candidates with larger weights (N,) are preferred.
+        It contains the required candidates. Others are added one by one, each time the one that
+        adds most to the observed (or moved) rigid-body modes. The method is orthogonalisation with
+        pivoting, which reaches the highest rank of any choice of this size. Candidates with larger
+        weights (N,) are preferred.
         """
         chosen, shut = list(self.required), self.rows.shut(self.required)
         left = self.layouts.rigid.rows
@@ -441,7 +446,8 @@ class SearchResult:
     ----------
     chosen : tuple of int
         Positions of the chosen candidates in the list of candidates, from 0.
-    value, bound, evaluations, history, stopped
+    Value, lower bound, number of evaluations, history and reason of an early end, as in
+    `Placement`.
         The same as in `Placement`.
 
     Examples

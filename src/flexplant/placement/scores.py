@@ -33,7 +33,7 @@ class Scores(Value):
     layouts : sequence of tuples of str
         Names of the chosen sensors or actuators.
     values : (n,) array
-        Scores, ascending; infinite for a layout that is infeasible.
+        Scores in ascending order; infinite for an infeasible layout.
     reasons : sequence of str
         Reason why each layout is infeasible; empty for a feasible one.
     order : (n,) array of int
@@ -47,12 +47,12 @@ class Scores(Value):
     unit : str
         Unit of the square root of a value, if the values are mean squares of a motion.
     unjudged : str
-        Remark that the scores do not include truncated modes; empty where the plant has an
+        Remark that the scores do not include truncated modes. It is empty if the plant has an
         evaluation model.
     interval : str
-        Interval that contains, for 95 % of the uncertain plant's sampled machines, the error of the
-        best layout divided by that of the next one; or the reason why it does not exist. Empty
-        where the plant has no sampled machines.
+        Text of an interval for the error of the best layout divided by that of the next one. It
+        contains this ratio for 95 % of the uncertain plant's sampled machines. If the interval does
+        not exist, the text is the reason. It is empty if the plant has no sampled machines.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -109,11 +109,11 @@ def score_sensors(
 ) -> Scores:
     """Return the scores of layouts of sensors, each instead of the plant's own sensors.
 
-    A layout that does not observe every rigid-body mode is infeasible and is not scored, because
-    its score could be the best one by mistake. For `PoiVariance`, layouts differ only in rows of
-    the output matrix C and of the noise covariance R. One score therefore takes about as long as
-    the solution of one Riccati equation by the doubling algorithm. The score of the best layout is
-    confirmed by `design_kalman`.
+    A layout that does not observe every rigid-body mode is infeasible and is not scored. Its
+    computed score would have no meaning, and could be the smallest. For `PoiVariance`, layouts
+    differ only in rows of the output matrix C and of the noise covariance R. One score therefore
+    takes about as long as the solution of one Riccati equation by the doubling algorithm.
+    `design_kalman` confirms the score of the best layout.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def score_sensors(
         When the plant is not sampled or has no structure, a layout is empty or an entry is not a
         sensor.
     AssumptionError
-        When the criterion has no meaning on this plant, whatever the sensors.
+        When the criterion cannot be computed on this plant with any sensors.
     CertificateError
         When a second calculation does not confirm the score of the best layout.
 
@@ -264,7 +264,7 @@ def _score_layouts(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceWorth(Value):
-    """The value of a choice when one device is left out, for each device; prints as a table.
+    """The value of the criterion when one device is left out, for each device; prints as a table.
 
     Parameters
     ----------
@@ -314,14 +314,14 @@ def device_worth(
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> DeviceWorth:
-    """Return what each chosen device is worth: the value when it alone is left out.
+    """Return the value of a criterion without each chosen device, to show what each one is worth.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant of the placement, or another plant of the same machine.
     placement : Placement
-        From `place_sensors`, `place_actuators` or `place_both`.
+        Result of `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
         Criterion; by default the criterion of the placement.
     executor, progress : as for `place_sensors`
@@ -329,7 +329,7 @@ def device_worth(
     Raises
     ------
     AssumptionError
-        When the devices miss a rigid-body mode even together.
+        When all devices together do not observe (or move) every rigid-body mode.
 
     Examples
     --------
@@ -417,16 +417,17 @@ def sensor_map(
     Parameters
     ----------
     plant, criterion, executor, progress
-        As for `score_sensors`. The plant keeps its own sensors.
+        Plant, criterion and options, as for `score_sensors`. The plant keeps its own sensors.
     points : (n, 3) array [m]
         Points on the structure.
     asd : float [m/sqrt(Hz), ...]
         Noise of the new sensor, as in `Sensor`.
     direction, quantity : str
-        Direction and quantity that it measures, as in `Sensor`.
+        Direction and quantity that the new sensor measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`. Points at which a further sensor violates a constraint are left out.
-        Points on a POI are left out as well, unless OffPoi(-1) is one of the constraints.
+        Constraints, as for `place_sensors`. A point is left out if a sensor there violates a
+        constraint. Points on a POI are left out as well, unless OffPoi(-1) is one of the
+        constraints.
 
     Returns
     -------

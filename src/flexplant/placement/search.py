@@ -70,9 +70,9 @@ def place_sensors(
         Sampled plant that was assembled from a structure. Its own sensors are used only if they are
         candidates; `Placement.left_out` names the others.
     candidates : sequence of Sensor
-        Candidates, each chosen at most once; a name means a sensor of the plant.
+        Candidates, each chosen at most once. A name stands for a sensor of the plant.
     count : int
-        Number of sensors to choose, `required` included.
+        Number of sensors to choose, including the `required` ones.
     criterion : PoiVariance or callable, optional
         Function of a plant that returns a float, smaller is better; by default `PoiVariance()`.
     required : sequence of str
@@ -91,8 +91,8 @@ def place_sensors(
         File to which each finished part of the work is saved. If the file exists, the search
         continues where it was stopped, also after the process was killed.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal or in a
+        notebook, for work of more than two seconds.
     rng : int, SeedSequence or Generator, optional
         Random generator of the random starts, or its seed.
 
@@ -104,8 +104,8 @@ def place_sensors(
     Raises
     ------
     AssumptionError
-        When all candidates together do not observe a rigid-body mode, which the message names, or
-        the criterion does not apply to this plant.
+        When all candidates together do not observe a rigid-body mode (the message names it), or the
+        criterion does not apply to this plant.
     InfeasibleError
         When no choice of this size has a finite score.
     CertificateError
@@ -138,7 +138,7 @@ def place_actuators(
     progress: bool | None = None,
     rng: Rng = None,
 ) -> Placement:
-    """Return the best choice of `count` actuators among candidates: the dual of `place_sensors`.
+    """Return the best choice of `count` actuators among candidates, as `place_sensors` for sensors.
 
     Parameters
     ----------
@@ -185,10 +185,11 @@ def place_both(
     progress: bool | None = None,
     rng: Rng = None,
 ) -> Placement:
-    """Return the best choice of sensors and actuators together, for one cost of the closed loop.
+    """Return the best choice of sensors and actuators together, by a cost of the closed loop.
 
-    Sensors and actuators are exchanged, one at a time, until no exchange lowers the cost. This may
-    give a better pair than choosing actuators first and sensors for these afterwards.
+    Sensors and actuators are exchanged, one at a time, until no exchange lowers the cost. The
+    result may be better than that of two separate searches, first for actuators and then for
+    sensors.
 
     Parameters
     ----------
@@ -207,8 +208,7 @@ def place_both(
     Returns
     -------
     Placement
-        The chosen `sensors` and `actuators`, with a lower bound on the cost of every pair of
-        choices.
+        The chosen `sensors` and `actuators`, and a lower bound on the cost of all pairs of choices.
 
     Raises
     ------
@@ -447,8 +447,8 @@ def pareto_curve(
         Numbers of devices, or budgets if `costs` is given. Amounts for which no choice is possible
         are left out.
     costs : mapping {str: float}, optional
-        Cost of candidates by name; the cost of the others is 1. For each budget, every number of
-        devices that the budget allows is tried.
+        Cost of candidates by name; the cost of the others is 1. If it is given, `amounts` are
+        budgets. For each budget, every number of devices that the budget allows is tried.
 
     Returns
     -------
@@ -460,7 +460,7 @@ def pareto_curve(
     ModelError, LabelError, AssumptionError, CertificateError
         As `place_sensors`.
     InfeasibleError
-        When no choice exists for any amount.
+        When no choice is possible for any amount.
 
     Examples
     --------

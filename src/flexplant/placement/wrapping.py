@@ -54,25 +54,27 @@ class Share(Scorer):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOutModes(Criterion):
-    """Response of chosen devices to truncated modes, relative to that to the modes of the plant.
+    """Response of chosen devices to truncated modes, divided by their response to the plant's
+    modes.
 
-    It is the sum ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the chosen sensors or
-    actuators i and the elastic truncated modes k, divided by the same sum over the elastic modes of
-    the plant. phi_ik is the mode shape at the device, zeta_k the damping ratio and omega_k the
-    frequency. Each term is the squared H2 norm of a mode. A controller with a high gain at the
-    frequencies of truncated modes excites them (spill-over).
+    Each response is the sum ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the chosen sensors
+    or actuators i and the elastic modes k. In the numerator k counts the truncated modes, and in
+    the denominator the modes of the plant. phi_ik is the mode shape at the device, zeta_k the
+    damping ratio and omega_k the frequency. Each term is the squared H2 norm of a mode. The
+    criterion is useful because a controller with a high gain at the frequencies of truncated modes
+    excites them (spill-over).
 
     Parameters
     ----------
     of : {"sensors", "actuators"}
-        Kind of the devices that count: the sensors or the actuators.
+        Kind of the devices that count.
 
     Raises
     ------
     ModelError
         When `of` is neither of these.
     AssumptionError
-        When called on a plant without an evaluation model of more modes.
+        When the plant has no evaluation model with more modes.
 
     Examples
     --------
@@ -90,7 +92,7 @@ class LeftOutModes(Criterion):
         return float(self.scorer(plant, own).value(range(len(own))))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the ratio of choices among candidates of the kind `of`; others do not count."""
+        """Return the ratio as a function of the choice; only candidates of the kind `of` count."""
         own = [side_of(port) == SIDES[self.of] for port in candidates]
         counts = np.array(own, dtype=np.float64)
         whole = plant.evaluation_plant
@@ -270,10 +272,9 @@ class OverMachines(Several):
         Criterion, or function of a plant that returns a float; smaller is better.
     machines : sequence of StandardPlant
         Sampled plants, such as `plant.uncertain(fit).machines.plants`, or one plant for each
-        machine of a fleet. Each one gets the devices (sensors and actuators) of the plant that is
-        scored.
+        machine of a fleet. Each of them gets the sensors and actuators of the plant that is scored.
     measure : {"worst", "mean"}
-        Whether the largest value over the machines counts, or their mean.
+        Whether the value is the largest over the machines, or their mean.
 
     Examples
     --------
@@ -298,29 +299,32 @@ class OverMachines(Several):
 class OverPositions(Several):
     """The worst or the mean of a criterion over the positions of a machine whose ports move.
 
-    Ports are the sensors and actuators of a plant. Like other ports, candidates may move with the
-    position of the machine (argument ``moves``). For example, a sensor head on the frame measures
-    another point of the stage at each position. The modes of the plant are computed only once; a
-    score takes one Riccati equation for each position. The lower bound is the worst (or the mean)
-    of the bounds at the positions. A choice that misses a rigid-body mode at any position has no
-    score. Constraints on places are checked only at the position of the given plant.
+    Ports are the sensors and actuators of a plant. Candidates may move with the position of the
+    machine, as other ports do (argument ``moves``). For example, a sensor head on the frame
+    measures another point of the stage at each position. The modes of the plant are computed only
+    once. A score takes one Riccati equation for each position. The lower bound is the worst (or the
+    mean) of the bounds at the positions. A choice that does not observe every rigid-body mode at
+    each position has no score. Constraints on places are checked only at the position of the given
+    plant.
 
     Parameters
     ----------
     criterion, measure
-        As for `OverMachines`, over the positions.
+        Criterion and measure, as for `OverMachines`, with positions in place of the machines.
     points : int or mapping {name: int or array}
         Number of values of each position over its range, or the values [m or rad]. The criterion is
-        not computed between these values: repeat the calculation with more values and compare.
+        computed only at these values. To see whether they suffice, repeat the calculation with more
+        values and compare.
 
     Raises
     ------
     AssumptionError
-        In a search, when all candidates together miss a rigid-body mode at a position.
+        In a search, when all candidates together do not observe every rigid-body mode at a
+        position.
     LabelError
-        When it is called on a plant without positions, or a name is not one of them.
+        When the plant has no positions, or a name is not one of them.
     ModelError
-        When the measure is neither of these; when it is called and a value is out of its range.
+        When the measure is neither of the two, or a value is out of its range.
 
     Examples
     --------
@@ -332,7 +336,8 @@ class OverPositions(Several):
     points: Any = 5
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Check the criterion at every position, and that the candidates suffice there."""
+        """Check the criterion at every position, and that the candidates observe all modes
+        there."""
         for there, ports in self.plants(plant, candidates):
             missed = RigidPart.of(there, sides_of(ports), ports).missing(range(len(ports)))
             if missed:
@@ -346,7 +351,8 @@ class OverPositions(Several):
     def plants(
         self, plant: StandardPlant, candidates: Sequence[Port]
     ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
-        """Yield the plant with all candidates at each position, and where these are there."""
+        """Yield the plant with all candidates at each position, and the candidates as placed
+        there."""
         keys = [(side_of(port), port.name) for port in candidates]
         whole = with_side(plant, sides_of(candidates), candidates) if keys else plant
         positions = whole.assembled.ports.positions
@@ -389,9 +395,9 @@ class LossScores(Scorer):
 class DeviceLoss(Wrapping):
     """The worst or the mean of a criterion after the loss of any one device.
 
-    The devices are the sensors or the actuators. The value is infinite if the remaining devices
-    miss a rigid-body mode after a loss. Choose at least one device more than are needed to observe
-    (or to move) all rigid-body modes.
+    The devices are the sensors or the actuators. The value is infinite if, after the loss of one
+    device, the others do not observe (or move) every rigid-body mode. Therefore choose at least one
+    device more than the rigid-body modes need.
 
     Parameters
     ----------

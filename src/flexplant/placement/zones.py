@@ -22,7 +22,7 @@ class Rectangle(Value):
     Parameters
     ----------
     lower, upper : (2,) array [m]
-        Corners of smallest and largest x and y.
+        Corner with the smallest x and y, and corner with the largest x and y.
 
     Examples
     --------
