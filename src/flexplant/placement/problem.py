@@ -446,9 +446,9 @@ class SearchResult:
     ----------
     chosen : tuple of int
         Positions of the chosen candidates in the list of candidates, from 0.
-    Value, lower bound, number of evaluations, history and reason of an early end, as in
-    `Placement`.
-        The same as in `Placement`.
+    value, bound, evaluations, history, stopped
+        Value, lower bound, number of evaluations, history and reason of an early end, as in
+        `Placement`.
 
     Examples
     --------

@@ -54,15 +54,14 @@ class Share(Scorer):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOutModes(Criterion):
-    """Response of chosen devices to truncated modes, divided by their response to the plant's
-    modes.
+    """Response of devices to truncated modes, divided by their response to the plant's modes.
 
-    Each response is the sum ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the chosen sensors
-    or actuators i and the elastic modes k. In the numerator k counts the truncated modes, and in
-    the denominator the modes of the plant. phi_ik is the mode shape at the device, zeta_k the
-    damping ratio and omega_k the frequency. Each term is the squared H2 norm of a mode. The
-    criterion is useful because a controller with a high gain at the frequencies of truncated modes
-    excites them (spill-over).
+    The devices are the chosen sensors or actuators. Each response is the sum of
+    ``phi_ik^2 / (4 zeta_k omega_k^3)`` over the devices i and elastic modes k. In the numerator k
+    counts the truncated modes, and in the denominator the modes of the plant. phi_ik is the mode
+    shape at the device, zeta_k the damping ratio and omega_k the frequency. Each term is the
+    squared H2 norm of a mode. The ratio matters because a controller with a high gain at the
+    frequencies of truncated modes excites them (spill-over).
 
     Parameters
     ----------
@@ -336,8 +335,7 @@ class OverPositions(Several):
     points: Any = 5
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Check the criterion at every position, and that the candidates observe all modes
-        there."""
+        """Check, at each position, the criterion and whether the candidates suffice."""
         for there, ports in self.plants(plant, candidates):
             missed = RigidPart.of(there, sides_of(ports), ports).missing(range(len(ports)))
             if missed:
@@ -351,8 +349,7 @@ class OverPositions(Several):
     def plants(
         self, plant: StandardPlant, candidates: Sequence[Port]
     ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
-        """Yield the plant with all candidates at each position, and the candidates as placed
-        there."""
+        """Yield the plant with all candidates at each position, and the candidates there."""
         keys = [(side_of(port), port.name) for port in candidates]
         whole = with_side(plant, sides_of(candidates), candidates) if keys else plant
         positions = whole.assembled.ports.positions
