@@ -47,7 +47,7 @@ GAINS = ("exact", "scheduled", "frozen")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathRms(Value):
-    """Standard deviations of a closed loop's channels along a trajectory; made by `rms_along`.
+    """Standard deviations of a loop's channels along a trajectory: the result of `rms_along`.
 
     Parameters
     ----------
@@ -88,23 +88,24 @@ def rms_along(
 ) -> PathRms:
     """Return the standard deviation of every channel of a loop whose machine moves.
 
-    The covariance P of the states of plant and controller is computed sample by sample,
-    ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'``. A is the system matrix of the closed loop at the
-    position of the sample, and G the gain from white noises of unit variance to the states. The
-    result is exact. The controller with its observer is constant for a ClosedLoop, and scheduled
-    for a ScheduledLoop.
+    The covariance P of the states of plant and controller is computed sample by sample as ``P[k +
+    1] = A[k] P[k] A[k]' + G[k] G[k]'``, without random numbers. A is the system matrix of the
+    closed loop at the position of the sample, and G the gain from white noises of unit variance to
+    the states. In a ClosedLoop the controller with its observer is constant. In a ScheduledLoop it
+    changes with the position.
 
     Parameters
     ----------
     loop : ClosedLoop or ScheduledLoop
         Loop around a sampled plant with positions.
     moving : mapping {position: path}
-        Paths as for `simulate`: SetPoints, functions of time, or a value for each sample.
+        Paths, as for `simulate`: each is a SetPoint, a function of time, or a value for each
+        sample.
     duration : float [s]
         Duration of the trajectory.
     repeats : bool
-        Whether the trajectory repeats without end: the variance is then the periodic one,
-        ``P[0] = P[duration]``. Otherwise the machine was at rest at the beginning for a long time.
+        Whether the trajectory repeats without end. The covariance is then periodic, ``P[0] =
+        P[duration]``. Otherwise the machine was at rest for a long time before the beginning.
 
     Returns
     -------
@@ -114,7 +115,7 @@ def rms_along(
     Raises
     ------
     AssumptionError
-        When the loop is not stable at the beginning, or not over a period of a repeated trajectory.
+        When the loop is not stable at the beginning, or over a period of a repeated trajectory.
     ModelError
         When no position moves, or a moving port has a filter or latency or is not a displacement.
 
@@ -192,7 +193,9 @@ def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathFilters(Value):
-    """Errors of estimated POIs along a trajectory; made by `filters_along`.
+    """Errors of estimated POI motions along a trajectory: the result of `filters_along`.
+
+    A POI is a point of interest, whose motion is estimated.
 
     Parameters
     ----------
@@ -201,10 +204,11 @@ class PathFilters(Value):
     names : sequence of str
         Motions of POIs, such as `die:z`.
     exact, scheduled, frozen : (n_names, n_time) arrays [m or rad]
-        Standard deviation of the error of each estimate, which uses the measurement y[k] of the
-        same sample. The `exact` filter has the time-varying gain of the Riccati recursion and the
-        smallest error. The `scheduled` filter interpolates steady gains of some positions linearly.
-        The `frozen` filter has the steady gain of the present position of the plant.
+        Standard deviation of the error of each estimate at each sample. The estimate uses the
+        measurement y of the same sample. The `exact` filter has the time-varying gain of the
+        Riccati recursion and the smallest error. The `scheduled` filter interpolates linearly
+        between the steady gains of several positions. The `frozen` filter has the steady gain of
+        the plant's present position.
     units : mapping {str: str}
         Units of the motions.
     """
@@ -230,7 +234,7 @@ class PathFilters(Value):
         return "\n".join(lines) + ">"
 
     def price(self, gain: str) -> dict[str, FloatArray]:
-        """Return the excess of each error (n_time,) of "scheduled" or "frozen" over "exact"."""
+        """Return the error (n_time,) of "scheduled" or "frozen" minus "exact", by motion."""
         require_known("gain", [gain], GAINS)
         extra = getattr(self, gain) - self.exact
         return {name: np.asarray(extra[i]) for i, name in enumerate(self.names)}
@@ -247,22 +251,21 @@ def filters_along(
 ) -> PathFilters:
     """Return the errors of three Kalman filters along a trajectory of a moving machine.
 
-    The gain of the exact filter is that of the Riccati recursion at each sample. The scheduled
-    filter interpolates steady gains of some positions. The frozen filter always has the steady gain
-    of the position of `plant`.
+    At each sample the exact filter has the gain of the Riccati recursion. The scheduled filter
+    interpolates between the steady gains of several positions. The frozen filter always has the
+    steady gain of the position of `plant`.
 
-    The covariance P of the error before a measurement becomes
-    ``P+ = A (I - M C) P (I - M C)' A' + A M R M' A' + Q`` one sample later, with the gain M of the
-    filter, the covariances Q of the process noise and R of the sensor noise, and A and C of the
-    plant at the position of the sample.
+    P is the covariance of the error before a measurement. One sample later it is ``P+ = A (I - M C)
+    P (I - M C)' A' + A M R M' A' + Q``. M is the gain of the filter, Q and R are the covariances of
+    process noise and sensor noise, and A and C belong to the plant at the position of the sample.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant with moving ports.
     moving, duration, repeats
-        As for `rms_along`. The exact filter of a repeated trajectory is the solution of a periodic
-        Riccati equation.
+        Path and duration, as for `rms_along`. On a repeated trajectory, the exact filter is the
+        solution of a periodic Riccati equation.
     positions : int
         Number of positions along the trajectory whose steady gains the scheduled filter uses.
 
@@ -277,8 +280,8 @@ def filters_along(
         When no steady filter exists, because a rigid-body mode is not excited by noise or is not
         visible to the sensors.
     ModelError
-        When no position or more than one moves, or a moving port has a filter or latency or is not
-        a displacement.
+        When no position or more than one moves. Also when a moving port has a filter or latency, or
+        is not a displacement.
     SolverError
         When the errors along a repeated trajectory do not converge.
 
@@ -436,14 +439,14 @@ def _constant(value: float, time: FloatArray) -> FloatArray:
 def estimate_along(
     plant: StandardPlant, records: Mapping[str, Any], *, moving: Mapping[str, Any]
 ) -> dict[str, FloatArray]:
-    """Return the estimates of the exact filter (time-varying Kalman filter) of a moving machine.
+    """Return the estimates of the time-varying Kalman filter (exact filter) of a moving machine.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant with moving ports.
     records : mapping {name: (n_time,) array}
-        Records of the sensors y and commands u, by name, or a `Response` of `simulate`.
+        Records of the sensors y and commands u by name, or the `Response` that `simulate` returned.
     moving : mapping {position: path}
         Positions of the machine, as for `simulate`.
 
@@ -456,7 +459,7 @@ def estimate_along(
     Raises
     ------
     LabelError, ModelError, ShapeError
-        As `filters_along`; when a record is missing or has another length.
+        As for `filters_along`; also when a record is missing or has another length.
 
     Examples
     --------

@@ -36,15 +36,17 @@ class ExposureFigures(NamedTuple):
 class ExposureErrors(Value):
     """Moving average (MA) and moving standard deviation (MSD) of errors; prints as a table.
 
+    This is the result of `exposure_errors`.
+
     Parameters
     ----------
     channels : sequence of str
-        The errors.
+        Names of the errors.
     units : sequence of str
         SI units of the errors.
     values : (n, 4) array
-        Columns: the largest |MA|, the |MA| that 99.7 % of the windows do not exceed, and the same
-        two figures of the MSD.
+        Four columns. The first two are the largest |MA| and the |MA| that 99.7 % of the windows do
+        not exceed. The last two are the same for the MSD.
     window : float [s]
         Length of the moving window.
     """
@@ -78,21 +80,23 @@ def exposure_errors(
 ) -> ExposureErrors:
     """Return MA and MSD of errors over the exposures of a run, by POI and axis.
 
-    The moving average (MA, overlay) is the mean over a window. The moving standard deviation (MSD,
-    fading) is the standard deviation in the window about this mean. Windows lie completely within
-    an exposure and slide over it sample by sample, like the slit over the points of a die.
+    The moving average (MA) is the mean of the error over a window; in lithography it is the overlay
+    error. The moving standard deviation (MSD) is the standard deviation in the window about this
+    mean; it is the fading of the image. Each window lies completely within an exposure. It slides
+    over the exposure sample by sample, as the slit slides over a die.
 
     Parameters
     ----------
     run : Response
         Result of `simulate`; all its runs are evaluated.
     channels : sequence of str, optional
-        Names of the errors; by default those of all POIs (points of interest), and the motions of
-        their axes without a reference.
+        Names of the errors. By default these are the errors of all POIs (points of interest), and
+        the motions of those of their axes that have no reference.
     window : float [s]
-        Exposure time of one point; None: each exposure is one window.
+        Length of the window, which is the exposure time of one point. With None, each exposure is
+        one window.
     start : float [s]
-        Time after which all samples are exposed, if `exposures` is not given.
+        Beginning of the exposure if `exposures` is not given. It lasts to the end of the run.
     exposures : (k, 2) array [s], optional
         Beginning and end of each exposure, such as `SetPointProfile.exposures`.
 
@@ -149,20 +153,20 @@ def settling_time(
     run : Response
         Result of `simulate`.
     channel : str
-        The error.
+        Name of the error.
     ma, msd : float
         Allowed |MA| and MSD (moving average and moving standard deviation, see `exposure_errors`),
         in the unit of the channel.
     window : float [s]
         Length of the window.
     after : float [s]
-        Start of the settling time, such as the end of a move.
+        Time from which the settling time is counted, such as the end of a move.
 
     Returns
     -------
     float, or (n_runs,) array [s]
-        Time from `after` to the beginning of the first window after which all windows are within
-        the limits; infinite when the last one is not.
+        Time from `after` to the beginning of the first window from which on all windows are within
+        the limits. It is infinite if the last window is not.
 
     Raises
     ------
@@ -274,7 +278,7 @@ def _window_moments(signal: FloatArray, count: int, whole: bool) -> tuple[FloatA
 class ErrorMap(Value):
     """Moving average (MA) and standard deviation (MSD) of the error at points of a structure.
 
-    `fx.plot.error_map` draws it.
+    This is the result of the function `error_map`. `fx.plot.error_map` draws it.
 
     Parameters
     ----------
@@ -283,7 +287,7 @@ class ErrorMap(Value):
     points : (p, 3) array [m]
         Coordinates of the points.
     ma, msd : (p,) arrays [unit]
-        Largest |MA| and MSD at each point.
+        Largest magnitude of the MA, and largest MSD, at each point.
     window : float [s]
         Length of the window.
     """
@@ -334,9 +338,9 @@ def error_map(
         Coordinates of the points.
     duration, noise, rng : as for `simulate`
     reference : signal, optional
-        Reference along `axis` as for `simulate`; rest by default.
+        Reference along `axis`, as for `simulate`; by default the machine stays at rest.
     axis : str
-        x, y, z, rx, ry or rz: the direction of the error.
+        Direction of the error: x, y, z, rx, ry or rz.
     window, start, exposures : as for `exposure_errors`
 
     Returns

@@ -42,30 +42,31 @@ _LEFT = 0.2
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Feedforward(Value):
-    """Forces of a set-point and its derivatives; a block for `close_loop`.
+    """Forces that follow from a set-point and its derivatives; a block for `close_loop`.
 
-    The forces are ``u = T sum_m gains[m] d^m r / dt^m``. The matrix T distributes the total force
-    of each axis to the actuators. If the plant has slow zeros, the outputs of filters that invert
-    them (`zeros`) are added. Made by `design_feedforward`.
+    The forces are ``u = T sum_m gains[m] d^m r / dt^m``, with the set-point r. The matrix T
+    distributes the total force of each axis to the actuators. If the plant has slow zeros, the
+    outputs of filters that invert them (`zeros`) are added. `design_feedforward` makes this object.
 
     Parameters
     ----------
     reference : str
         Channel of the set-point r.
     axes : sequence of str
-        Channels of the r axes of POIs that the forces move.
+        Channels of the r axes of POIs (points of interest) that the forces move.
     T : (nu, r) array
-        Distribution of the forces of axes to actuators; the magnitudes of a column add to one.
+        Distribution of the forces of axes to actuators. The magnitudes in a column add up to one.
     actuators : sequence of str
         Names of the actuators.
     gains : (p, r, 5) array
-        Gains of position, velocity, acceleration, jerk and snap; for one place, or for each of p
-        places.
+        Gains of position, velocity, acceleration, jerk and snap for each axis. The first index is
+        the place of the POI; p is 1 if the gains do not depend on it.
     dt : float [s]
         Sampling time of the plant.
     zeros : SlowZeros, optional
-        Filters of the highest derivative that invert slow zeros of the plant, whose time constants
-        are as long as moves, such as those of a frame on isolators. They are zero at rest.
+        Filters that invert slow zeros of the plant. Their input is the highest derivative, and
+        their output is zero at rest. A zero is slow if its time constant is as long as a move. A
+        frame on isolators causes such zeros.
     """
 
     reference: str
@@ -90,9 +91,9 @@ class Feedforward(Value):
 
     @property
     def system(self) -> StateSpace:
-        """The block from the reference and its derivatives to the actuators.
+        """The block from the set-point and its derivatives to the actuators.
 
-        It is static, or has two states for each of the slow zeros.
+        It is static; with slow zeros it has two states for each of them.
 
         Raises
         ------
@@ -123,18 +124,18 @@ class Feedforward(Value):
         return max((m for m in range(5) if np.any(self.gains[:, :, m])), default=2)
 
     def up_to(self, term: str) -> Feedforward:
-        """Return the feedforward without the derivatives above position, velocity, ... or snap."""
+        """Return the feedforward without derivatives above `term`, such as "acceleration"."""
         gains = self.gains.copy()
         gains[:, :, _term_index(term) + 1 :] = 0.0
         return self.replace(gains=gains)
 
     def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
+        """Return the force of each actuator at times (n_time,) [s], by the names of `known_forces`.
 
-        If the gains depend on the place, the number of times must equal that of the places. The
-        order of the set-point must be at least that of the highest gain. The output of filters of
-        slow zeros depends on earlier times. With such filters, the times must be the samples of the
-        plant and begin at rest.
+        If the gains depend on the place, the number of times must equal the number of places. The
+        set-point must have at least the order of the highest derivative with a gain. With filters
+        of slow zeros, the output depends on earlier times. The times must then be the samples of
+        the plant, and the first ones must be at rest.
         """
         _check_order(move, self._highest)
         t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))
@@ -157,61 +158,63 @@ def design_feedforward(
     elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
     slow_zeros: bool = True,
 ) -> Feedforward:
-    """Return the feedforward of a plant or a loop: its inverse at low frequency, as a power series.
+    """Return the feedforward of a plant or a loop, with gains for the derivatives of a set-point.
 
-    P is the response of the axes to forces along them, which T distributes to the actuators. It
-    includes the hold and all delays and filters of sensors and actuators. For a plant, the gains
-    are the coefficients of ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the
-    mass, k_3 the mass times the delay, and k_4 contains half the square of the delay and the
-    negative compliance of the flexible modes between actuators and POI (point of interest). For a
-    machine on springs k_0 and k_1 are stiffness and damping. The coefficients are Cauchy integrals
-    on the largest circle around zero on which two radii agree and inside which the expansion equals
-    the inverse; a zero of P (a mass on a spring near the POI) lies outside.
+    For a plant the feedforward is its inverse at low frequency, as a power series. P is the
+    response of the axes to forces along them, which T distributes to the actuators. It includes the
+    hold and all delays and filters of sensors and actuators. The gains are the coefficients of
+    ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the mass and k_3 the mass
+    times the delay. k_4 contains half the square of the delay, and the negative compliance of the
+    flexible modes between actuators and POI (point of interest). For a machine on springs k_0 and
+    k_1 are stiffness and damping. The coefficients are Cauchy integrals on a circle around zero. It
+    is the largest circle on which two radii agree and inside which the series equals the inverse.
+    Zeros of P lie outside of it.
 
-    The frame of a machine on isolators gives P zeros within the band, beyond which an expansion at
-    rest is wrong. If the plant is sampled, its stable zeros below a hundredth of the rate are
-    inverted exactly. Filters of the highest derivative do this (`zeros`), and their output is zero
-    at rest. A warning names unstable slow zeros. The output of filters depends on the past, so that
-    they are not combined with gains that vary along places (`along`).
+    The frame of a machine on isolators gives P zeros at low frequency. Above their frequency, the
+    power series is wrong. If the plant is sampled, its stable zeros below a hundredth of the rate
+    are therefore inverted exactly by filters (`zeros`). The input of these filters is the highest
+    derivative, and their output is zero at rest. A warning names unstable slow zeros. The output of
+    filters depends on the past. They are therefore not combined with gains that vary along places
+    (`along`).
 
     All axes that the actuators move independently (`flexplant.plant.driven_axes`) are treated
-    together, including the forces that keep the axes without a reference at rest.
+    together. The feedforward includes the forces that keep the axes without a reference at rest.
 
-    In a loop the gains minimise its error ``G_u F + G_r - 1`` by least squares. F is the
-    feedforward, and G_u and G_r are the responses of the POI to forces and to the reference in
-    closed loop. The inverse of P is not used here, because the feedback opposes it if sensors and
-    POI move differently. Poles of the controller and zeros of P may be as slow as the moves. The
-    errors are weighted with the spectrum of the move. If no move is given, it is that of a move
-    with a duration of about ``3 / bandwidth`` of the loop, and the feedforward has no force at rest
-    if the plant needs none. Gains of a lower order are the best of that order.
+    For a loop the gains minimise the error ``G_u F + G_r - 1`` of the loop by least squares. F is
+    the feedforward, and G_u and G_r are the closed-loop responses of the POI to forces and to the
+    reference. The inverse of P is not used here, because the feedback opposes it if sensors and POI
+    move differently. Poles of the controller and zeros of P may be as slow as the moves. The errors
+    are weighted with the spectrum of the move. If no move is given, the spectrum is that of a move
+    with a duration of about ``3 / bandwidth`` of the loop. The feedforward then has no force at
+    rest if the plant needs none. Gains of a lower order are the best of that order.
 
     Parameters
     ----------
     given : StandardPlant or ClosedLoop
-        Plant that was assembled from a structure, sampled if the loop is sampled; or a loop around
-        a model, without feedforward.
+        Plant that was assembled from a structure, or a closed loop around a model, without
+        feedforward. The plant is sampled if the feedforward is for a sampled loop.
     reference : str, optional
         Channel of the reference; by default the only one of the plant.
     order : int
-        Highest derivative, 2 to 4: acceleration, jerk, snap.
+        Order of the highest derivative: 2 (acceleration), 3 (jerk) or 4 (snap).
     move : SetPointProfile, optional
-        Move for which the errors of a loop are minimised; its order limits the gains.
+        Move for which the errors of a loop are minimised. Its order limits the order of the gains.
     along : (p, 3) array [m], optional
         Places of a POI that moves (`simulate(moving=)`). Gains are computed for each place.
     elements : mapping {name: element, or a list of some}, optional
         Elements of actuators and sensors, as for `simulate`. If the move exceeds a `Saturation`, a
         warning gives its name and the required value. The gains do not depend on the elements.
     slow_zeros : bool
-        Whether stable slow zeros are inverted by filters. They also work on machines whose
-        isolators differ from the model by 3 % in frequency or by a factor of 2 in damping. In 93 %
-        of 448 trials the peak error was smaller than with gains alone. In the other trials it was
-        below 0.3 % of the error without feedforward.
+        Whether filters invert stable slow zeros. In trials, the isolators of the machine differed
+        from the model by 3 % in frequency or by a factor of 2 in damping. In 93 % of 448 trials the
+        peak error was smaller than with gains alone. In the other trials it was below 0.3 % of the
+        error without feedforward.
 
     Returns
     -------
     Feedforward
-        Feedforward; its `system` is a block for `close_loop`, and the loop's reference must then be
-        a SetPoint.
+        Feedforward. Its `system` is a block for `close_loop`. The reference of that loop must be a
+        SetPoint.
 
     Raises
     ------
@@ -226,8 +229,8 @@ def design_feedforward(
     Warns
     -----
     FlexplantWarning
-        When the remaining error of the loop is a fifth or more; when a move exceeds a Saturation;
-        when the inverse of a plant has a slow unstable pole.
+        When the remaining error of the loop is a fifth or more of the error without feedforward, a
+        move exceeds a Saturation, or the inverse of a plant has a slow unstable pole.
 
     References
     ----------
@@ -275,9 +278,10 @@ def design_feedforward(
 
 
 def known_forces(plant: StandardPlant) -> StateSpace:
-    """Return the block that passes forces of `simulate` on to the actuators.
+    """Return the block through which forces that are known in advance reach the actuators.
 
-    Its inputs are `u1:feedforward`, ...: references of the loop, given as arrays.
+    Its inputs are `u1:feedforward` and so on. They become references of the loop, for which
+    `simulate` needs arrays of forces.
 
     Parameters
     ----------

@@ -25,15 +25,15 @@ _LINES = 100
 class InputShaper(Value):
     """Sequence of impulses that leaves no vibration of the modes for which it is designed.
 
-    A command is replaced by ``sum_i a_i command(t - t_i)``, with ``sum_i a_i = 1``; made by
-    `input_shaper`.
+    A command is replaced by ``sum_i a_i command(t - t_i)``, with ``sum_i a_i = 1``. `input_shaper`
+    makes this object.
 
     Parameters
     ----------
     times : (n,) array [s]
-        Times of the impulses, from 0.
+        Times t_i of the impulses. The first one is 0.
     amplitudes : (n,) array
-        Positive amplitudes, so that no actuator force exceeds that of the command.
+        Amplitudes a_i. They are positive, so that no actuator force exceeds that of the command.
     """
 
     times: FloatArray
@@ -45,14 +45,14 @@ class InputShaper(Value):
 
     @property
     def duration(self) -> float:
-        """Increase of the duration of a move [s]."""
+        """Time [s] by which the shaper makes a move longer."""
         return float(self.times[-1])
 
     def residual(self, freq: npt.ArrayLike, damping: npt.ArrayLike) -> FloatArray:
         """Return the remaining vibration of modes relative to that without the shaper.
 
-        ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta omega t_i) e^(j omega_d t_i)|``, after an
-        impulse [Singer1990]_.
+        After an impulse it is ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta omega t_i) e^(j omega_d
+        t_i)|`` [Singer1990]_.
 
         Parameters
         ----------
@@ -64,7 +64,7 @@ class InputShaper(Value):
         Returns
         -------
         (k,) array
-            Amplitude ratios: 0 without remaining vibration, 1 as without the shaper.
+            Amplitude ratios. 0 means no remaining vibration, and 1 the same as without the shaper.
         """
         omega = 2.0 * np.pi * np.atleast_1d(positive_array(freq, "freq"))
         zeta = np.broadcast_to(real_array(damping, "damping"), omega.shape)
@@ -74,10 +74,10 @@ class InputShaper(Value):
         return np.asarray(np.abs(turns @ self.amplitudes))
 
     def shaped(self, move: SetPointProfile) -> SetPointProfile:
-        """Return the shaped move, which has the same distance and takes longer by `duration`.
+        """Return the shaped move. Its distance is the same, and it takes longer by `duration`.
 
-        The shaped move is the exact sum of moves that start at the times of the impulses,
-        multiplied by their amplitudes. It is not sampled.
+        The shaped move is the sum of copies of the move. Each copy starts at the time of an impulse
+        and is multiplied by its amplitude. The sum is exact and not sampled.
         """
         delays = self.times / move.tick
         edges = np.unique(np.concatenate([move.edges + late for late in delays]))
@@ -132,12 +132,13 @@ def input_shaper(
 ) -> InputShaper:
     """Return the shaper that leaves one or several modes at rest after a move.
 
-    The residual is the remaining vibration relative to that without a shaper. ZV (zero vibration)
-    has two impulses half a period apart. ZVD (zero vibration and derivative) has three, and the
-    slope of its residual over frequency is zero at the mode. EI (extra-insensitive) has three; its
-    residual is `left` at the mode and zero at a frequency on each side of it. With `change`, ZV
-    shapers at frequencies over the band are combined until less than `left` remains everywhere in
-    it. Several modes get one shaper each, in series.
+    The residual is the remaining vibration divided by that without a shaper. ZV (zero vibration)
+    has two impulses half a period apart. ZVD (zero vibration and derivative) has three impulses,
+    and the slope of its residual over frequency is zero at the mode. EI (extra-insensitive) has
+    three impulses; its residual is `left` at the mode and zero at a frequency on each side of it.
+    With `change`, several ZV shapers for frequencies in the uncertain band are applied one after
+    the other, until less than `left` remains everywhere in the band. If several modes are given,
+    their shapers are applied one after the other.
 
     Parameters
     ----------
@@ -148,9 +149,9 @@ def input_shaper(
     kind : {"ZV", "ZVD", "EI"}
         Kind of the shaper if `change` is 0.
     change : float
-        Relative uncertainty of a frequency, to both sides.
+        Relative uncertainty of each frequency, to both sides.
     left : float
-        Largest remaining fraction of the vibration.
+        Largest fraction of the vibration that may remain, for EI and with `change`.
 
     Returns
     -------
@@ -159,8 +160,8 @@ def input_shaper(
     Raises
     ------
     ModelError
-        When a frequency is not positive, a damping ratio not below 1, or the band so wide that more
-        than `left` remains with six shapers.
+        When a frequency is not positive, a damping ratio is not below 1, or the band is so wide
+        that more than `left` remains with six shapers.
 
     References
     ----------
@@ -228,13 +229,14 @@ def quiet_setpoint(
     settle: float = 0.0,
     exposure: float = 0.0,
 ) -> SetPointProfile:
-    """Return a set-point of third order whose ramps last whole periods of one or two modes.
+    """Return a set-point of third order that leaves one or two modes at rest.
 
     The velocity is ``distance`` times the convolution of three rectangular pulses of unit area.
     Their lengths are T_1 >= T_2 >= T_3. The Fourier transform of a pulse is zero at each frequency
-    f for which ``f T_i`` is a whole number, so that a mode of this frequency remains at rest after
-    the move. T_3 is one period of the first mode, and T_2 is a whole number of periods of the
-    second mode. The bounds on velocity and acceleration hold; the jerk follows from T_3.
+    f for which ``f T_i`` is a whole number. A mode of this frequency therefore remains at rest
+    after the move. T_3 is one period of the first mode, and T_2 is a whole number of periods of the
+    second mode. The bounds on velocity and acceleration are kept. The jerk is not bounded; it
+    follows from T_3.
 
     Parameters
     ----------

@@ -23,12 +23,12 @@ from .sampled_runs import simulate
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedFeedforward(Value):
-    """A feedforward with learned gains, and the error of each trial; prints as a table.
+    """A feedforward with learned gains, and the error of each move; prints as a table.
 
     Parameters
     ----------
     feedforward : Feedforward
-        Feedforward with the gains of the move with the smallest error.
+        Feedforward with the gains of that move which had the smallest error.
     errors : (trials,) array [m]
         Rms of the error in each move.
     gains : (trials, r, 5) array
@@ -56,35 +56,37 @@ def learn_feedforward(
     trials: int = 4,
     step: float = 1.0,
 ) -> LearnedFeedforward:
-    """Return feedforward gains tuned on repeated moves, by least squares on basis functions.
+    """Return feedforward gains that are tuned on repeated moves of the machine, by least squares.
 
-    The basis functions are the set-point's derivatives, one for each axis of the forces. In a
-    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``. Phi is the
-    effect of a unit of each gain on the error in closed loop. It is computed from a model and may
-    be approximate, because each move measures the remaining error, and the least-squares gains for
-    this error are added. The error e_0 without these gains is not modelled. Every repeating error
-    (due to a wrong mass, a compliance or a delay) is therefore compensated as far as the basis
-    functions allow.
+    The forces are a sum of basis functions: the set-point's derivatives for each axis, multiplied
+    by gains. In a linear loop the error depends linearly on these gains, ``e = e_0 + Phi gains``.
+    Phi is the effect of a unit of each gain on the error in closed loop. It is computed from a
+    model and may be approximate: each move measures the remaining error, and the least-squares
+    gains for this error are added to the gains. The error e_0 without these forces is not modelled.
+    Every error that repeats (due to a wrong mass, a compliance or a delay) is therefore compensated
+    as far as the basis functions allow.
 
     Parameters
     ----------
     start : Feedforward
         Feedforward of the first move.
     trial : function
-        Function that makes the move with a Feedforward on the machine and returns the record.
+        Function that takes a Feedforward, makes the move on the machine with it, and returns the
+        record.
     loop : ClosedLoop
-        The same controller (without feedforward) on a model of the machine, for Phi.
+        Loop of the same controller, without feedforward, around a model of the machine. Phi is
+        computed from it.
     move : SetPointProfile
         Move that each trial repeats.
     duration : float [s]
         Duration of each run.
     terms : sequence of str
-        Derivatives that are tuned.
+        Names of the derivatives whose gains are tuned.
     trials : int
         Number of moves.
     step : float
-        Fraction of each correction that is applied: 1 unless the noise is larger than the repeating
-        error.
+        Fraction of each correction that is applied. Use 1, or less if the noise is larger than the
+        repeating error.
 
     Returns
     -------

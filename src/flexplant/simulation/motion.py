@@ -19,13 +19,13 @@ from ..words import instance
 class Motion(NamedTuple):
     """Position and its derivatives at the same times.
 
-    Derivatives above the order of a set-point are given as zero; they are impulses where the
-    highest derivative jumps.
+    A set-point has derivatives up to its order. Higher ones are given as zero, although they are
+    impulses where the highest derivative jumps.
 
     Parameters
     ----------
     position, velocity, acceleration, jerk, snap : arrays
-        In m or rad, and per second to the order of each.
+        Values in m or rad for the position, per second for the velocity, and so on.
 
     Examples
     --------
@@ -44,27 +44,27 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SetPointProfile(Value):
-    """A motion from rest to rest along one axis; made by `setpoint`, `scan` and `then`.
+    """A motion from rest to rest along one axis, made by `setpoint`, `scan` or `then`.
 
     Parameters
     ----------
     edges : (m + 1,) array [ticks]
-        Starts of the phases, from 0, and end of the last phase.
+        Beginning of each phase, from 0, and end of the last phase, in numbers of `tick`.
     lengths : (m,) array [s]
-        Lengths of the phases, accurate also where the edges are much larger numbers.
+        Lengths of the phases. They are accurate even if the edges are much larger numbers.
     from_end : (m,) bool array
-        Whether a phase's state is given at its end, not at its beginning.
+        Whether the entry of `states` for a phase holds at its end, instead of its beginning.
     states : (m, 5) array
         Position, velocity, acceleration, jerk and snap of each phase, at its beginning or at its
         end (see `from_end`).
     start, stop : float [m or rad]
-        Position at rest before and after.
+        Positions at rest before and after the motion.
     order : int
-        Order of the highest derivative, which is constant in each phase: 2, 3 or 4.
+        Order of the highest derivative: 2, 3 or 4. This derivative is constant in each phase.
     tick : float [s]
-        Grid spacing of the edges; 1 s without a grid.
+        Grid spacing of the edges. Without a grid it is 1 s.
     gridded : bool
-        Whether there is a grid.
+        Whether the edges lie on a grid.
     exposures : (k, 2) array [s]
         Beginning and end of each exposure window.
     """
@@ -92,17 +92,17 @@ class SetPointProfile(Value):
 
     @property
     def duration(self) -> float:
-        """Total time including rests and windows [s]."""
+        """Total time [s], including rests and exposure windows."""
         return float(self.edges[-1]) * self.tick
 
     @property
     def rate(self) -> float | None:
-        """Rate [Hz] of the grid on which it switches; None without a grid."""
+        """Rate [Hz] of the grid on which derivatives jump; None without a grid."""
         return 1.0 / self.tick if self.gridded else None
 
     @property
     def peaks(self) -> Motion:
-        """Largest magnitudes; that of the position is the distance from the start."""
+        """Largest magnitudes. For the position it is the largest distance from the start."""
         found = np.abs(np.concatenate([self._at(self.edges[:-1]), self._before()], axis=1))
         far = max(abs(self.stop - self.start), float(np.ptp(self._at(self.edges[:-1])[0])))
         return Motion(np.asarray(far), *found[1:].max(axis=1))
@@ -125,9 +125,9 @@ class SetPointProfile(Value):
         return Motion(*found)
 
     def then(self, following: SetPointProfile) -> SetPointProfile:
-        """Return this set-point with another one after it, which begins where this one ends.
+        """Return this set-point followed by another one, which begins where this one ends.
 
-        Order and grid of both are the same; the exposure windows are those of both.
+        Both must have the same order and grid. The result has the exposure windows of both.
         """
         other: SetPointProfile = instance(
             following, SetPointProfile, "following", "Use setpoint(...)."
@@ -337,18 +337,18 @@ def setpoint(
     exposure: float = 0.0,
     rate: float | None = None,
 ) -> SetPointProfile:
-    """Return the fastest motion from rest to rest within the bounds, in closed form.
+    """Return the fastest motion from rest to rest within the bounds, without optimisation.
 
-    The motion is of second order (its acceleration jumps), of third order if `jerk` is given (its
-    jerk jumps), or of fourth order if `snap` is given too (its snap jumps). For a short distance
-    some bounds are not reached. Motions of second and third order are time-optimal. A motion of
-    fourth order is time-optimal if it reaches the velocity bound. If it does not, acceleration and
-    jerk still return to zero between speeding up and slowing down, and the motion is at most 7.5 %
-    longer than the optimum.
+    The order of the motion is that of the derivative that jumps. It is two (acceleration), three if
+    `jerk` is given, or four if `snap` is given too. For a short distance some bounds are not
+    reached. Motions of second and third order are time-optimal. A motion of fourth order is
+    time-optimal if it reaches the velocity bound. If it does not, acceleration and jerk still
+    return to zero between speeding up and slowing down. The motion is then at most 7.5 % longer
+    than the optimum.
 
-    With `rate` all switching times are samples of a grid. The motion is a few samples longer and
-    its largest derivatives are slightly smaller, so that all bounds are kept and the final position
-    is exact. The samples of all derivatives are then consistent without interpolation.
+    With `rate` all derivatives jump at samples of a grid. The motion is then a few samples longer,
+    and its largest derivatives are slightly smaller, so that all bounds are kept and the final
+    position is exact. The samples of all derivatives are then consistent without interpolation.
 
     Parameters
     ----------
@@ -357,21 +357,21 @@ def setpoint(
     velocity, acceleration : float [m/s, m/s^2]
         Bounds on the magnitudes.
     jerk, snap : float, optional [m/s^3, m/s^4]
-        Bounds on the third and fourth derivative; a bound on snap needs one on jerk.
+        Bounds on the third and fourth derivative. A bound on snap needs one on jerk.
     start : float [m]
         Position before the motion.
     rest : float [s]
         Time at rest before the motion begins.
     settle, exposure : float [s]
-        Time to settle after the motion, and length of the exposure window after that.
+        Time to settle after the motion, and length of the exposure window that follows.
     rate : float, optional [Hz]
-        Rate of the controller, if the motion is to switch at its samples; rests are rounded up to
-        whole samples.
+        Rate of the controller. If it is given, derivatives jump only at its samples, and rests are
+        rounded up to whole samples.
 
     Returns
     -------
     SetPointProfile
-        With `.at(t)`, `.duration`, `.exposures`, and `.then(other)` for chains.
+        Motion, with `.at(t)`, `.duration`, `.exposures`, and `.then(other)` to append another one.
 
     Raises
     ------
@@ -417,27 +417,27 @@ def scan(
     rest: float = 0.0,
     rate: float | None = None,
 ) -> SetPointProfile:
-    """Return a scan: to constant velocity, settle, expose a length, and back to rest.
+    """Return a scan: speed up, settle, expose a length at constant velocity, slow down and rest.
 
     Parameters
     ----------
     length : float [m or rad]
         Signed length that is exposed at constant velocity.
     velocity : float [m/s]
-        Velocity during the exposure; with a grid it is lowered so that the exposure takes whole
-        samples.
+        Velocity during the exposure. With a grid it is lowered so that the exposure lasts a whole
+        number of samples.
     acceleration, jerk, snap : float [m/s^2, m/s^3, m/s^4]
         Bounds, as for `setpoint`.
     settle : float [s]
         Settling time at constant velocity before the exposure.
     start : float [m]
-        Position before the scan. The exposure begins later: see ``at(exposures)``.
+        Position before the scan. The exposure begins farther along, at ``at(exposures).position``.
     rest, rate : as for `setpoint`
 
     Returns
     -------
     SetPointProfile
-        With one exposure window.
+        Scan with one exposure window.
 
     Raises
     ------

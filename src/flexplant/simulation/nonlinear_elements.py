@@ -32,21 +32,22 @@ def _lower_limit(value: Any, name: str) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Saturation(Value):
-    """Limits of a signal: ``least <= v <= limit``, and ``|dv/dt| <= rate`` from sample to sample.
+    """Limits of a signal v, ``least <= v <= limit``, and of its rate of change.
 
     Parameters
     ----------
     limit : float [unit of the channel]
-        Largest magnitude; infinite when only the rate is limited.
+        Largest value. Use infinity when only the rate is limited.
     rate : float [unit/s], optional
-        Largest change per time; the signal starts at 0. None: not limited.
+        Largest change of the signal per time, from sample to sample. The signal starts at 0. With
+        None the rate is not limited.
     least : float [unit of the channel], optional
-        Smallest value; ``-limit`` by default. 0 for an actuator that only pushes.
+        Smallest value; by default it is ``-limit``. Use 0 for an actuator that can only push.
 
     Raises
     ------
     ModelError
-        When a limit is not positive, or `least` is positive; likewise for the other elements.
+        When a limit is not positive, or `least` is positive.
 
     Examples
     --------
@@ -73,7 +74,7 @@ class Saturation(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Quantiser(Value):
-    """A signal in discrete steps: ``step round(v / step)``, as from a converter or an encoder.
+    """Rounding of a signal v to discrete levels ``step round(v / step)``, as in a converter.
 
     Parameters
     ----------
@@ -96,7 +97,9 @@ Act: TypeAlias = Callable[[FloatArray], FloatArray]
 
 @runtime_checkable
 class Element(Protocol):
-    """Interface (a Python protocol) of your own nonlinear element: any object with `begin`.
+    """Interface of nonlinear elements that you write: any object with the method `begin`.
+
+    In Python this is called a protocol. The example is an element with a dead zone.
 
     >>> class DeadZone:
     ...     def begin(self, dt, generators):
@@ -125,10 +128,10 @@ class Element(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Hysteresis(Value):
-    """Play of a signal, a gear or a magnet: the output follows after a change of `width`.
+    """Play (backlash) or hysteresis of a signal: the output only follows changes beyond `width`.
 
-    The output is ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))`` of the input u and starts
-    at 0. A sum of such elements is the Prandtl-Ishlinskii model of hysteresis.
+    For the input u the output is ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))``, which
+    starts at 0. A sum of such elements is the Prandtl-Ishlinskii model of hysteresis.
 
     Parameters
     ----------
@@ -146,7 +149,7 @@ class Hysteresis(Value):
     width: float = field(metadata=checked(positive))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the play for the given number of runs."""
+        """Return the function that applies the play, for the given number of runs."""
         now = np.zeros(len(generators))
 
         def play(values: FloatArray) -> FloatArray:
@@ -158,12 +161,12 @@ class Hysteresis(Value):
 
 @dataclass(frozen=True, eq=False)
 class Dropout(Value):
-    """Lost samples: the last received value is read again.
+    """Loss of samples. Instead of a lost sample, the last received value is read again.
 
     Parameters
     ----------
     share : float
-        Probability of losing a sample, independent for each sample; the first one is never lost.
+        Probability of losing a sample. Losses are independent, and the first sample is never lost.
 
     Examples
     --------
@@ -193,9 +196,9 @@ class Dropout(Value):
 
 @dataclass(frozen=True, eq=False)
 class Friction(Value):
-    """Dry friction with presliding, as the force of an elastoplastic spring on a disturbance.
+    """Dry friction with presliding (elastic motion before sliding), for a disturbance channel.
 
-    The force is ``-s`` with ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])``, limited to the range
+    The force is ``-s``, where ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])`` is limited to the range
     from ``-level`` to ``level``. It is computed in every sample of the simulation (see `finer` of
     `simulate`) and is constant over this sample. ``stiffness dt^2`` must therefore be small
     compared with the mass.
@@ -205,9 +208,10 @@ class Friction(Value):
     level : float [N]
         Force at which the contact slides.
     stiffness : float [N/m]
-        Stiffness before sliding.
+        Stiffness of the contact before it slides.
     reads : str
-        The channel of y that measures the motion x at the place, without its noise.
+        Name of the channel of y that measures the motion x of the contact. Its noise is not
+        included.
 
     Examples
     --------
@@ -237,15 +241,16 @@ class Friction(Value):
 
 @dataclass(frozen=True, eq=False)
 class Jitter(Value):
-    """Jitter: a sensor is read early, or a command is applied late, by up to `spread`.
+    """Random errors of sampling times: a sensor is read early, or a command is applied late.
 
-    The shift of time has a uniform distribution in steps of the finer samples, and it is
-    independent for each sample and channel. It needs the argument `finer` of `simulate`.
+    The shift of time is between 0 and `spread`. It has a uniform distribution in steps of the finer
+    samples, and is independent for each sample and channel. It needs the argument `finer` of
+    `simulate`.
 
     Parameters
     ----------
     spread : float [s]
-        Largest jitter; less than the sampling time of the controller.
+        Largest shift of time. It must be less than the sampling time of the controller.
 
     Examples
     --------
@@ -257,7 +262,7 @@ class Jitter(Value):
     spread: float = field(metadata=checked(positive))
 
     def most(self, fine: float, finer: int, name: str) -> int:
-        """Return the largest number of finer samples."""
+        """Return the largest shift as a number of finer samples."""
         found = round(self.spread / fine)
         if not 1 <= found < finer:
             raise ModelError(

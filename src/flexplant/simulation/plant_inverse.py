@@ -27,44 +27,46 @@ def inverse_forces(
     bandwidth: float,
     reference: str | None = None,
 ) -> dict[str, FloatArray]:
-    """Return the forces that make the POI follow a set-point, by the plant's regularised inverse.
+    """Return the forces that make the POI follow a set-point, by a regularised plant inverse.
 
-    P is the response of the POI (point of interest) to the forces u, and r the set-point. The
-    forces minimise ``|r - P u|^2 + rho |u|^2``. At each frequency the solution is
-    ``U = P* (P P* + rho)^-1 R`` with the spectra U of u and R of r. It includes forces before a
-    change of the set-point. A plant with zeros outside the stability region (sampled or with
-    sensors away from actuators) has no stable causal inverse; this one is stable, and acts ahead of
-    the set-point (preview). With u in units of acceleration, the weight rho is
-    ``(2 pi bandwidth)^-4``. Far below the bandwidth the plant is therefore inverted, and far above
-    it the force is zero. All axes of the POI are included; those without a reference stay at rest.
-    If the sensors do not move like the POI, the feedback reacts to the move. This reaction is
-    computed on the model and subtracted.
+    P is the response of the POI (point of interest) to the forces u, and r is the set-point. The
+    forces minimise ``|r - P u|^2 + rho |u|^2``. At each frequency the solution is ``U = P* (P P* +
+    rho)^-1 R`` with the spectra U of u and R of r. With u in units of acceleration, the weight rho
+    is ``(2 pi bandwidth)^-4``. Far below the bandwidth the plant is therefore inverted, and far
+    above it the force is zero.
+
+    If the plant has zeros outside the stability region, its causal inverse is unstable. This is
+    common for sampled plants, and for sensors away from actuators. The inverse used here is stable,
+    but acts before the set-point changes (preview). All axes of the POI are included, and those
+    without a reference stay at rest. If the sensors do not move like the POI, the feedback reacts
+    to the move. This reaction is computed on the model and subtracted.
 
     Parameters
     ----------
     loop : ClosedLoop
-        The controller on a model: a sampled plant, assembled from a free structure.
+        Loop of the controller around a model: a sampled plant, assembled from a free structure.
     move : SetPointProfile
-        Move with a rest before it that is long enough for the preview; otherwise a warning is
-        given.
+        Move that begins with a rest. If the rest is too short for the preview, a warning is given.
     duration : float [s]
         Duration of the run.
     bandwidth : float [Hz]
         Frequency up to which the plant is inverted.
     reference : str, optional
-        The reference's channel; by default the plant's only one.
+        Channel of the reference; by default the only one of the plant.
 
     Returns
     -------
     dict {channel: (n_time,) array}
-        `u1:feedforward`, ...: references of a loop with the block `known_forces(plant)`.
+        Forces as arrays, named `u1:feedforward` and so on. They are references for a loop with the
+        block `known_forces(plant)`.
 
     Raises
     ------
     LabelError, AssumptionError
         As for `design_feedforward`.
     CertificateError
-        When responses from the plant's matrices give other forces at one of five frequencies.
+        When the forces are not the minimum at one of five frequencies, computed from the plant's
+        matrices.
     ModelError
         When the plant is continuous or held, `move` is not a set-point profile, or a number is not
         positive.
@@ -72,8 +74,8 @@ def inverse_forces(
     Warns
     -----
     FlexplantWarning
-        When forces of more than 0.1 % of the largest force would act before the beginning or after
-        the end of the run.
+        When forces above 0.1 % of the largest force would act before the beginning or after the end
+        of the run.
 
     References
     ----------

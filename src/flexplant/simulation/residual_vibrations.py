@@ -21,28 +21,29 @@ from .sampled_runs import known_inputs, named_references, simulate
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResidualVibration(Value):
-    """Remaining vibration of a signal after the end of a move; made by `residual_vibration`.
+    """Remaining vibration of a signal after the end of a move: the result of `residual_vibration`.
 
     Parameters
     ----------
     channel : str
         Name of the channel.
     freq, damping : (k,) arrays [Hz, 1]
-        Modes of the closed loop, the largest amplitude first.
+        Frequencies and damping ratios of the modes of the closed loop, the largest amplitude first.
     amplitude : (k,) array
         Amplitude of each mode at the end of the move, in the unit of the channel.
     predicted : float
-        Largest magnitude after the end of the move, computed as the sum of the modes.
+        Largest magnitude after the end of the move, computed from the sum of the modes.
     simulated : float
-        The same from a simulation.
+        Largest magnitude after the end of the move, in a simulation.
     decaying : float
-        Largest magnitude, after the end of the move, of the non-oscillating component.
+        Largest magnitude, after the end of the move, of the component that decays without
+        oscillation.
     rest : float
         Final value of the channel. All magnitudes are deviations from it.
     unit : str
         Unit of the channel.
     judged : bool
-        Whether the loop is that of the evaluation model.
+        Whether the vibration was computed on the evaluation model.
     """
 
     channel: str
@@ -82,8 +83,8 @@ def residual_vibration(
 
     The remaining vibration is computed by two independent methods. For ``predicted``, the state at
     the end of the move is split into the modes of the closed loop. The reference is constant from
-    then on, and each mode decays freely. For ``simulated``, it is the largest magnitude in a run
-    without noise.
+    then on, and each mode decays freely. ``simulated`` is the largest magnitude in a run without
+    noise.
 
     Parameters
     ----------
@@ -92,9 +93,9 @@ def residual_vibration(
     move : SetPointProfile
         Move, made by `setpoint`, `quiet_setpoint` or ``shaper.shaped(move)``.
     reference : str, optional
-        Reference that follows the move; needed where there are several.
+        Reference that follows the move; needed if there are several.
     channel : str, optional
-        Channel of z; by default the error of the reference.
+        Channel of z whose vibration is computed; by default the error of the reference.
     wait : float [s], optional
         Length of the time after the end of the move that is evaluated. By default it is ten periods
         of the slowest oscillating mode, but at most the duration of the move and at least a hundred

@@ -38,9 +38,9 @@ class Response(Value, Mapping[str, FloatArray]):
     names : sequence of str
         Names of the channels.
     units : mapping {channel: unit}, optional
-        SI units of the channels that have a known one.
+        SI units of those channels whose unit is known.
     seed : int or tuple of int, optional
-        Seed of the noise. The same run is repeated if it is given to `simulate` as `rng`.
+        Seed of the noise. If it is given to `simulate` as `rng`, the same run is repeated.
 
     Raises
     ------
@@ -115,11 +115,11 @@ class Response(Value, Mapping[str, FloatArray]):
         return 1.0 / self.dt if self.dt else 0.0
 
     def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
-        """Return the root mean square of a channel about zero, a number or one for each run.
+        """Return the root mean square of a channel: one number, or one for each run.
 
-        Samples before `start` [s] are left out (transients). In this and the other methods, an
-        unknown channel raises LabelError, and a start after the end of the record raises
-        ModelError.
+        The mean is not removed. Samples before `start` [s] are left out (transients). In this and
+        the other methods, an unknown channel raises LabelError, and a start after the end of the
+        record raises ModelError.
         """
         signal = self._from(channel, start)
         unit = signal_unit(signal)
@@ -151,7 +151,7 @@ class Response(Value, Mapping[str, FloatArray]):
         return value, low, high
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
-        """Return the largest magnitude of a channel from `start` on, one for each run."""
+        """Return the largest magnitude of a channel from `start` [s] on, for each run."""
         return as_numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
 
     def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
@@ -180,17 +180,18 @@ class Response(Value, Mapping[str, FloatArray]):
     def moving_average(self, channel: str, *, window: float = 5e-3) -> FloatArray:
         """Return the mean of a channel over a window [s] centred at each time (MA).
 
-        In lithography the window is the exposure time of a point: the MA of the error is overlay.
-        It is rounded to whole samples; an even number reaches one sample further back than ahead.
-        At both ends of the record the window is shortened to the samples that exist.
+        In lithography the window is the exposure time of a point, and the MA of the error is the
+        overlay error. The window is rounded to whole samples. If their number is even, the window
+        reaches one sample further back than ahead. At both ends of the record the window is
+        shortened to the samples that exist.
         """
         return self._moments(channel, window)[0]
 
     def moving_std(self, channel: str, *, window: float = 5e-3) -> FloatArray:
         """Return the standard deviation of a channel in a window [s] centred at each time (MSD).
 
-        The deviation is about the mean of the window. In lithography the MSD of the error is
-        fading, the blur of the image.
+        The deviation is that from the mean of the window. In lithography the MSD of the error is
+        called fading, the blur of the image.
         """
         return self._moments(channel, window)[1]
 
@@ -199,8 +200,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float]:
         """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
 
-        Windows [s] centred before `start` [s] are left out: they cover the move and its settling.
-        At the end of the record, windows are shortened.
+        Windows are centred at each sample. Those centred before `start` [s] are left out, because
+        they cover the move and its settling. At the end of the record, windows are shortened.
         """
         late = self._late(start)
         average, deviation = self._moments(channel, window)

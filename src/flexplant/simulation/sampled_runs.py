@@ -50,78 +50,81 @@ def simulate(
 ) -> Response:
     """Return the time response of a sampled closed loop.
 
-    In each sample the sensors are read and the blocks compute the commands. These are applied after
-    the plant's delay and held for one sample. White disturbances act on the plant with the exact
-    covariance `plant.process_noise` per sample, that of `design_kalman`; sensors have the variance
-    asd^2 rate / 2.
+    In each sample the sensors are read and the blocks compute the commands. The commands are
+    applied after the plant's delay and held for one sample. White disturbances act on the plant
+    with their exact covariance per sample, `plant.process_noise`, as in `design_kalman`. The noise
+    of a sensor has the variance asd^2 rate / 2.
 
     Parameters
     ----------
     loop : ClosedLoop or ScheduledLoop
-        Loop around a sampled plant. An unstable loop is simulated too, with a warning that gives
-        its spectral radius and its growth during the run.
+        Loop around a sampled plant. An unstable loop is simulated too. A warning then gives its
+        spectral radius and its growth during the run.
     duration : float [s]
-        Duration of the run: round(duration * rate) samples, the first at 0.
+        Duration of the run. It has round(duration * rate) samples, and the first one is at 0.
     reference : signal or mapping {name: signal}, optional
-        Signals of references such as `die:ref`; a single signal if the plant has one reference. A
-        signal is a SetPoint, an array of one value per sample, a number, or a function of the times
-        [s]; an array (runs, samples) has one row for each run. Derivatives of a SetPoint that
-        blocks read are taken from it.
+        Signals of references such as `die:ref`, or a single signal if the plant has one reference.
+        A signal is a SetPoint, an array with one value for each sample, a number, or a function of
+        the times [s]. An array (runs, samples) has one row for each run. If blocks read derivatives
+        of a reference, these are taken from its SetPoint.
     disturbance : mapping {name: signal}, optional
-        Signals of other channels of w, constant over each sample, in addition to their noise.
+        Signals of other channels of w, in addition to their noise. They are constant over each
+        sample.
     elements : mapping {name: element, or a list of some}, optional
-        Elements that act on channels of y before they are read, and on driven actuators: u is then
-        the value that is applied. Blocks with an input that has the name of the actuator, such as
-        observers, receive this value. A `Quantiser` acts first, then a `Saturation`, then others in
-        their order: `Hysteresis`, `Dropout`, or your own `Element`. `Jitter` shifts the instants of
-        reading or applying, and the blocks do not know the shift. On a disturbance, `Friction` (or
-        an `Element` with `reads`) is a force that reacts to a motion. A warning before the run
-        names a `Saturation` that the SetPoints exceed (force of an actuator, range of a sensor or
-        of the reference), with the required value.
+        Nonlinear elements by channel. On a channel of y, elements act before it is read. On a
+        driven actuator, they change the command, and u is the value that is applied. Blocks with an
+        input that has the name of the actuator, such as observers, receive this value. A
+        `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
+        `Dropout`, or your own `Element`. `Jitter` shifts the instants of reading or applying, which
+        the blocks do not know. On a disturbance, `Friction` (or an `Element` with `reads`) is a
+        force that reacts to a motion. If the SetPoints exceed a `Saturation`, a warning before the
+        run gives its name and the required value. A `Saturation` limits the force of an actuator,
+        or the range of a sensor or of the reference.
     anti_windup : float [s], optional
         Time constant of an anti-windup. While the applied value differs from the command, the
         integrators of blocks that drive actuators follow the applied value with this time constant.
-        All poles that are slower than it count as integrators.
+        A pole counts as an integrator if it is slower than this time constant.
     moving : mapping {POI or position: path}, optional
-        For a POI: its places (n_time, 3) [m] over time, or a function of the times that returns
-        them. Its channels in z are then those of its place at each sample. For a position of the
-        plant: its values [m or rad] over time, as a SetPoint (which may also be a reference), a
-        function, or an array (n_time,). All ports that belong to this position then move, and
-        forces move within each sample too.
+        Motion of POIs or positions during the run. For a POI it is its places (n_time, 3) [m] over
+        time, or a function of the times that returns them. Its channels in z are then those of its
+        place at each sample. For a position of the plant it is the values [m or rad] over time: a
+        SetPoint (which may also be a reference), a function, or an array (n_time,). All ports that
+        belong to this position then move. The places of forces also change within each sample.
     finer : int
-        Number of simulated samples of the plant in each sample of the controller, whose commands
-        are held. The response then also contains z between the samples of the controller. Noise and
-        elements act on the sensors at the samples of the controller; between them y is the motion
-        without noise. Given signals must then have values at the finer samples.
+        Number of simulated samples of the plant in each sample of the controller. The commands are
+        held meanwhile. The response then also contains z between the samples of the controller.
+        Noise and elements act on the sensors at the samples of the controller; between these
+        samples y is the motion without noise. Given signals must have values at the finer samples.
     noise : bool
         Whether the white noises of the plant act.
     rng : int, SeedSequence, Generator or None
-        Seed of the noises. Run i draws from its i-th child, so that it does not depend on the other
-        runs.
+        Seed of the noises. Run i has a separate seed, derived from this one, so that it does not
+        depend on the other runs.
     runs : int or sequence of int, optional
-        Number of runs, or numbers of the runs (from 0); the response then has an axis for them.
-        None: one run without that axis.
+        Number of runs, or numbers of the runs (from 0). The arrays of the response then have an
+        additional axis for the runs. With None there is one run without this axis.
     start : (n,) array, optional
-        State of the plant, or of plant and controller, at time 0; rest by default.
+        State of the plant, or of plant and controller, at time 0. By default the machine is at
+        rest.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal for work of more
+        than two seconds.
 
     Returns
     -------
     Response
-        All z, y, driven u and monitored outputs of blocks. A warning names actuators that steadily
-        push against each other at the end of a run with a reference or a disturbance, without
-        moving an axis of a POI.
+        All z, y, driven u and monitored outputs of blocks. After a run with a reference or a
+        disturbance, a warning names actuators that still push against each other without moving an
+        axis of a POI.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous or weighted, when u reaches y within a sample, or when white
-        noise would reach an output directly (its variance would be infinite); when a saturated
-        command depends on what is applied in the same sample.
+        When the plant is continuous or weighted, u reaches y within a sample, white noise would
+        reach an output directly (its variance would be infinite), or a saturated command depends on
+        the value that is applied in the same sample.
     LabelError
-        When a reference, a disturbance or the channel of an element is unknown, or it is not clear
-        which is meant.
+        When a reference, a disturbance or the channel of an element is unknown, or must be named.
     ModelError, ShapeError
         When a signal or the state has the wrong length, an element has a wrong type, integrators
         cannot be found from the commands, or the loop diverges beyond floating-point numbers.
@@ -442,26 +445,27 @@ _LONGER = 4
 def spectral_noise(
     asd: Density, *, rate: float, duration: float, runs: int | None = None, rng: Any = None
 ) -> FloatArray:
-    """Return Gaussian noise of a given spectrum, for `simulate(disturbance=)`.
+    """Return random Gaussian records with a given spectrum, for `simulate(disturbance=)`.
 
-    It can be the measured vibration of a floor, 1/f noise of a sensor or a slow drift. The noise is
-    a sum of sines (lines) of random amplitude and phase, ``E |X_k|^2 = asd(f_k)^2 rate n / 2``,
-    four times as dense as the record can resolve. Components slower than a quarter of a period in
-    the record, including the mean, are left out. Pass your own array for such a drift. Noise that
-    the controller design takes into account is specified in a port (`fx.plant.FirstOrder`,
-    `NarrowBand`, `RandomWalk`, a shape).
+    The noise can be the measured vibration of a floor, 1/f noise of a sensor or a slow drift. It is
+    a sum of sines of random amplitude and phase with ``E |X_k|^2 = asd(f_k)^2 rate n / 2``. X_k is
+    the discrete Fourier transform over n samples, where n is four times the length of the record.
+    Components slower than a quarter of a period in the record, including the mean, are left out.
+    Pass your own array for such a drift. Use ports (`fx.plant.FirstOrder`, `NarrowBand`,
+    `RandomWalk`, a shape) for noise that the controller design takes into account.
 
     Parameters
     ----------
     asd : function or (frequencies [Hz], densities)
-        One-sided amplitude spectral density [unit/sqrt(Hz)]. A function of an array of frequencies;
-        a measured one is interpolated on logarithmic scales, and is zero outside of its band.
+        One-sided amplitude spectral density [unit/sqrt(Hz)]. It is a function of an array of
+        frequencies, or a pair of arrays such as a measurement. The pair is interpolated on
+        logarithmic scales and is zero outside of its band.
     rate : float [Hz]
-        Rate of the samples: that of the plant, or `finer` times it.
+        Rate of the samples. It is the rate of the plant, or `finer` times this rate.
     duration : float [s]
         Duration of the record.
     runs : int, optional
-        Number of records. None: one record without that axis.
+        Number of records. With None there is one record without this axis.
     rng : int, SeedSequence, Generator or None
         Seed of the noise.
 
@@ -472,7 +476,7 @@ def spectral_noise(
     Raises
     ------
     ModelError, ShapeError
-        When a density is negative or not finite, frequencies do not rise, or a number is not
+        When a density is negative or not finite, frequencies do not increase, or a number is not
         positive.
 
     Examples

@@ -41,10 +41,10 @@ def _efforts(value: Any, name: str) -> float | dict[str, float]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Verdict(Value):
-    """Achieved values with the specified limits; prints as a table.
+    """Achieved values compared with the specified limits; prints as a table.
 
-    In a test: ``verdict = specification.check(loop, run)``, then
-    ``assert verdict.passed, str(verdict)``, whose message is the table.
+    `Specification.check` returns it. In a test write ``assert verdict.passed, str(verdict)``; if
+    the test fails, the message is the table.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ class Verdict(Value):
     values, limits : (n,) arrays
         Achieved and allowed values. An achieved value is NaN if it is not available.
     at_least : (n,) bool array
-        Whether the limit is a lower one.
+        Whether the limit is a lower limit.
     low, high : (n,) arrays, optional
-        Ends of each value's interval on 95 % of the machines that agree with the measurement; NaN
-        where no interval is stated.
+        Ends of the interval of each value. The interval holds on 95 % of the machines that agree
+        with the measurement. NaN where no interval is stated.
     sentences : sequence of n str, optional
-        The intervals in words, or the reason why there is none; empty where the plant of the loop
-        knows no such machines.
+        The intervals in words, or the reason why there is none. Texts are empty if the plant of the
+        loop knows no such machines.
 
     Examples
     --------
@@ -86,7 +86,7 @@ class Verdict(Value):
 
     @property
     def met(self) -> Any:
-        """Whether each requirement is met (n,); one without a value is not."""
+        """Whether each requirement is met (n,). A requirement without a value is not met."""
         above, below = self.values >= self.limits, self.values <= self.limits
         return np.where(self.at_least, above, below)
 
@@ -97,12 +97,13 @@ class Verdict(Value):
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """The requirements that are not met."""
+        """Names of the requirements that are not met."""
         return tuple(name for name, met in zip(self.names, self.met, strict=True) if not met)
 
     @property
     def met_on_machines(self) -> Any:
-        """Whether each requirement is met over its whole interval (n,); False without one."""
+        """Whether the whole interval of each requirement meets it (n,); False without an
+        interval."""
         if not self.sentences:
             return np.zeros(len(self.names), dtype=bool)
         above, below = self.low >= self.limits, self.high <= self.limits
@@ -165,7 +166,7 @@ def _stable(loop: ClosedLoop, known: PlantMachines) -> FigureInterval:
 
 @dataclass(frozen=True, eq=False)
 class Specification(Value):
-    """Limits for a closed loop and its runs; only given limits are checked.
+    """Limits for a closed loop and its runs. Only the limits that are given are checked.
 
     Parameters
     ----------
@@ -173,30 +174,30 @@ class Specification(Value):
         Largest moving average |MA| and moving standard deviation MSD of the error over the
         exposures (see `exposure_errors`).
     rms, peak : float, optional [m or rad]
-        Rms and largest magnitude of the error in the run, from `start` on.
+        Largest allowed rms and magnitude of the error in the run, from `start` on.
     settling : float, optional [s]
-        Largest time after `start` until |MA| (and MSD) stay within `ma` (and `msd`). If it is
-        given, the exposures begin at ``start + settling``.
+        Largest allowed time after `start` until |MA| (and MSD) stay within `ma` (and `msd`). If it
+        is given, the exposures begin at ``start + settling``.
     effort : float or mapping {actuator: float}, optional [N, N m]
-        Largest magnitude of a command, at any time of the run.
+        Largest allowed magnitude of a command, at any time of the run.
     noise : float, optional [m or rad]
-        Stationary rms of the error under the white noises, in closed form.
+        Largest allowed stationary rms of the error under the white noises, `ClosedLoop.rms`.
     bandwidth : float, optional [Hz]
-        Least bandwidth, at which |S| at u first crosses 0 dB.
+        Smallest allowed bandwidth. It is the frequency at which |S| at u first crosses 0 dB.
     modulus_margin : float, optional
-        Least modulus margin: the smaller of those with and without truncated modes, if these are
-        known.
+        Smallest allowed modulus margin. If truncated modes are known, the margin is checked with
+        and without them.
     channel : str, optional
         Channel of the error; by default the only one of the loop.
     window : float [s]
-        Window of MA and MSD.
+        Length of the window of MA and MSD.
     start : float [s]
-        End of the move; samples before it are not exposed.
+        End of the move. Samples before it do not belong to an exposure.
 
     Raises
     ------
     ModelError
-        When a limit is not positive, none is given, or `settling` comes without `ma`.
+        When a limit is not positive, no limit is given, or `settling` is given without `ma`.
 
     Examples
     --------
@@ -230,22 +231,23 @@ class Specification(Value):
             raise ModelError("settling is the time to reach ma (and msd): give ma as well.")
 
     def check(self, loop: ClosedLoop, run: _Run | None = None, *, exposures: Any = None) -> Verdict:
-        """Return the achieved values of a loop, on the machine or its model, and of a run.
+        """Return the achieved values of a loop and of its run, compared with the limits.
 
-        Where the plant of the loop knows the machines that agree with a measurement, each value has
-        its interval on 95 % of them.
+        If the plant knows the machines that agree with a measurement, each value gets an interval
+        that holds on 95 % of them.
 
         Parameters
         ----------
         loop : ClosedLoop
-            The loop.
+            Loop around a model, or around the machine.
         run : Response or callable, optional
-            Limits on errors and efforts need a Response, all runs of which are checked. A function
-            of a loop that returns a Response is accepted too:
-            ``lambda one: simulate(one, reference=move, duration=0.1)``. Only a function can be
-            repeated on other machines and therefore gives intervals.
+            Run of the loop; limits on errors and efforts need it. All runs of a Response are
+            checked. A function of a loop that returns a Response is accepted too: ``lambda one:
+            simulate(one, reference=move, duration=0.1)``. A function can be repeated on other
+            machines. Only then do the limits on errors and efforts get intervals.
         exposures : (k, 2) array [s], optional
-            As for `exposure_errors`; by default all after `start` (and `settling`).
+            Exposures, as for `exposure_errors`. By default the exposure begins at `start` (plus
+            `settling`).
         """
         instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
         done = run(loop) if callable(run) else run
