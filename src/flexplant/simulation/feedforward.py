@@ -93,7 +93,7 @@ class Feedforward(Value):
     def system(self) -> StateSpace:
         """The block from the set-point and its derivatives to the actuators.
 
-        It is static; with slow zeros it has two states for each of them.
+        Without slow zeros it is static. With them it has two states for each slow zero.
 
         Raises
         ------

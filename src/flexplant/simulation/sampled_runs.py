@@ -77,9 +77,9 @@ def simulate(
         `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
         `Dropout`, or your own `Element`. `Jitter` shifts the instants of reading or applying, which
         the blocks do not know. On a disturbance, `Friction` (or an `Element` with `reads`) is a
-        force that reacts to a motion. If the SetPoints exceed a `Saturation`, a warning before the
-        run gives its name and the required value. A `Saturation` limits the force of an actuator,
-        or the range of a sensor or of the reference.
+        force that reacts to a motion. If the SetPoints need more than a `Saturation` allows (force
+        of an actuator, range of a sensor or of the reference), a warning before the run gives its
+        name and the required value.
     anti_windup : float [s], optional
         Time constant of an anti-windup. While the applied value differs from the command, the
         integrators of blocks that drive actuators follow the applied value with this time constant.

@@ -102,8 +102,7 @@ class Verdict(Value):
 
     @property
     def met_on_machines(self) -> Any:
-        """Whether the whole interval of each requirement meets it (n,); False without an
-        interval."""
+        """Whether the whole interval meets each requirement (n,); False without an interval."""
         if not self.sentences:
             return np.zeros(len(self.names), dtype=bool)
         above, below = self.low >= self.limits, self.high <= self.limits

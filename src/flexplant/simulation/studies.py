@@ -48,50 +48,54 @@ def study(
     progress: bool | None = None,
     key: str = "",
 ) -> StudyTable:
-    """Return the results of a pipeline for each machine, as a table.
+    """Return a table with the results of a pipeline, which is run for each machine.
 
-    A machine whose pipeline raises, exits or does not return a row gets a row with the reason, and
-    the others continue. The table is equal to the last bit for every executor: seeds belong to
-    machines, and linear algebra uses one thread.
+    If the pipeline of a machine raises an error, exits or does not return a row, the row of this
+    machine contains the reason, and the other machines continue. The table is equal to the last bit
+    for every executor, because each machine has its own seed and linear algebra uses one thread.
 
     Parameters
     ----------
     machines : sequence
-        Values that differ between rows: virtual machines, measurements, parameters.
+        Inputs of the pipeline, one for each row: virtual machines, measurements or parameters.
     pipeline : callable
-        ``pipeline(machine)``, or ``pipeline(machine, generator)`` when rng is given; returns a
-        mapping {column: number, truth or text}. For a process pool it must be picklable: a function
-        of a module, or a `functools.partial` of one. `examples/fleet.py` has the usual chain.
+        Function called as ``pipeline(machine)``, or as ``pipeline(machine, generator)`` when rng is
+        given. It returns a mapping {column: number, truth value or text}. A process pool must be
+        able to pickle it: it is a function of a module, or a `functools.partial` of one.
+        `examples/fleet.py` has the usual chain.
     executor : concurrent.futures.Executor, optional
         A process pool, `dask.distributed`'s `Client.get_executor()`, or an executor of
         `mpi4py.futures`. With None the machines are computed one after another in this process.
-        When a process of a pool dies, its machines are tried again one by one, and a machine whose
-        process dies again fails; the rest continues in a new pool with the same settings (context,
-        initializer).
+        When a process of a pool dies, its machines are tried again one by one. A machine whose
+        process dies again gets a row with the reason. The others continue in a new pool with the
+        same settings (context, initializer).
     checkpoint : path, optional
-        File that stores each finished row. With an existing file the study continues where it was
-        stopped, also after being killed: machines in the file are not computed again. The file
-        belongs to the values of the machines, to the name of the pipeline with the arguments of a
+        File that stores each finished row. With an existing file, an interrupted study continues:
+        machines in the file are not computed again. The file is only accepted for the same values
+        of the machines, the same name of the pipeline (with the arguments of a partial) and the
+        same `key`.
         partial, and to `key`; another file is refused.
     rng : int, SeedSequence or Generator, optional
-        Seed from which a seed is spawned for each machine.
+        Seed from which a separate seed is derived for each machine.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal for work of more
+        than two seconds.
     key : str
-        Name of this study in its checkpoint. The code of the pipeline is not compared: give another
-        key when you change it.
+        Name of this study in its checkpoint. The code of the pipeline is not compared. Therefore
+        give another key when you change the code.
 
     Returns
     -------
     StudyTable
-        A mapping of arrays by column, in the order of the machines. Values that only some rows have
-        are missing in the others (NaN, False or ""), with a warning.
+        Mapping from each column to an array, in the order of the machines. If only some rows have a
+        column, its entries in the others are NaN, False or "", and a warning is given.
 
     Raises
     ------
     ModelError
-        When `machines` is empty, the pipeline cannot be called, it does not return a mapping of
-        numbers, truths and texts for the first machine, or the checkpoint belongs to another study.
+        When `machines` is empty, the pipeline cannot be called, its result for the first machine is
+        not a mapping of numbers, truth values and texts, or the checkpoint belongs to another
+        study.
     FlexplantError
         When the checkpoint cannot be written, or another study is writing to it.
 
@@ -194,17 +198,18 @@ _PLAIN: dict[type, Any] = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
-    """Results by column, ``table["MA"]`` of shape (n_machines,); ``pandas.DataFrame(dict(table))``.
+    """Results of a study by column. ``table["MA"]`` is an array of shape (n_machines,).
 
-    Where a machine failed or lacks a column, numbers are NaN, texts empty and truths False; the
-    column "failed" holds the reason, empty otherwise.
+    ``pandas.DataFrame(dict(table))`` makes a data frame. If a machine failed or lacks a column, its
+    numbers are NaN, its texts are empty and its truth values are False. The column "failed" holds
+    the reason of a failure, and is empty otherwise.
 
     Parameters
     ----------
     columns : mapping {str: (n,) array}
-        Columns of numbers, truths or texts.
+        Columns of numbers, truth values or texts.
     failed : sequence of str
-        Reason why a machine has no results; "" if it has results.
+        Reason why each machine has no results; "" if it has results.
     """
 
     columns: Mapping[str, npt.NDArray[Any]]
@@ -304,14 +309,17 @@ Estimator = KalmanEstimator | StaticEstimator
 class EstimatorComparison(Value):
     """Predicted and measured rms errors of several estimators; prints as a table.
 
+    This is the result of `compare_estimators`.
+
     Parameters
     ----------
     channel : str
-        Estimated motion.
+        Name of the estimated motion.
     names : sequence of str
         Names of the estimators.
     errors : (n, 4) array [m or rad]
-        Predicted and measured errors, and the ends of the confidence interval of the measured ones.
+        Four columns: the predicted error, the measured error, and the lower and upper end of the
+        confidence interval of the measured error.
     level : float
         Probability of the interval.
     """
@@ -338,13 +346,13 @@ class EstimatorComparison(Value):
 
 
 def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
-    """Return estimators as blocks of a loop that receive its signals and drive nothing.
+    """Return estimators as blocks that read the signals of a loop but do not influence it.
 
     Parameters
     ----------
     designs : mapping {name: KalmanEstimator or StaticEstimator}
-        Estimators by the name of the design. The name precedes the channel of each estimate:
-        `updated|die:hat` for a design "updated".
+        Estimators by name. The names of their estimates begin with this name: the design "updated"
+        gives `updated|die:hat`.
 
     Returns
     -------
@@ -379,16 +387,16 @@ def compare_estimators(
     start: float = 0.0,
     level: float = 0.95,
 ) -> EstimatorComparison:
-    """Return predicted errors of estimators with those measured in runs of a machine.
+    """Return the predicted errors of estimators, and the errors measured in runs of a machine.
 
     Parameters
     ----------
     designs : mapping {name: KalmanEstimator or StaticEstimator}
-        As given to `reading_along`.
+        Estimators by name, the same as for `reading_along`.
     run : Response
-        Several runs of a loop that contains the estimators, with the motion of the POI.
+        Two or more runs of a loop that contains the estimators and the motion of the POI.
     channel : str
-        The motion at the POI, `die:z`.
+        Motion of the POI (point of interest) that is estimated, such as `die:z`.
     start : float [s]
         Start time; earlier samples (transients) are left out.
     level : float
