@@ -74,7 +74,6 @@ def study(
         machines in the file are not computed again. The file is only accepted for the same values
         of the machines, the same name of the pipeline (with the arguments of a partial) and the
         same `key`.
-        partial, and to `key`; another file is refused.
     rng : int, SeedSequence or Generator, optional
         Seed from which a separate seed is derived for each machine.
     progress : bool, optional

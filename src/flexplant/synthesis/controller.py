@@ -33,7 +33,7 @@ from .preparation import Prepared
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Controller(Value):
-    """A controller with named channels and what was verified about it.
+    """A controller with named channels, and the numbers that verify it.
 
     Parameters
     ----------
@@ -43,12 +43,12 @@ class Controller(Value):
     method : str
         Method of the design.
     gamma : float, optional
-        Verified upper bound on the norm of the closed loop from w to z: the H-infinity norm, or for
-        `design_h2` the H2 norm. The pages of other designs, such as `design_mu`, say what their
-        gamma is.
+        Verified upper bound on the norm of the closed loop from w to z. It is the H-infinity norm,
+        or for `design_h2` the H2 norm. Other designs, such as `design_mu`, define gamma on their
+        page.
     lower : float, optional
-        Lower bound on this norm for all controllers: no controller reaches a smaller norm. The page
-        of the design method states the conditions.
+        Lower bound on this norm for all controllers. No controller reaches a smaller norm under the
+        conditions that the page of the design states.
     certificate : Certificate
         Numbers that verify the design by a second computation.
     reached : Certificate
@@ -60,15 +60,15 @@ class Controller(Value):
         Truncated modes are modes that the design model leaves out.
     tolerances : ModeTolerances, optional
         For an uncertain plant, the error of each modal frequency at which the loop becomes
-        unstable, compared with the uncertainty of this frequency. It also has the results on
-        machines that are drawn at random from the uncertainty.
+        unstable, compared with the uncertainty of this frequency. Results on machines that are
+        drawn at random from the uncertainty are included.
     notes : sequence of str
         Remarks, such as what the certificate does not cover.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
-        For `design_structured`: the given structure, with the parameters found.
+        Only for `design_structured`: the given structure, with the parameters found.
     tried : Certificate
-        Attempts of the design in the order in which they were made, each with its gamma. The gamma
-        of an attempt that failed is infinite.
+        Attempts of the design in their order, each with its gamma. For an attempt that failed,
+        gamma is infinite.
 
     Examples
     --------

@@ -26,43 +26,47 @@ from .structured.judges import require_finite_h2
 def design_h2(
     plant: AnyPlant | System, *, u: Sequence[str] | None = None, y: Sequence[str] | None = None
 ) -> Controller:
-    """Return the controller ``u = K y`` with the least H2 norm from w to z (rms of z for white w).
+    """Return the controller ``u = K y`` with the smallest H2 norm from w to z.
+
+    For white noise w of unit intensity, this norm is the rms of z.
 
     The plant is ``dx/dt = A x + B1 w + B2 u``, ``z = C1 x + D11 w + D12 u``, ``y = C2 x + D21 w +
-    D22 u``. X is the solution of the Riccati equation of control, and F its gain. Y is the solution
-    of the Riccati equation of estimation. The matrix R is ``D12' D12``, for a sampled plant ``D12'
-    D12 + B2' X B2``. The square of the least norm is::
+    D22 u``. X and F are the solution and the gain of the Riccati equation of control. Y is the
+    solution of the Riccati equation of estimation. The matrix R is ``D12' D12`` for a continuous
+    plant, and ``D12' D12 + B2' X B2`` for a sampled one. The square of the smallest norm is::
 
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
-    L0 and S are needed only for a sampled plant; L0 is zero for a continuous one. A sampled plant
-    is solved by the discrete-time equations, and u at a sample depends on y of the same sample. The
-    norm is computed a second time from the Gramians of the closed loop. Both results must agree.
+    L0, F0 and S are needed only for a sampled plant; for a continuous one L0 is zero. A sampled
+    plant is solved by the discrete-time equations. The command u at a sample depends on y of the
+    same sample. The norm is computed a second time from the Gramians of the closed loop, and both
+    results must agree.
 
     Parameters
     ----------
     plant : StandardPlant
-        Continuous or sampled. A labelled StateSpace (ours or python-control's) serves too.
+        Continuous or sampled plant. A StateSpace with named channels (also of python-control) is
+        accepted.
     u, y
-        As for `design_hinf`, with its warning of truncated modes.
+        As for `design_hinf`. Truncated modes give the same warning as there.
 
     Returns
     -------
     Controller
-        Controller whose `gamma` is the H2 norm of the closed loop. `lower` is the least norm by the
-        formula above; it is None if noise or effort had to be added (see Notes). `certificate`
+        Controller whose `gamma` is the H2 norm of the closed loop. `lower` is the smallest norm by
+        the formula above; it is None if noise or effort had to be added (see Notes). `certificate`
         holds the checks. `left_out` holds the check with the truncated modes, which the design
         model leaves out.
 
     Raises
     ------
     AssumptionError
-        When w acts directly on z in a continuous plant (infinite norm), or an undamped mode is not
-        seen by y, reached by u, seen by z or excited by w.
+        When w acts directly on z in a continuous plant, so that the norm is infinite. Also when an
+        undamped mode is not seen by y, reached by u, seen by z or excited by w.
     InfeasibleError, SolverError
-        When the norm of a singular problem falls to zero together with the added noise and effort,
-        or no stabilising controller was found.
+        When no stabilising controller was found. Also when noise or effort was added and the norm
+        falls to zero together with them.
     CertificateError
         When the closed loop is not stable or its norm is not that of the formula.
     ModelError
@@ -71,17 +75,17 @@ def design_h2(
     Notes
     -----
     LQG is a special case of this design. Its cost is ``x' Q x + u' R u``. Its white noises have the
-    intensity W (process) and V (sensors); for a sampled plant W and V are covariances. The channels
-    of LQG are ``z = [Q^(1/2) x; R^(1/2) u]`` and ``w = [process; sensor]``, with ``B1 = [W^(1/2),
-    0]`` and ``D21 = [0, V^(1/2)]``. On an assembled plant, the method `weighted` makes both. The
-    weight of each channel of w is the size of its noise: asd / sqrt(2) for a continuous plant and
-    asd / sqrt(2 dt) for a sampled one, where asd is the amplitude spectral density. The weight of
-    each channel of z is one over the allowed rms of the motion or effort.
+    intensities W (process) and V (sensors); for a sampled plant W and V are covariances. The
+    channels of LQG are ``z = [Q^(1/2) x; R^(1/2) u]`` and ``w = [process; sensor]``, with ``B1 =
+    [W^(1/2), 0]`` and ``D21 = [0, V^(1/2)]``. For an assembled plant, the method `weighted` makes w
+    and z. The weight of each channel of w is the size of its noise, where asd is its amplitude
+    spectral density: asd / sqrt(2) for a continuous plant and asd / sqrt(2 dt) for a sampled one.
+    The weight of each channel of z is one over the allowed rms of the motion or effort.
 
-    If D12 or D21 does not have full rank, a little noise of each sensor is added to w, and a little
-    effort of each actuator to z, as for `design_hinf`. Both are lowered until the norm hardly
+    If D12 or D21 does not have full rank, a small noise of each sensor is added to w, and a small
+    effort of each actuator to z, as for `design_hinf`. Both are reduced until the norm hardly
     changes. If w does not excite an undamped mode, a small disturbance at u is added to w. If z
-    does not observe one, a small multiple of y is added to z.
+    does not observe an undamped mode, a small multiple of y is added to z.
 
     References
     ----------

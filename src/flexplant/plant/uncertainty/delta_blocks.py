@@ -22,14 +22,14 @@ _PHASES = (0.1, 10.0)
 
 @dataclass(frozen=True, eq=False)
 class RepeatedScalar(Value):
-    """An uncertain block ``w = delta z`` whose number delta is the same in all its channels.
+    """An uncertain block ``w = delta z``. The same number delta multiplies all its channels.
 
     Parameters
     ----------
     size : int
-        Number of channels z that are multiplied by delta.
+        Number of channels of z, which is also that of w.
     real : bool
-        Whether delta is a real number (a parameter) or a complex one.
+        Whether delta is a real number (a parameter). Otherwise it is a complex number.
     name : str
         Name of the uncertainty in results and messages.
 
@@ -46,23 +46,23 @@ class RepeatedScalar(Value):
 
     @property
     def w(self) -> int:
-        """Number of its outputs."""
+        """Number of outputs."""
         return self.size
 
     @property
     def z(self) -> int:
-        """Number of its inputs."""
+        """Number of inputs."""
         return self.size
 
 
 @dataclass(frozen=True, eq=False)
 class FullBlock(Value):
-    """An uncertain block ``w = Delta z`` with any complex matrix Delta: unknown dynamics.
+    """An uncertain block ``w = Delta z`` for unknown dynamics. Delta is any complex matrix.
 
     Parameters
     ----------
     w, z : int
-        Number of outputs w of Delta, which drive the plant, and number of inputs z of Delta.
+        Number w of the outputs of Delta, which drive the plant, and number z of its inputs.
     name : str
         Name of the uncertainty in results and messages.
 

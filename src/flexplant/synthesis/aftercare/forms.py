@@ -294,15 +294,15 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     Returns
     -------
     mapping {(output, input): (k, 6) array}
-        Rows [b0, b1, b2, 1, a1, a2], as `scipy.signal.sosfilt` takes them; the first row has the
-        gain.
+        Rows [b0, b1, b2, 1, a1, a2], in the format of `scipy.signal.sosfilt`. The first row
+        contains the gain of the channel.
 
     Raises
     ------
     CertificateError
-        When the sections differ from the channel by more than 1e-6 of its largest gain. An example
-        is a pole that is so slow compared with the sampling rate that rounding of the coefficients
-        moves it.
+        When the sections differ from the channel by more than 1e-6 of its largest gain. This
+        happens, for example, if a pole is very slow compared with the sampling rate: rounding of
+        the coefficients then moves it.
     ModelError
         When the controller is continuous.
 
@@ -392,22 +392,22 @@ _LARGEST = 1e8
 
 
 def anti_windup_form(controller: Any, *, recovery: float | None = None) -> StateSpace:
-    """Return the controller with the applied u as inputs, unchanged until an actuator saturates.
+    """Return an anti-windup form of a controller, with the applied commands as additional inputs.
 
     ::
 
         x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
 
     Here u is the command of the controller and u_applied is the command that the actuators really
-    apply. If both are equal, this system equals the controller. When an actuator saturates, the
-    term with L corrects the states, so that they agree with the applied command. The poles of A - L
-    C determine how fast this correction acts.
+    apply. As long as both are equal, this system equals the controller. When an actuator saturates,
+    the term with L corrects the states, so that they agree with the applied command. The poles of
+    ``A - L C`` determine how fast this correction acts.
 
     By default, ``L = B D^-1`` (the form of Hanus). The poles of A - L C are then the zeros of the
-    controller. If `recovery` is given, L moves only those poles of the controller that decay more
-    slowly than this time constant, such as integrators. They get this time constant and keep their
-    frequency. The other poles do not change. For a PI controller this is the well-known
-    back-calculation with `recovery` as its tracking time.
+    controller. If `recovery` is given, L moves only the poles of the controller that decay more
+    slowly than this time constant, such as integrators. These poles get this time constant and keep
+    their frequency. The other poles do not change. For a PI controller this is the well-known
+    back-calculation, with `recovery` as its tracking time.
 
     Parameters
     ----------
@@ -419,16 +419,17 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     Returns
     -------
     StateSpace
-        System whose inputs are y and the applied commands, and whose outputs are the commands u. If
-        it is given to `close_loop` as a block, the applied commands are connected to it.
+        System whose inputs are those of the controller and then the applied commands. Its outputs
+        are the commands u. `close_loop` takes it as a block and connects the applied commands.
 
     Raises
     ------
     AssumptionError
-        When Hanus' form needs the inverse of a D that is singular, or its poles (the zeros of the
-        controller) are not stable: give a recovery time.
+        When D is singular, so that Hanus' form has no inverse of it. Also when the zeros of the
+        controller, which are the poles of this form, are not stable. Give a recovery time in both
+        cases.
     ModelError
-        When slow states do not appear in the commands, so that the commands cannot correct them.
+        When slow states do not act on the commands, so that commands cannot correct them.
 
     References
     ----------

@@ -77,40 +77,39 @@ class _FactoredController(NamedTuple):
 def reduce_controller(
     plant: AnyPlant | System, controller: Any, *, order: int | None = None, loss: float = 0.1
 ) -> Controller:
-    """Return a controller of fewer states that keeps the closed loop, or raise an error.
+    """Return a controller of fewer states whose closed loop is nearly the same.
 
     The controller K is written as ``K = N M^-1``, a normalised right coprime factorisation: N and M
     are stable even if K is not. The states of ``[N; M]`` are reduced by weighted balanced
     truncation. This changes the factors by the errors dN and dM. The loop of K with the plant P
-    stays stable if the following system, with the weight W, has an H-infinity norm below one::
+    stays stable if the weighted error has an H-infinity norm below one. With the weight W it is::
 
         W [dN; dM],   W = (M - P N)^-1 [P, -I]
 
     This condition (the small-gain theorem) is sufficient, but not necessary. The loop with the
     reduced controller is therefore computed in any case. An error is raised if this loop is
-    unstable, or if it loses more of its modulus margin than `loss` allows. For a weighted plant,
-    gamma (the H-infinity norm from w to z) may grow by at most `loss`, and the margin is not
-    limited.
+    unstable, or if it loses more of its modulus margin than `loss` allows. If the plant is
+    weighted, gamma (the H-infinity norm from w to z) is compared instead of the margin, and may
+    grow by at most `loss`.
 
     Parameters
     ----------
     plant : StandardPlant
-        Plant of the design, continuous or sampled like the controller. If it is weighted, gamma is
-        compared instead of the margin.
+        Plant of the design, weighted or not. It is continuous or sampled, like the controller.
     controller : StateSpace or Controller
-        Controller from y to u; its integrators and unstable poles are kept.
+        Controller from y to u. Its integrators and unstable poles are kept.
     order : int, optional
-        Largest number of states of the result, which may have fewer. By default the smallest number
-        with which the loop stays stable and the loss is allowed.
+        Largest number of states of the result, which may have fewer. By default it is the smallest
+        number with which the loop stays stable and the loss is allowed.
     loss : float
-        Allowed relative loss of the modulus margin (one over the largest singular value of the
-        sensitivity S), or allowed relative growth of gamma.
+        Allowed relative loss of the modulus margin, or allowed relative growth of gamma. The
+        modulus margin is one over the largest singular value of the sensitivity S.
 
     Returns
     -------
     Controller
         Reduced controller. The certificate holds the margin, gamma and the stability of the loop
-        before and after the reduction, and the weighted error of the factors (the norm above).
+        before and after the reduction. It also holds the weighted error of the factors.
 
     Raises
     ------
@@ -320,12 +319,12 @@ def stable_before(plant: AnyPlant, controller: StateSpace) -> Any:
 def discretise_controller(
     plant: AnyPlant, controller: Any, *, prewarp: float | None = None, loss: float = 0.5
 ) -> Controller:
-    """Return a continuous controller sampled at the rate of a plant, with the margin of its loop.
+    """Return a continuous controller sampled at the rate of a plant. Its loop is verified.
 
     The method is bilinear (Tustin). If `prewarp` is given, the response at this frequency is kept.
-    The sampled controller is closed with the sampled and delayed plant, and the modulus margin of
-    this loop is compared with that of the continuous loop. The loss of margin therefore includes
-    the effect of the delay. A controller that is designed for the sampled plant loses less margin.
+    The modulus margin of the loop with the sampled and delayed plant is compared with that of the
+    continuous loop. The loss of margin therefore includes the effect of the delay. A controller
+    that is designed for the sampled plant loses less margin.
 
     Parameters
     ----------
@@ -336,8 +335,8 @@ def discretise_controller(
     prewarp : float [Hz], optional
         Frequency at which the response is kept, such as that of a notch or of the crossover.
     loss : float
-        Allowed relative loss of the modulus margin, which is one over the largest singular value of
-        the sensitivity S.
+        Allowed relative loss of the modulus margin. The modulus margin is one over the largest
+        singular value of the sensitivity S.
 
     Returns
     -------

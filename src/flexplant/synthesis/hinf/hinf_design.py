@@ -45,70 +45,71 @@ def design_hinf(
     damped_below: float = 0.0,
     progress: bool | None = None,
 ) -> Controller:
-    """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
+    """Return a controller ``u = K y`` that keeps the H-infinity norm from w to z small.
 
     The H-infinity norm is the largest gain over all frequencies. Weights on w and z define how
-    large it may be in each channel. For a stage the weights follow from a bandwidth: ``weights =
-    fx.stage_weights(plant, 60.0)``, then ``K = fx.design_hinf(plant.weighted(z=weights.z,
-    w=weights.w))``; if `K.gamma` is below 1, all their requirements are satisfied.
-    `mixed_sensitivity` builds a plant from weights of S, KS and T. Two checks are made on the
-    closed loop in the original channels: it must be stable, and its norm is computed by two
-    methods. ``fx.close_loop(plant, K)`` returns the closed loop. The page `algorithms` describes
-    the method.
+    large it may be in each channel. For a stage, `stage_weights` computes the weights from a
+    bandwidth: ``weights = fx.stage_weights(plant, 60.0)``. The design is then ``K =
+    fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``. If `K.gamma` is below 1, all
+    requirements of the weights are satisfied. `mixed_sensitivity` builds a plant from weights of S,
+    KS and T. Two checks are made on the closed loop in the original channels: it must be stable,
+    and its norm is computed by two methods. ``fx.close_loop(plant, K)`` returns the closed loop.
+    The page `algorithms` describes the method.
 
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant or mapping {position: StandardPlant}
-        Plant, usually weighted; continuous or sampled. For a moving machine, a mapping by position,
-        ``{x: plant.at(x=x) for x in places}``. One controller for all positions is then designed on
-        the mean plant; additional channels of w and z represent the change with position. `gamma`
-        is the largest norm of all positions. The certificate contains the norms at each position
-        and half way between them. A StateSpace (also of python-control) is accepted if its channels
-        are named as in a StandardPlant, or if u and y are given.
+        Continuous or sampled plant, usually weighted. For a moving machine, give a mapping by
+        position, ``{x: plant.at(x=x) for x in places}``. One controller for all positions is then
+        designed on the mean plant. Additional channels of w and z represent the change with
+        position. `gamma` is the largest norm of all positions. The certificate contains the norms
+        at each position and half way between them. A StateSpace (also of python-control) is
+        accepted if its channels are named as in a StandardPlant, or if u and y are given.
     method : Riccati or Lmi, optional
-        Method of the synthesis. By default `Riccati()`. It needs full rank of D12, the feedthrough
+        Method of the synthesis, by default `Riccati()`. It needs full rank of D12, the feedthrough
         from u to z, and of D21, the feedthrough from w to y. If D12 does not have full rank, it
-        adds a small weight of u; if D21 does not, a small sensor noise. If w does not excite an
-        undamped mode, it adds a small disturbance at the actuators; if z does not observe one, it
-        adds a small multiple of the sensors to z. `Lmi()` finds gamma by a semidefinite program and
-        is suitable for up to 20 states.
+        adds a small weight of u; if D21 does not, it adds a small sensor noise. If w does not
+        excite an undamped mode, it adds a small disturbance at the actuators. If z does not observe
+        an undamped mode, it adds a small multiple of the sensors to z. `Lmi()` finds gamma by a
+        semidefinite program and is suitable for up to 20 states.
     bandwidth : float [Hz], optional
-        Bandwidth for a stage without weights: those of `stage_weights` are used, and the POI must
-        have one reference. `design_stage` finds the largest possible bandwidth.
+        Bandwidth of a stage whose plant has no weights. The weights are then those of
+        `stage_weights`, and the POI (point of interest) must have one reference. `design_stage`
+        finds the largest possible bandwidth.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
         Uncertainty of the plant before it was weighted, such as
-        ``plant.uncertain(frequency=0.005)``. The loop shall remain stable for all its modal
-        frequencies. Not needed if `plant` is an UncertainPlant. Each mode gets an additional
-        channel through which a change of its frequency acts. The structured singular value mu
-        measures how near the uncertainty comes to an unstable loop (see `mu`). Changes of
-        frequencies are real numbers, and the scaling matrix G of mu uses this; the channel includes
-        it. The size of the channel is found in a first design. `gamma` then includes these
-        channels, and a value above 1 is not a failure. The entry ``all frequencies at once`` of
-        `certificate` is an upper bound on mu over a frequency grid. If it is below 1, no plant of
-        the uncertainty has a closed-loop pole at a frequency of the grid.
+        ``plant.uncertain(frequency=0.005)``. It is not needed if `plant` is an UncertainPlant. The
+        design then aims at a loop that remains stable for all modal frequencies of the uncertainty.
+        Each mode gets an additional channel through which a change of its frequency acts. The
+        structured singular value mu measures how near the uncertainty comes to an unstable loop
+        (see `mu`). The channel includes the scaling matrix G of mu, because changes of frequencies
+        are real numbers. The size of the channel is found in a first design. `gamma` then includes
+        these channels, and a value above 1 is not a failure. The entry ``all frequencies at once``
+        of `certificate` is an upper bound on mu over a frequency grid. If it is below 1, no plant
+        of the uncertainty has a closed-loop pole at a frequency of the grid.
         ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
     damped_below : float [Hz]
         Frequency below which the controller actively damps uncertain modes that actuators excite.
-        Their channels then represent frequency errors of 1 % and errors of their mode shapes.
-        `design_stage` uses 3.5 times the bandwidth.
+        The channels of these modes then represent frequency errors of 1 % and errors of their mode
+        shapes. `design_stage` uses 3.5 times the bandwidth.
     progress : bool, optional
-        Whether to show a progress bar of the method's steps. None: on a terminal or in a
-        notebook, for work of more than two seconds.
+        Whether to show a progress bar of the method's steps. By default (None) it is shown on a
+        terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
     Controller
-        Controller. `gamma` is the verified norm, and `lower` is a lower bound on the norm for all
-        controllers. `certificate` holds the checks. `reached` holds the norm from each group of
+        The controller. `gamma` is the verified norm, and `lower` is a lower bound on the norm for
+        all controllers. `certificate` holds the checks. `reached` holds the norm from each group of
         channels of w to each group of channels of z. `left_out` holds the check with the truncated
         modes, which the design model leaves out.
 
     Raises
     ------
     AssumptionError
-        When an assumption of the method fails; the message names it in physical terms.
+        When an assumption of the method fails. The message names it in physical terms.
     InfeasibleError, SolverError
         When no stabilising controller was found, or gamma can be made arbitrarily small.
     CertificateError

@@ -53,36 +53,36 @@ Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Riccati(Value):
-    """Synthesis by the two Riccati equations of Glover and Doyle; bisection finds gamma.
+    """H-infinity synthesis by the Riccati equations of Glover and Doyle. A bisection finds gamma.
 
     Gamma is the bound on the H-infinity norm from w to z. A value of gamma counts as reached only
-    if the closed loop of its controller is stable and has all gains below gamma. The controller is
-    computed for a gamma `back_off` above the smallest one, because the controller of the smallest
-    gamma has very fast poles and is badly conditioned. The lower bound is the largest gamma for
-    which a proof exists that no controller reaches it. It is not the largest gamma for which the
-    computation failed.
+    if the closed loop of its controller is stable and has all gains below gamma. The controller of
+    the smallest gamma has very fast poles and is badly conditioned. Therefore the controller is
+    computed for a gamma that is larger by `back_off`. The lower bound is the largest gamma for
+    which it is proven that no controller reaches it. A failed computation alone does not count as a
+    proof.
 
     The equations make two assumptions. First, the feedthrough D12 from u to z and the feedthrough
     D21 from w to y have full rank. Second, w excites and z observes every mode on the stability
-    boundary (undamped modes). If a rank is missing, a little noise on each sensor and a little
-    effort of each actuator are added, at most 1e-3 of the plant's own signals at the speed of its
-    loop. If w or z misses an undamped mode, a small disturbance at the actuators is added to w, and
-    a small multiple of the sensors is added to z. A mode counts as undamped if its decay rate is
-    less than 1e-6 of that speed, or less than 1e-2 if several such modes lie close together. The
-    loop is verified without these additions. The notes state what was added and what it costs in
-    gamma.
+    boundary (undamped mode). If a rank is missing, a small noise on each sensor and a small effort
+    of each actuator are added. They are at most 1e-3 of the plant's own signals at the speed of its
+    loop. If w does not excite an undamped mode, a small disturbance at the actuators is added to w.
+    If z does not observe one, a small multiple of the sensors is added to z. A mode counts as
+    undamped if its decay rate is less than 1e-6 of the speed of the loop, or less than 1e-2 if
+    several such modes lie close together. The loop is verified without these additions. The notes
+    of the controller state what was added and how much gamma increases by it.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. By default 0.5 % if D12 and D21 have full
-        rank (0.3 % if something is added for a missed mode, or to a tiny effort or noise), and 5 %
-        otherwise.
+        Relative distance from the smallest gamma found. If D12 and D21 have full rank, it is 0.5 %
+        by default, or 0.3 % if something is added for an undamped mode or to a tiny effort or
+        noise. Otherwise it is 5 % by default.
     tolerance : float
-        Relative width at which the bisection stops.
+        Relative width of the interval of gamma at which the bisection stops.
     progress : bool, optional
-        Whether to show a progress bar of the bisection. None: on a terminal or in a
-        notebook, for work of more than two seconds.
+        Whether to show a progress bar of the bisection. By default (None) it is shown on a terminal
+        or in a notebook, for work of more than two seconds.
 
     References
     ----------
@@ -107,7 +107,8 @@ class Riccati(Value):
         Raises
         ------
         InfeasibleError
-            When gamma can approach its lower limit only with infinite gains of the controller.
+            When gamma approaches its smallest value only if the gains of the controller become
+            infinite.
         SolverError
             When the plant is so badly conditioned that no stabilising controller is found in double
             precision.

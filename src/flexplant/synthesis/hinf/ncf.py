@@ -51,17 +51,16 @@ def design_ncf(
 
     The plant G is first shaped by filters: ``G_s = after G before``. The shaped plant is written as
     ``G_s = M^-1 N`` with normalised left coprime factors M and N, which are stable. The controller
-    K_s stabilises G_s and also every plant ``(M + dM)^-1 (N + dN)`` whose errors dM and dN are
-    stable and satisfy ``|[dN, dM]| < 1 / gamma``. The bound gamma is::
+    K_s stabilises G_s. It also stabilises every plant ``(M + dM)^-1 (N + dN)`` whose errors dM and
+    dN are stable and satisfy ``|[dN, dM]| < 1 / gamma``. The bound gamma is::
 
         gamma_min = (1 + lambda_max(X Z))^(1/2),   gamma = (1 + back_off) gamma_min
 
-    Here X and Z are the solutions of the two Riccati equations of G_s. The smallest value gamma_min
-    is known from them, so that no search is needed. The result is ``K = before K_s after``. A
+    Here X and Z are the solutions of the two Riccati equations of G_s. They give the smallest value
+    gamma_min directly, so that no search is needed. The result is ``K = before K_s after``. A
     sampled plant is mapped to continuous time by the bilinear transformation, and the controller is
-    mapped back. This keeps
-    the H-infinity norms and the normalisation of the factors. Rigid-body modes and
-    integrators are allowed in the plant and in `before` and `after`.
+    mapped back. This keeps the H-infinity norms and the normalisation of the factors. Rigid-body
+    modes and integrators are allowed in the plant and in `before` and `after`.
 
     Parameters
     ----------
@@ -69,28 +68,29 @@ def design_ncf(
         Plant G. For a StandardPlant, the channels from u to y are used.
     before, after : StateSpace or array, optional
         Shaping filters at u and at y, with the sampling time of the plant. They give the loop gain
-        its slope. They may also transform to decoupled axes: `decouple` returns the matrices
-        `accelerations` (for `before`) and `to_motions` (for `after`).
+        its slope. They may also transform to decoupled axes. For this, `decouple` returns the
+        matrices `accelerations` (for `before`) and `to_motions` (for `after`).
     bandwidth : float [Hz], optional
-        Bandwidth of every channel. ``after G before`` must be square; each of its channels is
-        multiplied by ``k (1 + w / (10 s))`` with w = 2 pi bandwidth, and k makes its gain 1 at the
-        bandwidth.
+        Bandwidth of every channel. ``after G before`` must be square. Each of its channels is
+        multiplied by ``k (1 + w / (10 s))`` with w = 2 pi bandwidth. The factor k makes the gain of
+        the channel 1 at the bandwidth.
     back_off : float
-        Relative distance of gamma from gamma_min. It must be positive, because the formula for K_s
+        Relative distance of gamma from gamma_min. It must be positive, because the formula of K_s
         has a singular matrix at gamma_min.
 
     Returns
     -------
     Controller
-        `gamma` is the verified norm, and `lower` is gamma_min. The certificate holds the margin 1 /
-        gamma of the shaped plant, gamma_min from the Hankel norm of the factors, and the modulus
-        margin of the loop at u. As a rule of thumb, a design with a gamma below 4 is robust.
+        The controller. `gamma` is the verified norm, and `lower` is gamma_min. The certificate
+        holds the margin 1 / gamma of the shaped plant, gamma_min from the Hankel norm of the
+        factors, and the modulus margin of the loop at u. As a rule of thumb, a design with a gamma
+        below 4 is robust.
 
     Raises
     ------
     AssumptionError
-        When u does not excite an undamped or unstable mode, or y does not measure it, or the
-        shaping filters cancel it.
+        When u does not excite an undamped or unstable mode, y does not measure it, or the shaping
+        filters cancel it.
     CertificateError
         When the closed loop exceeds the claimed norm.
     ModelError, ShapeError
@@ -219,23 +219,23 @@ class _LoopShaping(Design):
 def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> float:
     """Return the margin of a loop u = K y against errors of normalised coprime factors.
 
-    The margin is ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |`` with the H-infinity norm. It lies
-    between 0 (unstable loop) and the largest value that any controller reaches, ``(1 + lambda_max(X
-    Z))^(-1/2)``, where X and Z are the solutions of the two Riccati equations of the plant. It
-    depends on the units of u and y. Scale u and y so that typical signals have size 1, or give the
-    shaped plant and its controller.
+    The margin is ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |`` with the H-infinity norm. It is 0 for
+    an unstable loop. The largest value that any controller reaches is ``(1 + lambda_max(X
+    Z))^(-1/2)``, where X and Z are the solutions of the two Riccati equations of the plant. The
+    margin depends on the units of u and y. Scale u and y so that typical signals have size 1, or
+    give the shaped plant and its controller.
 
     Parameters
     ----------
     plant : StandardPlant or StateSpace
         Plant G. For a StandardPlant, the channels from u to y are used.
     controller : Controller or StateSpace
-        Controller from y to u, its channels in the plant's order.
+        Controller from y to u. Its channels have the order of the plant's channels.
 
     Returns
     -------
     float
-        Margin; a value of 0.2 to 0.3 or more is called robust.
+        Margin. A loop with a margin above 0.2 to 0.3 is called robust.
 
     Raises
     ------

@@ -65,57 +65,58 @@ def design_stage(
 ) -> Controller:
     """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
 
-    A controller is designed for each of several bandwidths. The weights of each design are
-    `stage_weights` of its bandwidth, on ``plant.through(reference_errors(plant))`` or, without
-    references, on the plant itself. ``design_hinf(uncertain=)`` solves the problem. The result is
-    the design of largest bandwidth that satisfies three conditions. First, the modulus margin at u
-    is at least `margin`, also with the truncated modes (which the design model leaves out) if they
-    are known. Second, it is at least 7/8 of `margin` if the frequency of any one mode is off by its
-    uncertainty. Third, it is at least 7/8 of `margin` on each of 20 machines that are drawn at
-    random. A further machine then satisfies this with a probability of 20/21 (95 %). How the
-    machines are drawn depends on the plant. If it comes from a calibrated fit and no uncertainties
-    of frequencies are stated, the machines agree with the measurement (`StandardPlant.machines`).
-    Otherwise all frequencies change simultaneously by their stated uncertainties, and the mode
-    shapes change with them. The damping ratios change by their stated uncertainties, or by 30 % by
-    default. For a plant of a calibrated fit, the certificate also has the margin on the machines of
-    the fit.
+    A controller is designed for each of several bandwidths. The weights of each design are the
+    `stage_weights` of its bandwidth. They weight the plant
+    ``plant.through(reference_errors(plant))``, or the plant itself if it has no references.
+    ``design_hinf(uncertain=)`` computes the controller. The result is the design of largest
+    bandwidth that satisfies three conditions. First, the modulus margin at u is at least `margin`.
+    This also holds with the truncated modes (which the design model leaves out), if they are known.
+    Second, the modulus margin is at least 7/8 of `margin` if the frequency of any one mode is wrong
+    by its uncertainty. Third, it is at least 7/8 of `margin` on each of 20 machines that are drawn
+    at random. A further machine then satisfies this with a probability of 20/21 (95 %).
+
+    There are two ways to draw the machines. If the plant comes from a calibrated fit and no
+    uncertainties of frequencies are stated, the machines agree with the measurement
+    (`StandardPlant.machines`). Otherwise all frequencies change simultaneously by their stated
+    uncertainties, and the mode shapes change with them. The damping ratios change by their stated
+    uncertainties, or by 30 % by default. For a plant of a calibrated fit, the certificate also has
+    the margin on the machines of the fit.
 
     Parameters
     ----------
     plant : StandardPlant or UncertainPlant
-        Plant of a machine that follows references, or of one that is held at rest (without
-        references); continuous or sampled. A plant without stated uncertainty is taken with all its
-        frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})`` and
-        ``plant.uncertain(fit)`` are more accurate. The design itself uses the uncertainties of the
-        frequencies only.
+        Continuous or sampled plant of a machine that follows references, or that is held at rest
+        (without references). If no uncertainty is stated, all frequencies are uncertain by 0.5 %.
+        ``plant.uncertain(frequency={...})`` and ``plant.uncertain(fit)`` are more accurate. The
+        design itself uses only the uncertainties of the frequencies.
     bandwidth : float [Hz], optional
-        Bandwidth of the loop: frequency at which |S| from reference to error crosses 1 on the
-        slowest axis. The weights are adjusted until the loop reaches it within 1 %. For a plant
-        without references, the weights are those of 1.5 times the bandwidth. By default the largest
-        possible bandwidth.
+        Bandwidth of the loop; by default the largest possible one. It is the frequency at which |S|
+        from reference to error crosses 1 on the slowest axis. The weights are adjusted until the
+        loop reaches it within 1 %. For a plant without references, the weights are those of 1.5
+        times the bandwidth.
     margin : float
         Smallest allowed modulus margin, with the loop opened at u. The modulus margin is one over
         the largest singular value of the sensitivity S at any frequency.
     poi : str, optional
         Point of interest (POI), as for `stage_weights` and `reference_errors`.
     disturbance, effort : float
-        Sizes of the weights as for `stage_weights` of an uncertain plant.
+        Sizes of the weights, as for `stage_weights` of an uncertain plant.
     progress : as for `design_hinf`
 
     Returns
     -------
     Controller
-        Controller from the sensors and the reference to the actuators: ``close_loop(plant,
-        controller)``. `tried` lists the bandwidths of the weights with their modulus margins, 0
-        where the loop does not tolerate the errors of its modes; `certificate` has the margin of
-        the final design, and the least modulus margin of the machines drawn.
+        Controller from the sensors and the reference to the actuators, for ``close_loop(plant,
+        controller)``. `tried` lists the bandwidths of the weights with their modulus margins. The
+        margin is 0 if the loop does not tolerate the errors of its modes. `certificate` has the
+        margin of the final design, and the smallest modulus margin of the machines drawn.
 
     Raises
     ------
     AssumptionError, LabelError
         As for `stage_weights` and `reference_errors`.
     InfeasibleError
-        When all bandwidths that were tried fail; the message lists them.
+        When all bandwidths that were tried fail. The message lists them.
     ModelError
         When a number is out of range, or the plant was not assembled from a structure.
 
