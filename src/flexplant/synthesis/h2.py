@@ -38,10 +38,10 @@ def design_h2(
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
-    L0, F0 and S are needed only for a sampled plant; for a continuous one L0 is zero. A sampled
-    plant is solved by the discrete-time equations. The command u at a sample depends on y of the
-    same sample. The norm is computed a second time from the Gramians of the closed loop, and both
-    results must agree.
+    L0 and S are needed only for a sampled plant, with ``F0 = -R^-1 (B2' X B1 + D12' D11)``. For a
+    continuous plant L0 is zero. A sampled plant is solved by the discrete-time equations. The
+    command u at a sample depends on y of the same sample. The norm is computed a second time from
+    the Gramians of the closed loop, and both results must agree.
 
     Parameters
     ----------

@@ -37,20 +37,21 @@ Kind = Literal["velocity", "ppf", "irc"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ActiveDamping(Value):
-    """The controller that damps one mode, with what it reaches; made by `damp_modes`.
+    """The controller that damps one mode, with its verified results: the result of `damp_modes`.
 
     Parameters
     ----------
     element : DampingElement
-        The tuned element. Its input is the error (minus the measurement), its output the command.
+        The tuned element. Its input is the error (minus the measurement), and its output is the
+        command.
     controller : StateSpace
         Controller from y to u, including the sign of the feedback. `close_loop` takes it, also
-        together with a servo, whose commands are added.
+        together with a servo. The commands of both are then added.
     freq : float [Hz]
         Frequency of the mode without the loop.
     before, damping : float
-        Damping ratio of the mode without the loop (`before`), and the least damping ratio of the
-        mode and of the poles of the filter with the loop (`damping`).
+        Damping ratios without and with the loop. `before` is that of the mode without the loop.
+        `damping` is the smallest one of the mode and of the poles of the filter with the loop.
     margin : float
         Modulus margin of the loop.
     undamped : StandardPlant
@@ -67,18 +68,18 @@ class ActiveDamping(Value):
 
     @property
     def system(self) -> StateSpace:
-        """The controller; `close_loop` reads it under this name."""
+        """The controller. `close_loop` reads this attribute."""
         return self.controller
 
     @cached_property
     def loop(self) -> ClosedLoop:
-        """The closed loop on the plant, judged on its evaluation model."""
+        """The closed loop on the plant. It is also checked on the evaluation model."""
         others = [name for name in self.undamped.u if name not in self.controller.outputs]
         return close_loop(self.undamped, self.controller, idle=others)
 
     @cached_property
     def plant(self) -> StandardPlant:
-        """The plant with the damping loop closed, for the design of a servo, whose u is added."""
+        """The plant with the damping loop closed, to which a servo can add its commands."""
         found = _with_loop(self.undamped, self.controller)
         whole_plant = self.undamped.evaluation_plant
         if whole_plant is None:
@@ -87,7 +88,7 @@ class ActiveDamping(Value):
 
     @property
     def loop_gain(self) -> StateSpace:
-        """Loop gain L of negative feedback for `fx.plot.root_locus`; factor 1 is the tuned gain."""
+        """Loop gain L (negative feedback) for `fx.plot.root_locus`. Factor 1 is the tuned gain."""
         gain: StateSpace = -series(self.undamped.Gyu.select(
             self.controller.inputs, self.controller.outputs), self.controller)  # fmt: skip
         return gain
@@ -109,31 +110,32 @@ def damp_modes(
     damping: float | None = None,
     margin: float = 0.3,
 ) -> ActiveDamping:
-    """Return the law that damps a mode: to a given damping ratio, or as much as its kind can.
+    """Return a law that damps one mode, to a given damping ratio or as much as possible.
 
     The search tries filters of the given kind with both signs of the gain, and follows the root
-    locus of each. The filter adds poles to the loop. The damping ratio that is maximised is
-    therefore the smallest one of the mode's pole and the poles of the filter. A law is accepted
-    only if it keeps the modulus margin, does not move rigid-body poles to the right, and keeps at
-    least 70 % of the damping ratio of every other mode. If a damping ratio is given, the result is
-    the law that reaches it with the least gain over the resonance.
+    locus of each. The filter adds poles to the loop. Therefore the smallest damping ratio of the
+    mode's pole and the poles of the filter is maximised. A law is accepted only if it keeps the
+    modulus margin, does not move rigid-body poles to the right, and keeps at least 70 % of the
+    damping ratio of every other mode. If a damping ratio is given, the result is the law that
+    reaches it with the smallest gain over the resonance.
 
     Parameters
     ----------
     plant : StandardPlant, or what `standard_plant` takes
-        Continuous or sampled; sensors measure displacement.
+        Continuous or sampled plant, whose sensors measure displacement.
     kind : {"velocity", "ppf", "irc"} or a class of DampingElement
-        `VelocityFeedback`, `PositivePositionFeedback`, `IntegralResonantControl`.
+        Kind of the law. The three names stand for `VelocityFeedback`, `PositivePositionFeedback`
+        and `IntegralResonantControl`.
     mode : int
-        Number of the mode among the oscillating poles of u to y, from 1, by frequency; rigid-body
-        modes and real poles are not counted.
+        Number of the mode, from 1, in the order of frequency. Only oscillating poles of the path
+        from u to y are counted, so that rigid-body modes and real poles are left out.
     u, y : str, optional
-        Actuator and sensor, collocated or not; needed where the plant has several.
+        Actuator and sensor, at the same place (collocated) or not; needed if the plant has several.
     damping : float, optional
-        Damping ratio, below 1; by default the largest.
+        Damping ratio to be reached, below 1; by default the largest possible one.
     margin : float
-        Modulus margin that the loop keeps, between 0 and 1. It is one over the largest magnitude of
-        the sensitivity S.
+        Modulus margin that the loop must keep, between 0 and 1. The modulus margin is one over the
+        largest magnitude of the sensitivity S.
 
     Returns
     -------
@@ -144,7 +146,7 @@ def damp_modes(
     Raises
     ------
     AssumptionError
-        When no law of the kind reaches the given damping ratio, or none damps the mode.
+        When no law of the kind reaches the given damping ratio, or no law damps the mode.
     LabelError, ModelError
         When u or y is unknown or must be named, the mode does not exist, or a number is out of
         range.

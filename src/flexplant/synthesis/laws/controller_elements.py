@@ -19,16 +19,16 @@ from .law import BlockSection, Section, SingleElement
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pid(SingleElement):
-    """``p + i / s + d s / (1 + s / w)``: proportional, integral and derivative action.
+    """PID element ``p + i / s + d s / (1 + s / w)``.
 
     Parameters
     ----------
     p, i, d : float
-        Gains: p in command per error, i in command per error and second, d in command per rate of
-        the error.
+        Proportional, integral and derivative gain. Their units are command per error, command per
+        error and second, and command per rate of the error.
     pole : float [Hz], optional
-        Corner w above which the gain of the derivative action is constant. It must be given if d is
-        not zero.
+        Corner w, above which the gain of the derivative action is constant. It must be given if d
+        is not zero.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Pid(SingleElement):
         zero: float | None = None,
         pole: float | None = None,
     ) -> Pid:
-        """Return ``gain (1 + w_i / s) (1 + s / w_z) / (1 + s / w_p)``.
+        """Return the PID ``gain (1 + w_i / s) (1 + s / w_z) / (1 + s / w_p)``.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Pid(SingleElement):
         return cls(p, k * w_i, k / w_z - p / w_p, float(pole))
 
     def as_corners(self) -> dict[str, float | None] | None:
-        """Return the arguments of `corners` that give this PID; None if its zeros are complex."""
+        """Return the arguments of `corners` for this PID, or None if its zeros are complex."""
         if self.pole is None:
             corner = self.i / self.p / (2.0 * np.pi) if self.p else -1.0
             same: dict[str, float | None] = {"gain": self.p, "integrator": corner}
@@ -115,13 +115,13 @@ class Pid(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Lead(SingleElement):
-    """``(1 + sqrt(r) p) / (1 + p / sqrt(r)) / sqrt(r)``, p = s / w: gain 1 where it leads most.
+    """Lead ``(1 + sqrt(r) p) / (1 + p / sqrt(r)) / sqrt(r)`` with p = s / w.
 
     Parameters
     ----------
     freq : float [Hz]
-        Frequency w at which the phase lead is largest, namely ``asin((r - 1) / (r + 1))``. The gain
-        at this frequency is one. The zero lies at freq / sqrt(r), the pole at freq sqrt(r).
+        Frequency w at which the phase lead is largest. The lead there is ``asin((r - 1) / (r +
+        1))``, and the gain is 1. The zero lies at freq / sqrt(r), and the pole at freq sqrt(r).
     ratio : float
         Ratio r of the pole to the zero. Below 1 the element is a lag.
 
@@ -148,12 +148,14 @@ class Lead(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Lag(SingleElement):
-    """``(p + 1) / (p + 1 / ratio)``, p = s / w: gain 1 far above w, gain `ratio` far below w.
+    """Lag ``(p + 1) / (p + 1 / ratio)`` with p = s / w.
+
+    The gain is 1 far above the frequency w, and `ratio` far below it.
 
     Parameters
     ----------
     freq : float [Hz]
-        Frequency w of the zero; the pole lies at freq / ratio.
+        Frequency w of the zero. The pole lies at freq / ratio.
     ratio : float
         Gain at low frequency.
 
@@ -180,12 +182,12 @@ class Lag(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Integrator(SingleElement):
-    """``1 + w / s``: integral action below a corner, gain 1 above.
+    """Integral action ``1 + w / s`` below a corner w. Above the corner the gain is 1.
 
     Parameters
     ----------
     freq : float [Hz]
-        Corner frequency w, the zero of the integrator.
+        Corner frequency w, which is the zero of the element.
 
     Examples
     --------
@@ -205,17 +207,17 @@ class Integrator(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Notch(SingleElement):
-    """``(p^2 + 2 depth width p + 1) / (q^2 + 2 width q + 1)``, p = s / w, q = p / skew.
+    """Notch ``(p^2 + 2 depth width p + 1) / (q^2 + 2 width q + 1)``, p = s / w, q = p / skew.
 
     Parameters
     ----------
     freq : float [Hz]
         Frequency w of the zeros, the centre of the notch.
     depth : float
-        Gain at the centre for skew 1, below 1. Above 1 the element is a resonance. The damping
-        ratio of the zeros is depth times width.
+        Gain at the centre if skew is 1. Below 1 the element is a notch, and above 1 a resonance.
+        The damping ratio of the zeros is depth times width.
     width : float
-        Damping ratio of the poles, which is half the relative width of the notch.
+        Damping ratio of the poles. It is half the relative width of the notch.
     skew : float
         Ratio of the frequency of the poles to that of the zeros. The gain at high frequency is the
         square of this ratio.
@@ -241,17 +243,17 @@ class Notch(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LowPass(SingleElement):
-    """``1 / (p^2 + 2 damping p + 1)``, or ``1 / (p + 1)`` of order 1, p = s / w.
+    """Low-pass ``1 / (p^2 + 2 damping p + 1)``, or ``1 / (p + 1)`` of order 1, with p = s / w.
 
     Parameters
     ----------
     freq : float [Hz]
-        Corner.
+        Corner frequency w.
     order : {1, 2}
         Order of the filter. The gain falls with 20 dB per decade above the corner for order 1, and
         with 40 dB per decade for order 2.
     damping : float
-        Damping ratio of order 2; by default that of a Butterworth filter.
+        Damping ratio of the poles for order 2; by default that of a Butterworth filter.
 
     Examples
     --------
@@ -275,13 +277,13 @@ class LowPass(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FixedBlock(SingleElement):
-    """A given system with one input and one output, used as an element of a law.
+    """An element of a law that is a given system with one input and one output.
 
     Parameters
     ----------
     block : StateSpace
-        System from error to command, continuous or sampled. A sampled one with states can only be
-        used at its own rate.
+        System from error to command, continuous or sampled. A sampled system with states can only
+        be used at its own rate.
     label : str
         Description that is shown when the law is printed.
 
@@ -301,14 +303,14 @@ class FixedBlock(SingleElement):
 
     @classmethod
     def of(cls, given: Any, *, label: str = "") -> FixedBlock:
-        """Return the element of a system, or of a designed controller.
+        """Return the element that is a given system, or a designed controller.
 
         Parameters
         ----------
         given : StateSpace or Controller
-            System of the element. A designed Controller K is used as ``u = K y`` and includes the
-            sign of the feedback, so that the element is ``-K``. A StateSpace is used unchanged,
-            from error to command.
+            System of the element. A StateSpace is used unchanged, from error to command. A designed
+            Controller K includes the sign of the feedback (``u = K y``). The element is therefore
+            ``-K``.
         label : str, optional
             Description of the element; by default the name or the method of `given`.
         """
@@ -331,6 +333,6 @@ class FixedBlock(SingleElement):
 
     @cached_property
     def section(self) -> BlockSection:
-        """The system; for a sampled block, its continuous equivalent by Tustin's rule."""
+        """The system. A sampled block is replaced by its continuous equivalent by Tustin's rule."""
         rate, g = self.own_rate, self.block
         return BlockSection(bilinear(g, rate) if rate else g.replace(dt=0.0))

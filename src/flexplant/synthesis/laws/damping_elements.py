@@ -24,10 +24,10 @@ _CORNERS = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DampingElement(SingleElement):
-    """An element from error to command (``u = -L y``) whose gain damps a mode.
+    """Base class of elements L that damp a mode. Their input is the error: ``u = -L y``.
 
-    A new kind of damping is a subclass. It defines the property `section`, the transfer function,
-    and the method `candidates`, which gives the elements that `damp_modes` tries.
+    A new kind of damping is a subclass. It defines the property `section`, which is the transfer
+    function, and the method `candidates`, which gives the elements that `damp_modes` tries.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class DampingElement(SingleElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VelocityFeedback(DampingElement):
-    """Velocity feedback: ``gain s / (1 + s / w)``, the velocity of a displacement sensor.
+    """Velocity feedback ``gain s / (1 + s / w)`` for a displacement sensor.
 
     If actuator and sensor are at the same place, every mode below w is damped, including rigid-body
     modes.
@@ -55,7 +55,7 @@ class VelocityFeedback(DampingElement):
     gain : float
         Command per velocity, in the unit of the command over that of y per second.
     pole : float [Hz]
-        Corner w.
+        Corner frequency w. Above it the gain is constant.
 
     References
     ----------
@@ -84,13 +84,13 @@ class VelocityFeedback(DampingElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PositivePositionFeedback(DampingElement):
-    """Positive position feedback: ``-gain / (p^2 + 2 damping p + 1)``, p = s / w.
+    """Positive position feedback ``-gain / (p^2 + 2 damping p + 1)`` with p = s / w.
 
-    The frequency w of the filter lies near that of the mode, so that the filter, which is well
-    damped, also damps the mode. Above w the gain of the filter falls. The displacement is fed back
-    with positive sign, ``u = +gain F(s) y``, which acts as a negative stiffness. The gain at zero
-    frequency must therefore be below the static stiffness. A body without a spring to the ground
-    cannot be damped in this way.
+    The frequency w of the filter lies near that of the mode. The filter is well damped, and
+    therefore damps the mode too. Above w the gain of the filter falls. The displacement is fed back
+    with positive sign, ``u = +gain F(s) y``, where F(s) is the filter. This acts as a negative
+    stiffness. The gain at zero frequency must therefore be below the static stiffness. A body
+    without a spring to the ground cannot be damped in this way.
 
     Parameters
     ----------
@@ -130,20 +130,20 @@ class PositivePositionFeedback(DampingElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IntegralResonantControl(DampingElement):
-    """Integral resonant control, ``-gain / (1 + s / w)``: integral feedback with a feedthrough.
+    """Integral resonant control ``-gain / (1 + s / w)``, an integrator with a feedthrough.
 
     The law is an integrator ``k / s`` whose input is ``y - d u``, where d is an artificial
-    feedthrough. This is the same as the formula above with gain = 1 / d and w = k d. If d is larger
-    than the static compliance of a collocated actuator and sensor, the plant with feedthrough has a
-    zero below each resonance. Integral feedback then damps all these modes.
+    feedthrough. This equals the formula above with gain = 1 / d and w = k d. If d is larger than
+    the static compliance of a collocated actuator and sensor, the plant with feedthrough has a zero
+    below each resonance. Integral feedback then damps all these modes.
 
     Parameters
     ----------
     gain : float
-        The number 1 / d, command per displacement at zero frequency. It must be below the static
+        Command per displacement at zero frequency, which is 1 / d. It must be below the static
         stiffness.
     freq : float [Hz]
-        Corner w.
+        Corner frequency w.
 
     References
     ----------

@@ -25,7 +25,7 @@ from .loop_design import DesignedLoops, axes_of, made
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ShapedAxis(Value):
-    """The law of one axis in a `LoopDesign`: a gain, elements, and which elements are on.
+    """The law of one axis in a `LoopDesign`: a gain, and elements that can be switched off.
 
     Parameters
     ----------
@@ -35,10 +35,10 @@ class ShapedAxis(Value):
     gain : float
         Gain by which the product of the elements is multiplied.
     on : sequence of bool, optional
-        Whether each element acts; by default all.
+        Whether each element is on; by default all are on.
     feedforward : sequence of up to 5 float
-        Feedforward gains: command of the axis per position, velocity, acceleration, jerk and snap
-        (the fourth derivative) of its reference.
+        Feedforward gains. They are the command of the axis per position, velocity, acceleration,
+        jerk and snap (the fourth derivative) of its reference.
     closed : bool
         Whether the loop of this axis is closed while others are shaped (sequential loop closing).
 
@@ -110,11 +110,11 @@ class ShapedAxis(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopDesign(Value):
-    """Loops shaped by hand: the elements of each axis, the decoupling and the plant's data.
+    """Loops that are shaped by hand: the elements of each axis, and data of the plant.
 
-    The controller is ``u = before diag(law_i) (r - after y)`` with the references r, plus the
-    feedforward of the axes that have one. The design consists of numbers only, so that equal
-    designs give exactly equal controllers.
+    The controller is ``u = before diag(law_i) (r - after y)`` with the references r. The
+    feedforward of the axes that have one is added. The design consists of numbers only, so that
+    equal designs give exactly equal controllers.
 
     Parameters
     ----------
@@ -122,25 +122,25 @@ class LoopDesign(Value):
         Law of each axis, in the order of the outputs of `after`.
     before, after : StateSpace or array, optional
         Static transformations for decoupling. `before` maps the commands of the axes to u, and
-        `after` maps y to the motions of the axes. None if the channels of the plant are the axes.
+        `after` maps y to the motions of the axes. With None the channels of the plant are the axes.
     rate : float [Hz]
         Sampling rate of the controller; 0 if it is continuous.
     delay : float
-        For a measured plant, number of samples of delay in addition to the delay that the
-        measurement contains.
+        Delay in samples of a measured plant that is not contained in the measurement.
     hold : bool
-        For a measured plant, whether the zero-order hold has still to be added. False if it was
-        measured from sampled commands to sampled outputs, so that it contains the hold.
+        Whether the zero-order hold must be added to a measured plant. Use False if the plant was
+        measured from sampled commands to sampled outputs, because the measurement then contains the
+        hold.
     rigid, unstable : int
-        For a measured plant, its number of rigid-body modes and its number of unstable poles (poles
-        outside the stability region).
+        Number of rigid-body modes and number of unstable poles of a measured plant. Poles outside
+        the stability region are unstable.
     references : mapping {axis: channel}
-        Name of the reference that each axis follows. An axis with feedforward always has one; by
-        default its name is ``axis:ref``.
+        Name of the reference that each axis follows. An axis with feedforward always has a
+        reference, whose name is ``axis:ref`` by default.
     made_on : str
         Description of the plant on which the design was made.
     fingerprint : str
-        Hash of the plant's numbers. The method `is_made_on` compares it.
+        Hash of the plant's numbers, which `is_made_on` compares.
 
     Examples
     --------
@@ -204,17 +204,18 @@ class LoopDesign(Value):
         unstable: int = 0,
         references: Mapping[str, str] | None = None,
     ) -> LoopDesign:
-        """Return a design on a plant; by default its axes are those that the actuators move.
+        """Return a design for a plant.
 
         Parameters
         ----------
         plant : as for `design_loops`
         axes : mapping {axis: ShapedAxis}, optional
-            Axes that are missing have a gain of 1.
+            Axes of the design; by default those that the actuators move. An axis that is not given
+            has a gain of 1.
         before, after, rate, delay, hold, unstable, references : as for `design_loops`
         rigid : int, optional
-            Number of rigid-body modes of a measured plant. By default one for each axis whose
-            response falls with 40 dB per decade at its lowest frequencies.
+            Number of rigid-body modes of a measured plant. By default each axis whose response
+            falls with 40 dB per decade at its lowest frequencies counts as one.
 
         Raises
         ------
@@ -242,7 +243,7 @@ class LoopDesign(Value):
         return "\n".join(lines)
 
     def is_made_on(self, plant: Any) -> bool:
-        """Return whether the design was made on this plant, which is compared by its numbers.
+        """Return whether the design was made on a plant with the same numbers.
 
         Parameters
         ----------
@@ -283,11 +284,11 @@ class LoopDesign(Value):
         return found
 
     def controller(self) -> StateSpace:
-        """Return the system from y, and references where axes have one, to u.
+        """Return the controller as a system from y and the references to u.
 
-        Its inputs after y are the references and those of their derivatives that a feedforward
-        uses, for example ``z:ref:acceleration``. `close_loop`, `simulate` and `write_c` take it. It
-        includes axes that are not closed while others are shaped.
+        Its inputs are y, the references of axes that have one, and the derivatives of references
+        that a feedforward uses, for example ``z:ref:acceleration``. `close_loop`, `simulate` and
+        `write_c` take it. Axes that are open while others are shaped are included.
         """
         axes = Axes(None, self.before, self.after, self.rate)
         feedback = connected(axes, axes_controller(axes, self.laws), self._followed)
@@ -310,7 +311,7 @@ class LoopDesign(Value):
         return {name: found[name] for name in self.axes if name in found}
 
     def loops(self, plant: Any) -> DesignedLoops:
-        """Return the loops on a plant with all axes closed: report, check with truncated modes.
+        """Return the loops on a plant with all axes closed, with their report and checks.
 
         Parameters
         ----------
@@ -325,7 +326,7 @@ class LoopDesign(Value):
         return made(self.placed(plant), self.laws, self.rigid, self.unstable, dict(self.references))
 
     def placed(self, plant: Any) -> Axes:
-        """Return a plant in the axes of the design.
+        """Return a plant transformed to the axes of the design.
 
         Parameters
         ----------
@@ -345,13 +346,13 @@ class LoopDesign(Value):
         return parts
 
     def script(self, plant: str = "") -> str:
-        """Return a Python script that makes the same design, to the last digit.
+        """Return a Python script that makes exactly the same design.
 
         Parameters
         ----------
         plant : str, optional
-            The line that makes the plant, for example ``plant = fx.load("stage.npz")``; the script
-            then reports the loops on it.
+            Line that makes the plant, for example ``plant = fx.load("stage.npz")``. If it is given,
+            the script also reports the loops on this plant.
         """
         return design_script(self, str(plant))
 

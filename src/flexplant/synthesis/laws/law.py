@@ -178,7 +178,7 @@ class SingleElement(LawElement):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Law(LawElement):
-    """A product of elements, from error to command: ``gain F1(s) F2(s) ...``.
+    """A product of elements ``gain F1(s) F2(s) ...``, from error to command.
 
     When the law is sampled, each factor is mapped by Tustin's rule.
 
@@ -191,8 +191,8 @@ class Law(LawElement):
     rate : float [Hz]
         Sampling rate; 0 when continuous.
     prewarped : bool
-        Whether the frequencies of a notch, a lead and the corner of a low-pass are kept when the
-        law is sampled. Tustin's rule alone would shift them.
+        Whether the frequencies of notches, leads and the corners of low-passes are kept exactly
+        when the law is sampled. Tustin's rule alone would shift them.
 
     Examples
     --------
@@ -244,7 +244,7 @@ class Law(LawElement):
 
     @cached_property
     def system(self) -> StateSpace:
-        """The system from error to command, sampled where the law is."""
+        """The system from error to command. It is sampled if the law is."""
         sizes = [len(section.matrices[0]) for section in self._sections]
         blocks = [size for size in sizes if size][::-1]
         dt = 1.0 / self.rate if self.rate else 0.0
@@ -259,17 +259,17 @@ class Law(LawElement):
         return chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
 
     def response(self, freq: npt.ArrayLike) -> ComplexArray:
-        """Return the response (n_freq,), in closed form.
+        """Return the response (n_freq,) at increasing frequencies.
 
         Parameters
         ----------
         freq : (n_freq,) array [Hz]
-            Increasing; below half the rate of a sampled law.
+            Frequencies in increasing order. For a sampled law they are below half the rate.
         """
         return self.at(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
 
     def at(self, freq: FloatArray) -> ComplexArray:
-        """Return the response at frequencies [Hz] in any order, which are not checked."""
+        """Return the response at frequencies [Hz] in any order. The frequencies are not checked."""
         return self.gain * product(self._sections, tustin_s(freq, self.rate))
 
 

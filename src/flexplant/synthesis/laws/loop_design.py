@@ -41,7 +41,7 @@ class DesignedLoops(Value):
         Stability of all loops together, and crossover and margins of the loop of each axis while
         the loops of the other axes are closed.
     left_out : SpillOver, optional
-        Stability and margins on the plant with the truncated modes, where these are known.
+        Stability and margins on the plant with the truncated modes, if these are known.
     notes : sequence of str
         Remarks on the design.
     tolerances : ModeTolerances, optional
@@ -131,7 +131,7 @@ def design_loops(
     unstable: int = 0,
     references: Mapping[str, str] | None = None,
 ) -> DesignedLoops:
-    """Return the controller of given laws, ``u = -before diag(laws) after y``, and a report.
+    """Return the controller ``u = -before diag(laws) after y`` of given laws, and a report.
 
     Each law is a product of elements such as `Pid`, `Lead`, `Notch` and `LowPass`. The plant may
     also be a measured frequency response (Frf). Stability is then determined by the Nyquist
@@ -143,17 +143,17 @@ def design_loops(
         Plant. For a StandardPlant that was assembled from a structure, the axes are those that the
         actuators move (`decouple`), unless `before` and `after` are given.
     laws : Law or mapping {axis: Law}
-        Law from error to command: one for all axes, or one for each axis. Laws are sampled at the
-        rate of the plant.
+        Law from error to command: one law for all axes, or one for each axis. Laws are sampled at
+        the rate of the plant.
     before, after : StateSpace or array, optional
         Static transformations. `before` maps the commands of the axes to u, and `after` maps y to
         the motions of the axes.
     rate, delay, hold
-        Only for an Frf: the sampling rate of the controller (continuous by default), its delay in
-        samples, and whether the zero-order hold has still to be added, as for `in_axes`.
+        Only for an Frf, as for `in_axes`: the sampling rate of the controller (continuous by
+        default), its delay in samples, and whether the zero-order hold must be added.
     rigid, unstable : int
-        Only for an Frf: its number of rigid-body modes and its number of unstable poles (poles
-        outside the stability region), as for `report_loops`.
+        Only for an Frf, as for `report_loops`: its number of rigid-body modes and its number of
+        unstable poles (poles outside the stability region).
     references : mapping {axis: channel of y}, optional
         Reference that each axis follows, such as ``{"die:z": "die:ref"}``.
 
@@ -171,7 +171,7 @@ def design_loops(
     Warns
     -----
     FlexplantWarning
-        When the loop is unstable, or is unstable with the truncated modes.
+        When the loop is unstable, either on the plant or with the truncated modes.
 
     References
     ----------

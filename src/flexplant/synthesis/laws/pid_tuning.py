@@ -33,26 +33,27 @@ _POINTS, _AROUND = 60, 3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PidTuning(Value):
-    """A tuned PID controller with what it reaches; made by `tune_pid`.
+    """A tuned PID controller with its verified results: the result of `tune_pid`.
 
-    The controller is ``u = k (1 + w_i / s) (1 + s / w_d) / (1 + s / w_f) (r - y)``. A PI controller
-    has no lead: the factors with w_d and w_f are then left out.
+    The controller is ``u = k (1 + w_i / s) (1 + s / w_d) / (1 + s / w_f) (r - y)``, with the
+    reference r. For a PI controller, the factors with w_d and w_f (the lead) are left out.
 
     Parameters
     ----------
     controller : StateSpace
-        From y to u, including the sign of the feedback: for `close_loop`, `write_c`, ...
+        Controller from y to u, including the sign of the feedback. `close_loop` and `write_c` take
+        it.
     gain : float
         Gain k, in the unit of u over that of y.
     integral, lead, roll_off : float [Hz]
-        Corner frequencies w_i, w_d and w_f, divided by 2 pi. Lead and roll-off are infinite if they
+        Corner frequencies w_i, w_d and w_f in Hz. Those of lead and roll-off are infinite if they
         are not used.
     crossover : float [Hz]
         Lowest frequency at which the loop gain is 1.
     bandwidth : float [Hz]
-        Lowest frequency at which |S| passes 1.
+        Lowest frequency at which |S| crosses 1, where S is the sensitivity.
     margin : float
-        Modulus margin.
+        Modulus margin, 1 / max |S|.
     """
 
     controller: StateSpace
@@ -87,9 +88,9 @@ def tune_pid(
 ) -> PidTuning:
     """Return a PI or PID controller of a plant with one input and one output.
 
-    The magnitude of the loop gain is 1 at the bandwidth. Among the corner frequencies of integral
-    action and lead that keep the modulus margin, those with the largest integral gain are chosen.
-    Bandwidth and margin are verified on the closed loop.
+    The loop gain crosses 1 at the given bandwidth. Several corner frequencies of integral action
+    and lead keep the modulus margin. Those with the largest integral gain are chosen. Bandwidth and
+    margin are verified on the closed loop.
 
     Parameters
     ----------
@@ -97,17 +98,17 @@ def tune_pid(
         Plant with one input and one output. It may have integrators, and its gain may have either
         sign.
     bandwidth : float [Hz], optional
-        Frequency at which the loop gain crosses 1; by default the largest that keeps the margin.
-        For a continuous plant this may have no limit; the bandwidth is then a thousand times the
-        fastest pole.
+        Frequency at which the loop gain crosses 1. By default it is the largest one that keeps the
+        margin. For a continuous plant there may be no largest one; a thousand times the fastest
+        pole is then used.
     margin : float
-        Modulus margin to be kept, between 0 and 1. It is one over the largest magnitude of the
-        sensitivity S.
+        Modulus margin to be kept, between 0 and 1. The modulus margin is one over the largest
+        magnitude of the sensitivity S.
     rate : float [Hz], optional
-        Rate of the controller; the plant is then sampled exactly with its dead time. By default the
-        controller is continuous.
+        Sampling rate of the controller. The plant is then sampled exactly with its dead time. By
+        default the controller is continuous.
     dead_time : float [s]
-        Dead time from u to y; it needs a rate.
+        Dead time from u to y. If it is not zero, a rate must be given.
 
     Returns
     -------
@@ -116,8 +117,8 @@ def tune_pid(
     Raises
     ------
     ModelError
-        When the plant has several channels, dead time comes without a rate, or no PID keeps the
-        margin.
+        When the plant has several channels, a dead time is given without a rate, or no PID keeps
+        the margin.
 
     References
     ----------

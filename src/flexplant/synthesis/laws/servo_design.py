@@ -60,57 +60,57 @@ def design_servo(
     """Return a controller with one law for each axis that the actuators move.
 
     The controller is ``u = -T C(z) (hat - ref)``, with the estimates hat and the references ref. T
-    decouples the axes: ``T = pinv(G(sigma)) / sigma^2``, where G is the response of the plant at
-    the real number s = sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). C has one law for
-    each axis. The law follows from the slope of the axis's response at the bandwidth w_b:
+    decouples the axes: ``T = pinv(G(sigma)) / sigma^2``, where G is the plant's response at the
+    real number s = sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). C has one law for each
+    axis. It depends on the slope of the axis's response at the bandwidth w_b:
 
     - mass line (above all springs): ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``;
     - damper line: ``k (1 + w_i / s) F(s)``;
     - spring line: ``k F(s) / s``; response that is zero at zero frequency: ``k F(s)``.
 
-    Here w_i is the corner of the integral action; F is a second-order roll-off with the notches.
-    Between two lines, the law with the smaller peak of |S| at u is used. The gain k makes the loop
-    gain of the axis 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance, k is
-    computed from the response at s = sigma, provided that this keeps 6 dB. If a mode lies above the
-    bandwidth within a factor of 4, larger numbers are tried for each 4 of the mass line's law: 16,
-    or 64 if 16 does not keep 6 dB. Such a wide lead suppresses the error up to a higher frequency,
+    Here w_i is the corner of the integral action, and F is a second-order roll-off with the
+    notches. Between two lines, the law with the smaller peak of |S| at u is used. The gain k makes
+    the loop gain of the axis 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance,
+    k is computed from the response at s = sigma, if this keeps 6 dB. If a mode lies above the
+    bandwidth within a factor of 4, a wide lead is tried: the number 4 in the mass line's law
+    becomes 16, or 64 if 16 does not keep 6 dB. It suppresses the error up to a higher frequency,
     but less at low frequencies, and passes more noise to the actuators. A notch has the damping of
-    its mode, and its frequency or, for a fast mode, a lower one, so that the loop tolerates errors
-    of the mode's frequency. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
+    its mode. Its frequency is that of the mode, or lower for a fast mode, so that errors of the
+    frequency are tolerated. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant.
     bandwidth : float or mapping {axis: float} [Hz]
-        Frequency at which the loop of each axis crosses 1; below a fifth of the rate. If the plant
-        resonates, the error is suppressed only up to a lower frequency: the certificate has both.
+        Frequency at which the loop gain of each axis crosses 1; below a fifth of the rate. If the
+        plant resonates, errors are suppressed only up to a lower frequency, see the certificate.
     poi : str, optional
-        The POI whose axes are controlled; by default all POIs.
+        Point of interest (POI) whose axes are controlled; by default all POIs.
     axes : sequence of str, optional
         Channels of z (axes of POIs) or y (sensors) to control, as for
         `flexplant.plant.driven_axes`.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass, below half the rate; by default 8 bandwidths (16 or 64
-        with a wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
+        Corner of the second-order low-pass, below half the rate. By default it is 8 bandwidths (16
+        or 64 with a wide lead, 3 for an axis on a spring), at most 0.4 of the rate.
     integrator : float [Hz], optional
         Corner of the integral action; by default a tenth of the bandwidth. With a wide lead it is
-        the highest corner up to this that raises |S| at u by at most 10 %. On springs it is up to
-        half the bandwidth, if |S| at a twentieth of it would exceed 0.3 otherwise.
+        lower if |S| at u would otherwise rise by more than 10 %. On springs it is up to half the
+        bandwidth, if |S| at a twentieth of the bandwidth would otherwise exceed 0.3.
     notches : sequence of float [Hz], optional
-        Frequencies of resonances to notch, each below half the rate. By default they are placed at
-        the plant's modes, one by one, while |S| at u is above 6 dB (or the loop is unstable) and a
-        notch lowers it. An empty sequence means no notches.
+        Frequencies of resonances to notch, each below half the rate. By default they are modes of
+        the plant. They are added one by one while |S| at u is above 6 dB (or the loop is unstable)
+        and a notch lowers it. With an empty sequence there are no notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
-        Block that gives the estimates `die:hat`, ...; by default the POI itself is used.
+        Block whose outputs are the estimates `die:hat`, ...; by default the POI itself is used.
 
     Returns
     -------
     Controller
-        From the references `die:ref`, ... (if any) and the estimates `die:hat`, `die:rx:hat`, ...
-        to the actuators. The certificate holds spectral radius and modulus margin of the complete
-        loop, also with truncated modes; and the frequency up to which |S| of every reference is
-        below 1. If |S| at u exceeds 6 dB, it also holds the largest bandwidth that keeps 6 dB.
+        Controller from the references `die:ref`, ... (if any) and the estimates `die:hat`, ... to
+        the actuators. The certificate holds spectral radius and modulus margin of the loop, also
+        with truncated modes, and the frequency up to which |S| of every reference is below 1. If
+        |S| at u exceeds 6 dB, it also holds the largest bandwidth that keeps 6 dB.
 
     Raises
     ------
@@ -217,17 +217,17 @@ def servo_bandwidth(
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
     The responses of plant and observer are computed once on a grid that includes resonances. The
-    loop is opened at the plant's input; the observer still receives u. A bandwidth that keeps the
-    peak on this grid is accepted on three conditions: the closed loop is stable, every axis with a
-    reference has |S| of at most 0.3 at a twentieth of the bandwidth, and `modulus_margin` keeps the
-    peak. Truncated modes are included if known. Bandwidths are tried from high to low in steps of
-    9 % until one is accepted. A bisection then searches above it.
+    loop is opened at the plant's input; the observer still receives u. Bandwidths are tried from
+    high to low in steps of 9 %. A bandwidth that keeps the peak on the grid is accepted if the
+    closed loop is stable, `modulus_margin` keeps the peak, and every axis with a reference has |S|
+    of at most 0.3 at a twentieth of the bandwidth. Truncated modes are included if known. A
+    bisection then searches above the accepted bandwidth.
 
     Parameters
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Upper bound on the largest singular value of S at u; 2 is 6 dB.
+        Upper bound on the largest singular value of the sensitivity S at u. A peak of 2 is 6 dB.
 
     Returns
     -------

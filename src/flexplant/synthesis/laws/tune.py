@@ -46,18 +46,19 @@ def tune_loops(
     notches: int = 3,
     progress: bool | None = None,
 ) -> DesignedLoops:
-    """Return the laws of highest bandwidth that keep the sensitivity |S| of all axes below a peak.
+    """Return the laws of largest bandwidth that keep the sensitivity |S| of all axes below a peak.
 
-    For a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds
-    the law of each axis (PID, low-pass and notches), `design.report` its margins; `close_loop`
-    takes `design.system`, and `write_c` exports it. ``before=`` and ``after=`` decouple several
-    axes; `decouple` computes them. The loop gain is kept small where the measured frequencies do
-    not resolve a resonance. The result is the best of many starts, without proof that it is
-    optimal; a warning is given if the peak is exceeded. Method: `algorithms`.
+    Type ``design = fx.tune_loops(frf, rate=10e3)`` for a measured FRF, or pass a plant.
+    `design.laws` holds the law of each axis (PID, low-pass and notches), and `design.report` its
+    margins. `close_loop` takes `design.system`, and `write_c` exports it. With ``before=`` and
+    ``after=`` several axes are decoupled; `decouple` computes both. If the measured frequencies do
+    not resolve a resonance, the loop gain is kept small there. The result is the best of many
+    starts, without proof that it is optimal. A warning is given if the peak is exceeded. The page
+    `algorithms` describes the method.
 
-    The law of an axis depends on its response: that of a mass (-40 dB per decade), of a damper
-    (-20) or of a spring (0). A single axis that is unstable, or integrates an odd number of times
-    as motors do, gets the law of `tune_pid`.
+    The law of an axis depends on the slope of its response: that of a mass (-40 dB per decade), of
+    a damper (-20 dB) or of a spring (0 dB). If there is a single axis and it is unstable, or
+    integrates an odd number of times as motors do, it gets the law of `tune_pid`.
 
     Parameters
     ----------
@@ -66,15 +67,15 @@ def tune_loops(
         Upper bound on |S| at u and on |S| of each axis. If each axis has one sensor, it is also an
         upper bound on |S| at y. A peak of 2 (6 dB) is a modulus margin of 0.5.
     rigid : int, optional
-        Number of rigid-body modes. By default that of the model, or for a measured FRF the number
-        of axes. Give 0 if the machine stands on springs and the lines include the frequencies of
-        its suspension modes.
+        Number of rigid-body modes. By default it is that of the model; for a measured FRF it is the
+        number of axes. Give 0 if the machine stands on springs and the measured frequencies include
+        those of its suspension modes.
     notches : int
         Largest number of notches of each axis. A notch is used only if it raises the bandwidth by
         at least 2 %.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal or in a
+        notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -84,16 +85,16 @@ def tune_loops(
     Raises
     ------
     SolverError
-        When no bandwidth within the lines keeps the peak of an axis, which is named; or when the
-        laws found are not stable together.
+        When no bandwidth within the measured frequencies keeps the peak of an axis (the message
+        names the axis), or the laws found are not stable together.
     ModelError, ShapeError, LabelError, AssumptionError
-        As for `design_loops`; ModelError when peak is not above 1.
+        As for `design_loops`. ModelError is also raised when peak is not above 1.
 
     Warns
     -----
     FlexplantWarning
-        When the peak is exceeded. The warning states the largest |S|, its place and its frequency.
-        The result has the same text in `notes`.
+        When the peak is exceeded. The warning states the largest |S|, where it occurs, and its
+        frequency. The `notes` of the result contain the same text.
 
     Examples
     --------
