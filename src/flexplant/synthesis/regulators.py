@@ -21,27 +21,27 @@ def lqr(
     """Return the linear-quadratic regulator (LQR), continuous or sampled.
 
     The feedback ``u = -F x`` minimises the cost ``int x' Q x + 2 x' N u + u' R u dt``. For a
-    sampled system the cost is the sum over the samples (as in ``dlqr``). F is the `gain` of the
-    result.
+    sampled system the cost is the sum over the samples (as in ``dlqr``). The attribute `gain` of
+    the result is F.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     Q, R, N : (n, n), (m, m), (n, m) arrays
-        Weights on states, inputs and both; R is positive definite.
+        Weights on states (Q), inputs (R) and their products (N). R is positive definite.
 
     Returns
     -------
     RiccatiSolution
-        Solution with the gain F (m, n) as `gain`, the poles of A - B F as `poles`, and `P`, so that
-        x' P x is the cost from a state x.
+        Solution with the gain F (m, n) as `gain` and the poles of A - B F as `poles`. With the
+        matrix `P`, the cost from a state x is x' P x.
 
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As for `flexplant.lti.control_care`: when the weights have wrong sizes, R is singular, or a
-        mode cannot be stabilised.
+        When the weights have wrong sizes, R is singular, or a mode cannot be stabilised. The errors
+        are those of `flexplant.lti.control_care`.
 
     References
     ----------
@@ -64,9 +64,9 @@ def lqi(
 ) -> RiccatiSolution:
     """Return the linear-quadratic regulator with integral action (LQI).
 
-    The feedback ``u = -F [x; q]`` minimises the cost of `lqr` for the states x and the integrals q,
-    ``dq/dt = r - y`` (``q[k+1] = q[k] + dt (r - y)`` if the system is sampled). The outputs follow
-    constant references r without a stationary error.
+    The feedback ``u = -F [x; q]`` minimises the cost of `lqr` for the states x and the integrals q.
+    They follow ``dq/dt = r - y``, or ``q[k+1] = q[k] + dt (r - y)`` if the system is sampled. The
+    outputs y follow constant references r without a stationary error.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def lqi(
     Raises
     ------
     AssumptionError
-        When the system has a zero at zero frequency, or more outputs than inputs: some integrals
-        then cannot be stabilised.
+        When the system has a zero at zero frequency, or more outputs than inputs. Some integrals
+        can then not be stabilised.
     ShapeError, ModelError, SolverError
         As for `lqr`.
 
@@ -144,25 +144,25 @@ def _with_integrals(g: StateSpace, outputs: Iterable[str] | None) -> StateSpace:
 
 
 def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = None) -> StateSpace:
-    """Return the Kalman filter of a system, from inputs u and outputs y to estimated states.
+    """Return the Kalman filter of a system. It estimates the states from inputs u and outputs y.
 
     The system is ``dx/dt = A x + B u + w, y = C x + D u + v`` with white noises w and v. The
-    estimate x^ follows ``dx^/dt = A x^ + B u + K e`` with the innovation ``e = y - C x^ - D u``.
-    For a sampled system x^ is the state predicted for the next sample. `flexplant.design_kalman`
-    does the same for a plant with its ports, and computes the error of the estimate.
+    estimate x^ follows ``dx^/dt = A x^ + B u + K e`` with the innovation ``e = y - C x^ - D u`` and
+    the filter gain K. For a sampled system x^ is the state predicted for the next sample. For a
+    plant with ports, use `flexplant.design_kalman`, which also computes the error of the estimate.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     W, V, N : (n, n), (p, p), (n, p) arrays
-        Spectral densities of w, of v and between w and v; covariances for a sampled system. N is
-        zero by default.
+        Spectral densities of w, of v and between w and v. For a sampled system they are
+        covariances. N is zero by default.
 
     Returns
     -------
     StateSpace
-        Its outputs have the names of the states of `sys`.
+        The filter. Its outputs have the names of the states of `sys`.
 
     Raises
     ------
@@ -206,24 +206,24 @@ def lqg(
     V: FloatArray,
     integrate: Iterable[str] | None = None,
 ) -> StateSpace:
-    """Return the controller of least quadratic cost from measurements y to inputs u.
+    """Return the linear-quadratic Gaussian (LQG) controller from measurements y to inputs u.
 
-    The controller is the state feedback of `lqr` (`lqi` if outputs are integrated) on the estimate
-    of `lqe`. The sign of the feedback is in the controller, as everywhere here:
-    ``fx.lti.feedback(sys, K, sign=1)``, or ``fx.loop.report_loops((sys, K))``.
+    The controller is the state feedback of `lqr` on the estimate of `lqe`. If outputs are
+    integrated, it is the state feedback of `lqi`. The controller K includes the sign of the
+    feedback (``u = K y``). The closed loop is therefore ``fx.lti.feedback(sys, K, sign=1)``, and
+    its margins are ``fx.loop.report_loops((sys, K))``.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     Q, R : (n, n), (m, m) arrays
-        Weights as in `lqr`. If outputs are integrated, Q is (n + p, n + p) as in `lqi`, where p is
-        the number of integrated outputs.
+        Weights as in `lqr`. If p outputs are integrated, Q is (n + p, n + p) as in `lqi`.
     W, V : (n, n), (p, p) arrays
-        As in `lqe`.
+        Spectral densities (or covariances) of the noises, as in `lqe`.
     integrate : iterable of str, optional
-        Outputs that follow a reference without an error; the controller then has inputs
-        `y1:ref`, ... after the measurements.
+        Outputs that are integrated, so that they follow a constant reference without an error. The
+        controller then has inputs `y1:ref`, ... after the measurements.
 
     Returns
     -------
@@ -276,7 +276,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     poles : (n,) array [rad/s, or 1 where sampled]
-        Poles in conjugate pairs; each may be given at most as often as there are inputs.
+        Poles in conjugate pairs. Each may be given at most as many times as there are inputs.
 
     Returns
     -------
@@ -285,9 +285,9 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     Raises
     ------
     ShapeError
-        When the number of poles is not that of the states.
+        When the number of poles differs from the number of states.
     ModelError
-        When the poles cannot be placed: no input moves one of the modes, or a pole is asked for
+        When the poles cannot be placed. Either no input moves one of the modes, or a pole is given
         more often than there are inputs.
 
     References

@@ -98,9 +98,9 @@ def tune_pid(
         Plant with one input and one output. It may have integrators, and its gain may have either
         sign.
     bandwidth : float [Hz], optional
-        Frequency at which the loop gain crosses 1. By default it is the largest one that keeps the
-        margin. For a continuous plant there may be no largest one; a thousand times the fastest
-        pole is then used.
+        Frequency at which the loop gain crosses 1 (`crossover` of the result). By default it is the
+        largest one that keeps the margin. For a continuous plant there may be no largest one; a
+        thousand times the fastest pole is then used.
     margin : float
         Modulus margin to be kept, between 0 and 1. The modulus margin is one over the largest
         magnitude of the sensitivity S.

@@ -237,29 +237,32 @@ _LITTLE = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class Lmi(Value):
-    """Synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
+    """H-infinity synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
 
     Gamma is the bound on the H-infinity norm from w to z. One semidefinite program with the matrix
     variables X and Y gives the smallest gamma. For this program, the states are balanced: they are
-    transformed so that the solutions of the two equations of least quadratic cost (control and
-    estimation) are equal and diagonal. The eigenvalues of X and Y prove, to the accuracy of the
+    transformed so that the solutions of two Riccati equations (least quadratic cost of control and
+    of estimation) are equal and diagonal. The eigenvalues of X and Y prove, to the accuracy of the
     solver, that this gamma can be reached. The Riccati equations of H-infinity control prove a
     lower bound for all controllers. If the optimum is more than 2 % above that bound, an error is
-    raised. The controller is not computed from X and Y, because ``I - X Y`` is nearly singular next
-    to the optimum, and digits would be lost. It is computed from the Riccati equations, as by
-    `Riccati()`, for a gamma a little larger than the smallest one. The smallest one is taken as at
-    most 0.5 % above the lower bound. Small noise, effort and disturbances are added where the
-    equations need them, as by `Riccati()`.
+    raised.
 
-    Plants may have up to 20 states, which take at most 10 s. The time grows with the sixth power of
-    the number of states, and larger plants are refused. An error is also raised if the ratio of
-    fast to slow states, or of large to small gains, is too large for the accuracy of the solver.
+    The controller is not computed from X and Y, because ``I - X Y`` is nearly singular next to the
+    optimum, and digits would be lost. It is computed from the Riccati equations, as by `Riccati()`,
+    for a gamma a little larger than the smallest one. The smallest one is taken as at most 0.5 %
+    above the lower bound. If the equations need it, small noise, effort and disturbances are added,
+    as by `Riccati()`.
+
+    Plants may have up to 20 states, for which the synthesis takes at most 10 s. The time grows with
+    the sixth power of the number of states, and larger plants are refused. An error is also raised
+    if the solver is not accurate enough for the plant, because its states are both very fast and
+    very slow, or its gains very large and very small.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma. By default 0.5 % if D12 and D21 have full rank,
-        otherwise as for `Riccati()`.
+        Relative distance from the smallest gamma. By default it is 0.5 % if D12 and D21 have full
+        rank; otherwise it is that of `Riccati()`.
     tolerance : float
         Relative tolerance of the solver on the duality gap and on the residuals.
     max_states : int
@@ -290,7 +293,8 @@ class Lmi(Value):
         ModelError
             When the problem has no states, or more than max_states.
         InfeasibleError
-            When gamma can approach its lower limit only with infinite gains of the controller.
+            When gamma approaches its smallest value only if the gains of the controller become
+            infinite.
         SolverError
             When the solver stops early, or its optimum is not near the lower bound.
         """

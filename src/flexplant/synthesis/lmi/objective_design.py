@@ -42,17 +42,17 @@ _KINDS = (H2, Hinf, PeakGain)
 
 @dataclass(frozen=True, eq=False)
 class AutoBackOff(Value):
-    """Distances from the optimum that `design_lmi` tries in turn, each twice the one before.
+    """Sequence of back-offs that `design_lmi` tries, each twice as large as the one before.
 
     The back-off is the relative distance of the minimised norm from the optimum of the linear
-    matrix inequalities (LMIs). Close to the optimum, the gains of the controller may be infinite.
-    It is not known in advance at which distance a controller keeps all bounds in spite of rounding.
+    matrix inequalities (LMIs). Close to the optimum, the gains of the controller may become very
+    large, and rounding may violate a bound. The necessary distance is not known in advance.
     `Controller.tried` lists the back-offs that were tried.
 
     Parameters
     ----------
     first : float
-        The first back-off that is tried, as a fraction of the optimum.
+        First back-off that is tried, as a fraction of the optimum.
 
     Examples
     --------
@@ -75,47 +75,48 @@ def design_lmi(
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
 ) -> Controller:
-    """Return a controller that keeps several norms below bounds and makes one of them small.
+    """Return a controller that keeps several norms below bounds and minimises one of them.
 
-    Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. The problem is
-    solved by linear matrix inequalities (LMIs), in which all objectives share one Lyapunov matrix.
-    This makes the problem convex, but its optimum is only an upper bound: a better controller may
-    exist. All results are computed again from the closed loop: the H-infinity norm by `hinf_norm`,
-    the H2 norm from Gramians, peak gains from the impulse response, and poles as eigenvalues.
+    For example, a mixed H2/H-infinity design is ``minimize=H2(...), subject_to=[Hinf(...,
+    below=...)]``. The problem is solved by linear matrix inequalities (LMIs), in which all
+    objectives share one Lyapunov matrix. This makes the problem convex. Its optimum is however only
+    an upper bound, so that a better controller may exist. All results are computed again from the
+    closed loop: the H-infinity norm by `hinf_norm`, the H2 norm from Gramians, peak gains from the
+    impulse response, and poles as eigenvalues.
 
     Parameters
     ----------
     plant : StandardPlant
         Plant, usually weighted, with at most max_states states. For a sampled plant, the damping
-        and the bandwidth of a PoleRegion give a region that is not convex. The poles are then kept
-        in the intersection of a polygon and a disc, which lies inside this region.
+        and the bandwidth of a PoleRegion define a region that is not convex. The poles are then
+        kept in a convex part of this region, the intersection of a polygon and a disc.
     minimize : H2, Hinf or PeakGain
-        Objective that is minimised, without `below`.
+        Objective that is minimised; its `below` is not given.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
-        Constraints.
+        Constraints. Each norm has its bound `below`.
     back_off : float or AutoBackOff, optional
         Relative distance of the minimised norm from its optimum. It is needed because the gains of
-        the controller may be infinite at the optimum. A number is used as it is. None:
+        the controller may be infinite at the optimum. A number is used as it is. By default,
         ``AutoBackOff()`` tries 3 %, 6 % and so on until a controller keeps all bounds.
     max_states : int
-        Largest number of states; larger problems are refused, since the time grows with the sixth
-        power.
+        Largest number of states. Larger problems are refused, because the time grows with the sixth
+        power of this number.
     u, y : sequence of str, optional
         As for `design_hinf`.
 
     Returns
     -------
     Controller
-        Controller. `gamma` is the verified norm of the minimised objective, and `reached` holds the
-        norm of every objective. The certificate holds the bound of the LMIs for comparison. `tried`
-        lists the back-offs with the norm that each reached; it is infinite, with the reason, if a
-        bound was not kept.
+        The controller. `gamma` is the verified norm of the minimised objective, and `reached` holds
+        the norm of every objective. The certificate holds the bound of the LMIs for comparison.
+        `tried` lists the back-offs with the norm that each reached. If a bound was not kept, the
+        norm is infinite, and the reason is given.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous and has a direct feedthrough from w to z of an H2 norm. Also
-        when a mode that is not stable is not excited by u or not measured by y.
+        When an H2 norm of a continuous plant includes a direct feedthrough from w to z. Also when u
+        does not excite, or y does not measure, a mode that is not stable.
     CertificateError
         When the closed loop does not keep a bound.
     InfeasibleError
@@ -124,7 +125,7 @@ def design_lmi(
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError
-        When the solver stops early, or no controller satisfies what the LMIs claim.
+        When the solver stops early, or no controller agrees with the result of the LMIs.
 
     References
     ----------

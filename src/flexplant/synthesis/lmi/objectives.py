@@ -41,12 +41,12 @@ _APART = 1.005
 
 @dataclass(frozen=True, eq=False, repr=False)
 class H2(MeasuredObjective):
-    """The H2 norm from w to z: the rms of z for white noise w of unit intensity.
+    """The H2 norm from w to z. It is the rms of z for white noise w of unit intensity.
 
     Parameters
     ----------
     w, z : sequences of str, optional
-        Channels; by default all.
+        Names of the channels; by default all channels of w and z.
     below : float, optional
         Upper bound on the norm. It is not given for the norm that is minimised.
 
@@ -60,11 +60,11 @@ class H2(MeasuredObjective):
     """
 
     def measured(self, closed: StateSpace) -> float:
-        """Return the norm of a closed loop by its Gramians."""
+        """Return the norm of a closed loop, computed from its Gramians."""
         return h2_norm(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the judges (`Judge`) that compute the norm for controllers of an order."""
+        """Return the `Judge` objects that compute the norm for controllers of an order."""
         w, z = self.chosen(plant)
         require_finite_h2(plant, w, z)
         return [H2Judge(problem_on(plant, w, z), order)]
@@ -72,7 +72,7 @@ class H2(MeasuredObjective):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Hinf(MeasuredObjective):
-    """The H-infinity norm from w to z: the largest gain over all frequencies.
+    """The H-infinity norm from w to z. It is the largest gain over all frequencies.
 
     Parameters
     ----------
@@ -90,18 +90,18 @@ class Hinf(MeasuredObjective):
         return peak_gain(closed)[0]
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the judges (`Judge`) that compute the norm for controllers of an order."""
+        """Return the `Judge` objects that compute the norm for controllers of an order."""
         return [GainJudge(problem_on(plant, *self.chosen(plant)), order)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PeakGain(MeasuredObjective):
-    """The peak-to-peak gain: the largest amplitude of z for w of amplitude one.
+    """The peak-to-peak gain. It is the largest amplitude of z for w of amplitude one.
 
-    The linear matrix inequality bounds the Euclidean length of the vector z at all times, for a
-    vector w whose length is at most one (the star norm). The result is verified by the integral of
-    the absolute impulse response of each channel (for a sampled plant by the sum), which is the
-    exact peak-to-peak gain of the channel.
+    The linear matrix inequality gives a bound that is called the star norm. It bounds the Euclidean
+    length of the vector z at all times, for all vectors w whose length is at most one. The result
+    is verified by the integral of the absolute impulse response of each channel (by the sum for a
+    sampled plant). This is the exact peak-to-peak gain of the channel.
 
     Parameters
     ----------
@@ -119,11 +119,11 @@ class PeakGain(MeasuredObjective):
     decay: float | None = field(default=None, metadata=checked(positive))
 
     def measured(self, closed: StateSpace) -> float:
-        """Return the largest integral or sum of an absolute impulse response."""
+        """Return the largest integral (or sum) of an absolute impulse response."""
         return impulse_sum(closed) if closed.dt else impulse_integral(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the judges (`Judge`) that compute the sum of each channel for an order."""
+        """Return the `Judge` objects that compute the sum of each channel, for an order."""
         w, z = self.chosen(plant)
         return [PeakJudge(problem_on(plant, [i], [o]), order) for i in w for o in z]
 
@@ -135,8 +135,8 @@ class PoleRegion(Value):
     Parameters
     ----------
     decay : float [rad/s]
-        Least decay rate: real parts are below -decay, or magnitudes below e^(-decay dt) for a
-        sampled plant.
+        Smallest decay rate. Real parts of the poles are below -decay. For a sampled plant,
+        magnitudes of the poles are below e^(-decay dt).
     damping : float, optional
         Smallest damping ratio of the poles. For a sampled plant it is the damping ratio of ``s =
         log(z) / dt`` with the pole z.
@@ -158,7 +158,7 @@ class PoleRegion(Value):
     bandwidth: float | None = field(default=None, metadata=checked(positive))
 
     def outside(self, closed: StateSpace) -> str:
-        """Return which pole of a closed loop lies outside, in words; empty when none does."""
+        """Return a text of a pole of the closed loop that lies outside; empty if there is none."""
         poles = continuous_poles(closed)
         if not poles.size:
             return ""

@@ -28,22 +28,23 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DiskMargin(Value):
-    """The largest complex change of the gain at which a loop is guaranteed to stay stable.
+    """The disk of complex gain changes within which a closed loop is sure to stay stable.
 
     The loop gain is multiplied by the complex factor ``f = (2 + (1 - sigma) d) / (2 - (1 + sigma)
-    d)``. The closed loop stays stable for all complex numbers d with ``|d| < alpha``. For one loop,
-    ``alpha = 1 / max |S + (sigma - 1) / 2|``, where S is the sensitivity and sigma is the skew.
+    d)``. The number d is the change, and sigma is the skew. The closed loop stays stable for all
+    complex d with ``|d| < alpha``. For one loop, ``alpha = 1 / max |S + (sigma - 1) / 2|``, where S
+    is the sensitivity.
 
     Parameters
     ----------
     kind : {"S-T", "S", "T"}
-        Kind of change. "S-T" is a skew sigma of 0: the gain may rise and fall by the same factor.
-        "S" is a skew of 1: a relative change of 1 / L, where L is the loop gain; its alpha is the
-        modulus margin. "T" is a skew of -1: a relative change of L.
+        Kind of change. "S-T" has a skew sigma of 0: the gain may rise and fall by the same factor.
+        "S" has a skew of 1, a relative change of 1 / L, where L is the loop gain; its alpha is the
+        modulus margin. "T" has a skew of -1, a relative change of L.
     alpha : float
-        Guaranteed size: no smaller change makes the loop unstable.
+        Size of d up to which stability is guaranteed.
     reached : float
-        Size of a change d that makes the loop unstable. It equals alpha for one loop. For several
+        Size of a change d that makes the loop unstable. For one loop it equals alpha. For several
         loops together it follows from the lower bound of the structured singular value mu, and may
         be larger than alpha.
     freq : float [Hz]
@@ -63,7 +64,7 @@ class DiskMargin(Value):
 
     @property
     def gains(self) -> tuple[float, float]:
-        """The factors on the gain that the disk allows, below and above 1."""
+        """The smallest and the largest real factor on the gain that the disk allows."""
         sigma, a = SKEWS[self.kind], self.alpha
         low = (2.0 - a * (1.0 - sigma)) / (2.0 + a * (1.0 + sigma))
         rest = 2.0 - a * (1.0 + sigma)
@@ -72,7 +73,7 @@ class DiskMargin(Value):
 
     @property
     def phase(self) -> float:
-        """The change of phase [deg] that the disk allows, lead or lag."""
+        """The largest change of phase [deg], lead or lag, that the disk allows."""
         # where the disk of the factors f, symmetric to the real axis, meets the unit circle
         sigma, square = SKEWS[self.kind], self.alpha**2
         cosine = (4.0 - square * (1.0 + sigma**2)) / (4.0 + square * (1.0 - sigma**2))
@@ -88,18 +89,18 @@ class DiskMargin(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MarginTable(Value):
-    """All usual margins of a loop; `print` shows one table with units.
+    """All usual margins of a loop. It prints as a table with units.
 
     Parameters
     ----------
     loops : tuple of LoopMargins
-        Classical margins, one loop at a time: all crossovers, gain, phase and delay.
+        Classical margins of one loop at a time: all crossovers, gain, phase and delay.
     disks : tuple of tuples of DiskMargin
         Disk margins of each loop, for the kinds S-T, S and T.
     together : tuple of DiskMargin
-        Disk margins of the same three kinds if all loops change at once, each by a separate complex
-        factor. They are computed from bounds of the structured singular value. For a single loop
-        they equal those of `disks`.
+        Disk margins of the same three kinds if all loops change at the same time, each by a
+        separate complex factor. They are computed from bounds of the structured singular value mu.
+        For a single loop they equal those of `disks`.
     """
 
     loops: tuple[LoopMargins, ...]
@@ -119,12 +120,12 @@ class MarginTable(Value):
 
 
 def margins(loop: Loop, *, at: Literal["u", "y"] = "u") -> MarginTable:
-    """Return classical margins and disk margins, one loop at a time and all loops at once.
+    """Return classical margins and disk margins of each loop, and of all loops together.
 
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller), or a loop gain L of negative feedback
-        As for `flexplant.loop.loop_gain`; the plant may be a measured Frf.
+        Loop, as for `flexplant.loop.loop_gain`. The plant may be a measured Frf.
     at : {"u", "y"}
         Where the loops are broken.
 
@@ -135,7 +136,7 @@ def margins(loop: Loop, *, at: Literal["u", "y"] = "u") -> MarginTable:
     Raises
     ------
     ModelError
-        When the closed loop is not stable: it has no margins.
+        When the closed loop is not stable. It then has no margins.
     LabelError
         When channels of plant and controller do not match.
 

@@ -89,26 +89,26 @@ def design_mu(
     order: int = 1,
     progress: bool | None = None,
 ) -> Controller:
-    """Return a controller whose weighted gain stays small on every machine of an uncertainty.
+    """Return a controller whose weighted gain is small on every machine of an uncertain plant.
 
-    The method is D-K iteration (as ``musyn``). A Delta is an uncertainty that is scaled to size 1,
-    and D(s) are filters of few states that scale the channels of the Deltas. Each step has two
-    parts. First, an H-infinity controller is designed for the plant whose Deltas are scaled by D.
-    Second, a new D is computed for the best loop so far. Each D is multiplied by the number that
-    gives the smallest H-infinity norm. If Deltas are real, the iteration is also made without this
-    factor, and the better result is kept. The first candidates are the controller designed without
-    uncertainty and the one for a constant D.
+    The method is D-K iteration (as ``musyn``). A Delta is an uncertainty that is scaled to size 1.
+    D(s) are filters of few states that scale the channels of the Deltas. Each step has two parts.
+    First, an H-infinity controller is designed for the plant whose Deltas are scaled by D. Second,
+    a new D is computed for the best loop so far. Each D is multiplied by the number that gives the
+    smallest H-infinity norm. If Deltas are real, the iteration is also made without this number,
+    and the better result is kept. Before the iteration, two candidates are computed: the controller
+    designed without uncertainty, and the one for a constant D.
 
     The design treats real Deltas as complex, which is conservative. The controllers are compared by
-    mixed mu, in which real Deltas stay real, and whose bound holds at all frequencies, also between
-    grid points. The result is the controller with the smallest mixed mu.
+    mixed mu, in which real Deltas stay real. Its bound holds at all frequencies, also between grid
+    points. The result is the controller with the smallest mixed mu.
 
-    If all Deltas are frequencies, a simpler design is used. Each mode has one channel, as in
-    `design_hinf` of an uncertain plant, with the scaling G for real Deltas and a constant D that is
+    If all Deltas are frequencies, a simpler design is used. As in `design_hinf` of an uncertain
+    plant, each mode has one channel, with the scaling G for real Deltas and a constant D that is
     balanced in closed loop. The bound is then computed on a frequency grid through the modes, to
-    first order in their changes. Machines at corners of the uncertainty, where each frequency is at
-    an end of its interval, are closed exactly. This design needs a weighted disturbance that moves
-    the modes. Without one, the general iteration is made.
+    first order in their changes. In addition, loops are computed exactly on machines whose
+    frequencies are all at an end of their intervals. This design needs a weighted disturbance that
+    moves the modes. Without one, the general iteration is made.
 
     Parameters
     ----------
@@ -116,28 +116,27 @@ def design_mu(
         Uncertain plant from `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M,
         blocks)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
-        Weights of the performance requirement, as for `StandardPlant.weighted`. The weights of
-        `stage_weights` can also be used. Channels that are not named, or have the weight None, are
-        left out.
+        Weights of the performance requirement, as for `StandardPlant.weighted`, for example those
+        of `stage_weights`. Channels that are not named, or have the weight None, are left out.
     method : as for `design_hinf`, optional
     iterations : int
         Largest number of steps of the D-K iteration.
     order : int
-        Largest number of states of D for each Delta and side.
+        Largest number of states of D, for each Delta and for each of its sides.
     progress
-        As for `design_hinf`, with its warning of truncated modes.
+        As for `design_hinf`. Truncated modes give the same warning as there.
 
     Returns
     -------
     Controller
-        Controller. `gamma` is the upper bound of mu of robust performance (see
+        The controller. `gamma` is the upper bound of mu of robust performance (see
         `robust_performance`). If it is below 1, all machines of the uncertainty are stable and have
         weighted gains below 1. The certificate holds mu of every step.
 
     Raises
     ------
     AssumptionError, SolverError, InfeasibleError, CertificateError
-        When no step gives a controller; see `design_hinf`.
+        When no step gives a controller. See `design_hinf`.
     ModelError, LabelError
         When `uncertain` is not an uncertain plant, or channels are missing or unknown.
 

@@ -44,37 +44,37 @@ _BAND = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 20), -np.geomspace(1e-4, 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RobustStability(Value):
-    """Bounds on the uncertainty under which a loop is stable, and the worst machine.
+    """Bounds on the uncertainty for which a loop stays stable, and the least stable machine.
 
     Parameters
     ----------
     upper : float
         Upper bound of the structured singular value mu. A Delta is an uncertainty that is scaled to
         size 1. Every machine whose Deltas are smaller than ``1 / upper`` is stable. If `upper` is
-        below 1, all machines of the uncertainty are stable. Values below 0.05 are not computed more
-        exactly.
+        below 1, all machines of the uncertainty are stable. Values below 0.05 are not refined.
     lower : float
-        Lower bound of mu: a machine with Deltas of size ``1 / lower`` is not stable. It is 0 if no
-        such machine was found, or if none was searched for because all machines of the uncertainty
-        are stable.
+        Lower bound of mu. A machine with Deltas of size ``1 / lower`` is not stable. The bound is 0
+        if no such machine was found. It is also 0 if none was searched for, because all machines of
+        the uncertainty are stable.
     freq : float [Hz]
-        Frequency at which mu is largest; NaN if mu is not resolved.
+        Frequency at which the upper bound is largest; NaN if it was not refined.
     values : mapping {str: float}
-        The Deltas of that machine.
+        Values of the Deltas of the machine that belongs to `lower`.
     machine : StandardPlant, optional
-        That machine, a little beyond its edge of stability; it can be simulated. None when none was
-        found, or the one found could not exist (without stiffness or damping).
+        The machine that belongs to `lower`, moved a little beyond its limit of stability. It can be
+        simulated. None if no machine was found, or if it cannot exist because a stiffness or
+        damping is not positive.
     frequencies, bounds : (k,) arrays [Hz, 1]
-        Upper bounds at single frequencies; only those near the largest are tight.
+        Upper bounds at single frequencies. Only those near the largest one are tight.
     certificate : Certificate
         Checks of the result. It holds the stability of the least stable machine among those drawn
-        at random, whose loops are computed exactly. For a sampled plant it holds the distance
-        between the channels of the Deltas and exactly sampled machines. It also holds the number of
-        frequency intervals that were proven by Hamiltonian matrices (0 for more than 260 states,
-        where the intervals are covered by sampling instead), and the check with the truncated
-        modes.
+        at random, whose loops are computed exactly. For a sampled plant it holds the error of the
+        sampled model with Deltas, compared with exactly sampled machines. It also holds the number
+        of frequency intervals that were proven by Hamiltonian matrices. This number is 0 for more
+        than 260 states, because samples of the frequency then replace this proof. Finally it holds
+        the check with the truncated modes.
     left_out : SpillOver, optional
-        Stability and margins of the nominal loop on the plant with the truncated modes, where these
+        Stability and margins of the nominal loop on the plant with the truncated modes, if these
         are known.
     """
 
@@ -124,15 +124,15 @@ def robust_stability(
     rng: Any = 0,
     progress: bool | None = None,
 ) -> RobustStability:
-    """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
+    """Return bounds on the uncertainty for which a loop stays stable, by mu of all its Deltas.
 
-    The structured singular value mu is one over the size of the smallest Deltas that make the loop
-    unstable, where a Delta is an uncertainty that is scaled to size 1. Deltas of frequencies,
-    damping and parameters are real numbers. All neglected modes together are one full complex
-    block. Unmodelled dynamics and the blocks of `uncertain_system` keep their kind. The bound holds
-    at all frequencies, also between grid points. A sampled loop is examined with its sampling and
-    delay. The result is checked on machines that are drawn from the uncertainty, and the loop of
-    each is computed exactly.
+    A Delta is an uncertainty that is scaled to size 1. The structured singular value mu is one over
+    the size of the smallest Deltas that make the loop unstable. Deltas of frequencies, damping and
+    parameters are real numbers. All neglected modes together are one full complex block. Unmodelled
+    dynamics and the blocks of `uncertain_system` keep their kind. The bound holds at all
+    frequencies, also between grid points. A sampled loop is examined with its sampling and delay.
+    The result is checked on machines that are drawn from the uncertainty. The loop of each machine
+    is computed exactly.
 
     Parameters
     ----------
@@ -142,17 +142,18 @@ def robust_stability(
     *blocks : StateSpace, or values with a `system`
         Controller, as for `close_loop`.
     quick : bool
-        Whether to compute a simpler bound first, if all Deltas are frequencies. It uses one channel
-        for each mode, is valid to first order in the changes, and is computed on a frequency grid
-        through the resonances. For twenty modes it takes less than a second, while the full search
-        takes ten. If it is below 1, it is the result. Otherwise the full search follows.
+        Whether to compute a simpler bound first; only used if all Deltas are frequencies. This
+        bound uses one channel for each mode, is valid to first order in the changes, and is
+        computed on a frequency grid through the resonances. If it is below 1, it is the result.
+        Otherwise the full search follows. For twenty modes the simpler bound takes less than a
+        second, and the full search takes ten.
     machines : int
-        Number of machines drawn, each Delta at an end of its interval.
+        Number of machines drawn. Each Delta of a machine is at an end of its interval.
     rng : int, SeedSequence, Generator or None
-        Random generator of the machines and of the search for the worst, or its seed.
+        Random generator of the machines and of the search for the least stable one, or its seed.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal or in a
+        notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -163,8 +164,8 @@ def robust_stability(
     AssumptionError
         When the nominal loop is not stable.
     CertificateError
-        When a machine is unstable although stability was proven, or when sampled machines depend on
-        their Deltas in a way that is too far from linear.
+        When a machine is unstable although stability was proven. Also when sampled machines are too
+        nonlinear in their Deltas.
     SolverError
         When the proven intervals do not cover all frequencies.
 
@@ -312,22 +313,22 @@ def _tried_on(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WorstCaseGain(Value):
-    """The largest gain from w to z over all machines of an uncertainty.
+    """Bounds on the largest gain from w to z over all machines of an uncertainty.
 
     Parameters
     ----------
     upper : float
-        No machine of the uncertainty has a larger gain at any frequency.
+        Upper bound. No machine of the uncertainty has a larger gain at any frequency.
     lower : float
-        The gain of `machine`, its norm computed from its own closed loop.
+        Lower bound. It is the gain of `machine`, computed from its closed loop.
     nominal : float
-        The gain without uncertainty.
+        Gain without uncertainty.
     freq : float [Hz]
         Frequency at which `machine` has this gain.
     values : mapping {str: float}
-        The Deltas of that machine.
+        Values of the Deltas of `machine`.
     machine : StandardPlant
-        Machine with this gain; it can be simulated.
+        Machine with the gain `lower`. It can be simulated.
     frequencies, bounds : (k,) arrays [Hz, gain]
         Upper bounds at single frequencies.
     """
@@ -357,19 +358,19 @@ def worst_case_gain(
     rng: Any = 0,
     progress: bool | None = None,
 ) -> WorstCaseGain:
-    """Return bounds on the largest gain from w to z over an uncertainty, and the worst machine.
+    """Return bounds on the largest gain from w to z over an uncertainty, with the machine found.
 
-    The upper bound is a skewed structured singular value: the size of the Deltas is fixed to
-    ``|Delta| <= 1``, and only the block from z to w that represents the gain is scaled. It is
-    computed on frequency intervals that cover all frequencies. The lower bound is the gain of a
-    machine that a search found. The loop of this machine is computed exactly, with the sampling and
-    delay of the plant.
+    The upper bound is a skewed structured singular value. This means that the size of the Deltas is
+    fixed to ``|Delta| <= 1``, and only the block from z to w that represents the gain is scaled.
+    The bound is computed on frequency intervals that cover all frequencies. The lower bound is the
+    gain of a machine that a search found. The loop of this machine is computed exactly, with the
+    sampling and delay of the plant.
 
     Parameters
     ----------
     uncertain, *blocks : as for `robust_stability`
     w, z : sequence of str, or mapping {name: weight}
-        Channels between which the gain is computed, with weights if wanted. A weight is a number or
+        Channels between which the gain is computed, with weights if needed. A weight is a number or
         a system with one input and one output.
     rng : int, SeedSequence, Generator or None
         Random generator of the search, or its seed.
@@ -382,11 +383,11 @@ def worst_case_gain(
     Raises
     ------
     AssumptionError
-        When the nominal loop is not stable, or machines of the uncertainty may be unstable.
+        When the nominal loop is not stable, or stability of all machines is not proven.
     CertificateError
-        When the machine found has a larger gain than was proven possible.
+        When the machine found has a larger gain than the upper bound allows.
     ModelError, LabelError, SolverError
-        As for `robust_stability`; where channels are missing or unknown.
+        As for `robust_stability`; also when channels are missing or unknown.
 
     References
     ----------

@@ -58,18 +58,18 @@ class MuBounds(Value):
     Parameters
     ----------
     upper : float
-        Upper bound: no Delta of the structure smaller than 1 / upper makes ``I - M Delta``
-        singular, at any frequency.
+        Upper bound. If a Delta of the given structure is smaller than 1 / upper, ``I - M Delta`` is
+        not singular at any frequency.
     lower : float
-        Lower bound: the Delta in `perturbation`, of size 1 / lower, makes ``I - M Delta`` singular.
-        It is 0 if no such Delta was found.
+        Lower bound. The Delta in `perturbation`, of size 1 / lower, makes ``I - M Delta`` singular.
+        The bound is 0 if no such Delta was found.
     freq : float [Hz]
-        Frequency where the upper bound is largest; NaN for a matrix.
+        Frequency at which the upper bound is largest; NaN for a matrix.
     perturbation : (w, z) complex array
-        Perturbation of size 1 / lower, at the frequency where it acts; zero when none was found.
+        Delta of size 1 / lower, at the frequency where it acts. It is zero if none was found.
     frequencies, bounds : (k,) arrays [Hz, 1]
-        Upper bounds at single frequencies. Only those near the largest one are tight; the search
-        does not lower the others further.
+        Upper bounds at single frequencies. Only those near the largest one are tight, because the
+        search does not lower the others further.
     intervals : int
         Number of intervals that cover the frequency axis; 0 for a matrix.
     """
@@ -97,15 +97,15 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
 
     The size of Delta is its largest singular value. The upper bound uses scaling matrices D and G
     that satisfy ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system, each pair of scalings is
-    proven for an interval of frequencies; the ends of the interval follow from the eigenvalues of a
-    Hamiltonian matrix. The intervals cover all frequencies, so that no peak is missed. The lower
-    bound uses power iterations with random restarts. For a system it is verified by the eigenvalues
-    of the closed loop with the perturbation.
+    proven for an interval of frequencies, whose ends follow from the eigenvalues of a Hamiltonian
+    matrix. The intervals cover all frequencies, so that no peak is missed. The lower bound is found
+    by power iterations with random restarts. For a system it is verified by the eigenvalues of the
+    closed loop with the perturbation.
 
     Parameters
     ----------
     M : (z, w) array or StateSpace
-        Complex matrix; or a stable system, continuous or sampled.
+        Complex matrix, or stable system, continuous or sampled.
     blocks : sequence of RepeatedScalar and FullBlock
         Blocks of Delta, ``w = Delta z``, in the order of the channels of M.
     rng : int, SeedSequence, Generator or None
@@ -122,7 +122,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     ShapeError, ModelError
         When the sizes of the blocks do not match M, or M is neither a matrix nor a system.
     SolverError
-        When intervals do not cover the frequency axis.
+        When the proven intervals do not cover all frequencies.
 
     References
     ----------

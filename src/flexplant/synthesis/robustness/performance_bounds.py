@@ -32,7 +32,7 @@ def robust_performance(
     rng: Any = 0,
     progress: bool | None = None,
 ) -> MuBounds:
-    """Return mu of robust performance: how far uncertainty and weighted gain stay below one.
+    """Return mu of robust performance, which measures stability and weighted gain together.
 
     If this number is below 1, every machine of the uncertainty is stable and has a weighted gain
     below 1 from w to z. If it is 2, machines with half the uncertainty are stable and have a
@@ -50,7 +50,8 @@ def robust_performance(
     Returns
     -------
     MuBounds
-        `lower` is 0 for a plant with neglected modes: no lower bound is then computed.
+        Bounds of mu. `lower` is 0 for a plant with neglected modes, for which no lower bound is
+        computed.
 
     Raises
     ------

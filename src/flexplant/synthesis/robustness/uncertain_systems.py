@@ -19,7 +19,7 @@ from ...store import Value
 
 @dataclass(frozen=True, eq=False)
 class BlockStructure(Uncertainty):
-    """The uncertainty of a system M with blocks Delta; made by `uncertain_system`.
+    """The uncertainty of a system M with blocks Delta: the result of `uncertain_system`.
 
     Parameters
     ----------
@@ -67,22 +67,23 @@ def uncertain_system(
     A Delta is an unknown number or matrix of size at most 1. The result can be passed to
     `robust_stability`, `worst_case_gain`, `robust_performance` and `design_mu`. Its method
     ``.lft(values)`` inserts values of some Deltas, and ``.machines.drawn(count)`` draws systems at
-    random. If u and y are not given, M is a loop that is already closed, and no controller is
+    random. If u and y are not given, M is a loop that is already closed. No controller is then
     needed: ``robust_stability(uncertain)``.
 
     Parameters
     ----------
     M : StateSpace or control.StateSpace
-        System with named channels, continuous or sampled, which includes the weights of the Deltas.
+        System with named channels, continuous or sampled. It includes the weights of the Deltas.
     blocks : sequence of RepeatedScalar and FullBlock
-        Blocks in the order of the channels; those without a name are called `delta1`, `delta2`, ...
+        Blocks in the order of the channels. Blocks without a name are called `delta1`, `delta2`,
+        ...
     u, y : sequences of str
         Inputs that the controller drives and outputs that it reads.
 
     Returns
     -------
     UncertainPlant
-        Its nominal plant is M with Delta = 0.
+        Uncertain plant. Its nominal plant is M with Delta = 0.
 
     Raises
     ------

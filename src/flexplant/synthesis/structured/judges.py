@@ -236,19 +236,19 @@ _CLOSE = 1e-7
 
 
 class Judge(Protocol):
-    """One number of a stable loop, such as a norm, that `design_structured` minimises.
+    """Interface of objects that compute the number `design_structured` minimises, such as a norm.
 
     The search minimises the logarithm of this number and uses its gradient. The judge receives
     controllers in the user's units. An objective makes its judge from the prepared problem p, which
     is scaled: one unit of its time is ``1 / p.speed`` seconds. A judge that works on the matrices
-    of p therefore has to convert its number back into the user's units.
+    of p must therefore convert its number to the user's units.
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
-        """Return the number, infinite for an unstable loop, and the place where it is reached."""
+        """Return the number (infinite for an unstable loop), and the place where it occurs."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
-        """Return logarithms of functions near the number, including the one at the place."""
+        """Return logarithms of functions near the number, including the one at `place`."""
         # `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
         # the place alone counts
 

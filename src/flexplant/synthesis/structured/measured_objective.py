@@ -23,20 +23,20 @@ from .judges import STEP, Closed, Judge, Matrices, SmoothJudge, problem_on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredObjective(Value):
-    """Base class for your own objectives: each is a positive number of a closed loop.
+    """Base class for your own objectives. An objective is a positive number of a closed loop.
 
-    A new objective defines the method `measured`: a smooth function of the closed loop from w to z,
-    in seconds and in the units of the channels. It returns infinity for a stable loop that is not
-    acceptable, and must not depend on the choice of states. The search computes its derivatives
-    with respect to the n parameters of the controller by differences: each gradient closes 2 n more
-    loops, which `evaluations` does not count.
+    A new objective defines the method `measured`. It is a smooth function of the closed loop from w
+    to z, in seconds and in the units of the channels. It returns infinity for a stable loop that is
+    not acceptable. Its value must not depend on the choice of states. The search computes
+    derivatives with respect to the n parameters of the controller by differences. Each gradient
+    therefore needs 2 n more closed loops, which `evaluations` does not count.
 
     Parameters
     ----------
     w, z : sequences of str, optional
         Channels of the closed loop that `measured` receives; by default all.
     below : float, optional
-        Upper bound on the number. The search uses the number divided by this bound.
+        Upper bound on the number. If it is given, the search uses the number divided by this bound.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class MeasuredObjective(Value):
     below: float | None = field(default=None, metadata=checked(positive))
 
     def chosen(self, plant: AnyPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of the channels w and z; by default all of the plant."""
+        """Return the names of the channels w and z; by default all channels of the plant."""
         for side in "wz":
             require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
         return self.w or plant.w, self.z or plant.z
@@ -70,7 +70,7 @@ class MeasuredObjective(Value):
         """Return the objective of a closed loop from w to z."""
 
     def judges(self, plant: AnyPlant, order: int) -> Sequence[Judge]:
-        """Return the objects (`Judge`) that compute the objective for controllers of an order."""
+        """Return the `Judge` objects that compute the objective for controllers of an order."""
         return [MeasuredJudge(plant, self, order)]
 
 

@@ -64,30 +64,32 @@ def design_structured(
     evaluations: int = 10_000,
     progress: bool | None = None,
 ) -> Controller:
-    """Return the controller of a given structure with the smallest norm found from w to z.
+    """Return the controller of a given structure with the smallest norm from w to z that was found.
 
     The search begins at several starts. From each start, the largest real part of the closed-loop
     poles is lowered first, until the loop is stable. Then the largest norm over all plants is
-    lowered; if there are several objectives, each norm is divided by its `below`. At a minimum of
+    lowered. If there are several objectives, each norm is divided by its `below`. At a minimum of
     the H-infinity norm, several peaks of the gain are often equally high. Each step therefore uses
-    the gains at all high peaks together, with their gradients (``d|T| = Re u* dT v``, where u and v
-    are the singular vectors) and second derivatives. The searches with the best results are
-    continued. The problem is not convex, so that another start may give a smaller norm.
+    the gains at all high peaks together, with their gradients and second derivatives. The gradients
+    are ``d|T| = Re u* dT v``, where T is the response from w to z, and u and v are its singular
+    vectors. The searches with the best results are continued. The problem is not convex, so that
+    another start may give a smaller norm.
 
     Parameters
     ----------
     plant : StandardPlant, sequence of StandardPlant, or mapping {position: StandardPlant}
-        Plant, continuous or sampled. If several plants are given, one controller is designed for
-        all of them; they must have the same u, y and rate. For a mapping by position, the loop is
-        also checked half way between positions, on plants that are interpolated linearly. A
-        labelled StateSpace is accepted.
+        Continuous or sampled plant. If several plants are given, one controller is designed for all
+        of them. They must have the same u, y and rate. For a mapping by position, the loop is also
+        checked half way between positions, on plants that are interpolated linearly. A StateSpace
+        with named channels is accepted.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
-        Structure of the controller, and start of the search.
+        Structure of the controller. It also gives the first start of the search.
     objective : Hinf, H2, PeakGain, MeasuredObjective, or sequence of these
         Objective to be minimised. If several objectives are given, each must have its bound
         `below`, and the largest ratio of an objective to its bound is minimised. Your own objective
-        derives from `synthesis.MeasuredObjective`. The H2 norm of a continuous plant with D12 and
-        D21 is finite only without a feedthrough of the controller: ``FixedOrder(n, direct=False)``.
+        is a subclass of `synthesis.MeasuredObjective`. For a continuous plant with D12 and D21
+        (feedthrough from u to z and from w to y), the H2 norm is finite only without a feedthrough
+        of the controller: ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     starts : int
@@ -96,21 +98,22 @@ def design_structured(
     rng : int, SeedSequence or Generator
         Random generator of the starts, or its seed.
     evaluations : int
-        Largest number of closed loops computed for each plant; the search then ends with the best
-        result so far.
+        Largest number of closed loops that are computed for each plant. The search then ends with
+        the best result so far.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. By default (None) it is shown on a terminal or in a
+        notebook, for work of more than two seconds.
 
     Returns
     -------
     Controller
-        Controller. Its `structure` is the given one with the parameters found, from which a further
-        design can begin. `gamma` is the largest verified norm (over `below`), `tried` the result of
-        each start. The certificate holds the norm of each plant and objective (for plants by
-        position the worst one, also between positions), and two figures of the local minimum:
-        `slope`, the norm of the smallest convex combination of the gradients of log gamma, and
-        `decrease left`, the relative decrease of gamma by a step of length `radius`, to first
+        The controller. Its `structure` is the given one with the parameters found, from which a
+        further design can begin. `gamma` is the largest verified norm (divided by `below`), and
+        `tried` lists the result of each start. The certificate holds the norm of each plant and
+        objective. For plants by position it is the worst one, also between positions. The
+        certificate also holds two numbers that show how near the result is to a local minimum.
+        `slope` is the norm of the smallest convex combination of the gradients of log gamma.
+        `decrease left` is the relative decrease of gamma by a step of length `radius`, to first
         order.
 
     Raises
@@ -118,7 +121,7 @@ def design_structured(
     AssumptionError
         When u does not excite, or y does not measure, a mode that is not stable.
     InfeasibleError
-        When no start is stabilised; the message has the frequency of the pole that remains
+        When no start leads to a stable loop. The message has the frequency of the pole that remains
         unstable.
     CertificateError
         When the norm of a loop differs from that of the search, or the loop is unstable between
@@ -129,7 +132,8 @@ def design_structured(
     Warns
     -----
     FlexplantWarning
-        When truncated modes make the loop unstable, or raise |S| at u above 8 dB; it names them.
+        When truncated modes make the loop unstable, or raise |S| at u above 8 dB. The warning names
+        these modes.
 
     References
     ----------

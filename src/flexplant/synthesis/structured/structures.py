@@ -92,20 +92,20 @@ class FixedOrder(Value):
     """A controller of given order, with all entries of A, B, C and (optionally) D free.
 
     One start of the search is the controller of full order, reduced to this order. Another start is
-    built up from the lowest order: the best controller of each order is found, and one state is
-    added to it for the next order.
+    built up from the lowest order. For this, the best controller of each order is found, and one
+    state is added to it for the next order.
 
     Parameters
     ----------
     order : int
         Number of states; 0 for a static gain.
     pattern : (nu, ny) array of bool, optional
-        Free entries of a static gain; the others are zero (decentralised feedback).
+        Entries of a static gain that are free. The others are zero (decentralised feedback).
     start : StateSpace, optional
-        Controller y -> u of this order with which the search begins, for example of an earlier
-        design.
+        Controller from y to u of this order with which the search begins, for example the result of
+        an earlier design.
     direct : bool
-        Whether D is free. Otherwise D is zero, so that the gain of the controller falls at high
+        Whether D is free. If not, D is zero, so that the gain of the controller falls at high
         frequency.
 
     Examples
@@ -238,12 +238,13 @@ def as_system(K: Matrices, names: tuple[Sequence[str], Sequence[str]], dt: float
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ObserverGains(Value):
-    """An observer of the plant's states with state feedback: the gains L and F are free.
+    """An observer of the plant's states with state feedback, whose gains L and F are free.
 
-    ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, where B2 is the input matrix of u, C2
-    the output matrix of y, and D22 the feedthrough from u to y, all three of the weighted plant.
-    The search starts with the gains of LQG. For a sampled plant, the observer is that of its
-    continuous equivalent by the bilinear transformation.
+    The controller is ``dx/dt = A x + B2 u + L (C2 x + D22 u - y)`` with ``u = F x``. A, B2, C2 and
+    D22 are the matrices of the weighted plant from u to y. The signs of L and F are opposite to
+    those of the usual Kalman gain and LQR gain, so that the poles of the loop are those of A + L C2
+    and A + B2 F. The search starts with the gains of LQG. For a sampled plant, the observer is that
+    of its continuous equivalent by the bilinear transformation.
 
     Examples
     --------
@@ -283,16 +284,17 @@ class ObserverGains(Value):
 
 
 class Parametrised:
-    """Any structure: a function of parameters that gives a controller.
+    """A structure that you write as a function from parameters to a controller.
 
     Parameters
     ----------
     make : function
-        Function of an (n,) array that returns a StateSpace y -> u, always of the same order,
-        sampled like the plant, and smooth in the parameters.
+        Function that takes an (n,) array of parameters and returns a StateSpace from y to u. The
+        controller has always the same order and the sampling of the plant, and depends smoothly on
+        the parameters.
     start : (n,) array
         Parameters at which the search begins. Each parameter is scaled by the magnitude of its
-        start, or by 1 if its start is 0.
+        start value, or by 1 if this value is 0.
     spread : float
         Relative size of the random differences between the starts of the search.
 
@@ -343,9 +345,10 @@ class TunedLaws(Value):
     """A decoupled controller ``u = -before diag(laws) after y`` whose parameters are optimised.
 
     The search starts with the given laws. It multiplies each free parameter (gain, corner
-    frequency, centre of a notch) by a positive factor, so that signs do not change and zeros stay
-    zero. Corner frequencies are limited to half the sampling rate, or for a continuous plant to ten
-    times its fastest pole. A corner frequency that is given above this limit is not increased.
+    frequency, centre of a notch) by a positive factor. Signs therefore do not change, and zeros
+    stay zero. Corner frequencies are limited to half the sampling rate, or for a continuous plant
+    to ten times its fastest pole. A corner frequency that is given above this limit is not
+    increased.
 
     Parameters
     ----------
