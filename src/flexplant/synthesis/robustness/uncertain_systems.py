@@ -75,8 +75,8 @@ def uncertain_system(
     M : StateSpace or control.StateSpace
         System with named channels, continuous or sampled. It includes the weights of the Deltas.
     blocks : sequence of RepeatedScalar and FullBlock
-        Blocks in the order of the channels. Blocks without a name are called `delta1`, `delta2`,
-        ...
+        Blocks in the order of the channels. Blocks without a name are called `delta1`, `delta2` and
+        so on.
     u, y : sequences of str
         Inputs that the controller drives and outputs that it reads.
 
