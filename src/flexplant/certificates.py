@@ -20,8 +20,8 @@ class Verified(Value):
     Parameters
     ----------
     what : str
-        Name of the checked quantity, with its unit in brackets if it has one, such as "norm" or
-        "corner [Hz]".
+        Name of the checked quantity, with its unit in brackets if it has one: "norm", "corner
+        [Hz]".
     figure : float
         Number that was found.
     route : str
