@@ -302,9 +302,9 @@ class ClosedLoop(Value):
     def modulus_margin(self) -> float:
         """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
-        This is ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``. The frequencies f are
-        refined at the closed loop's resonances. If actuators have different units, axes are scaled
-        as in `LoopReport.scaled_margin`. It is 0 for an unstable loop.
+        ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
+        loop's resonances. If actuators have different units, axes are scaled as in
+        `LoopReport.scaled_margin`. It is 0 for an unstable loop.
         """
         return self.broken.margin()
 
@@ -316,7 +316,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def on_machines(self) -> MachineLoops:
-        """The loops of this controller with the machines that agree with the measurement.
+        """The same controller around machines that agree with the measurement.
 
         A plant that knows no such machines raises ModelError.
         """
@@ -368,8 +368,8 @@ class ClosedLoop(Value):
         """Tolerances to errors of single modes; None if modes are coupled or the loop is unstable.
 
         If the plant has uncertain frequencies, truncated modes are included where they are known.
-        The range of changes is 1 %, or 2.5 times the uncertainty of the frequency. `interval`
-        covers simultaneous changes of all modes.
+        `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
+        or up to 2.5 times their uncertainty.
         """
         return reported_tolerances(self)
 
@@ -381,9 +381,9 @@ class ClosedLoop(Value):
         """Return the tolerance of the loop to errors of frequency and damping of each mode.
 
         One mode changes at a time. The results are the exact changes at which a pole crosses the
-        stability boundary, and at which the modulus margin falls to `margin`. If the loop gain is
-        above 1 at a mode with 0.1 % damping, the tolerance may be below 0.2 %. The frequencies of
-        an unmeasured model are seldom that accurate.
+        stability boundary, and at which the modulus margin falls to `margin`. A loop with a gain
+        above 1 at a mode of 0.1 % damping may tolerate less than 0.2 %, while the frequencies of
+        unmeasured modes of a model are seldom that accurate.
 
         Parameters
         ----------
@@ -442,8 +442,8 @@ class ClosedLoop(Value):
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
         """Return the one-sided power spectral density that all white noises together cause.
 
-        For a sampled loop it is the density of the samples, up to half the rate. Motion above half
-        the rate is included by aliasing. The integral is therefore the variance ``rms(channel)^2``.
+        For a sampled loop it is that of the samples, up to half the rate: motion above half the
+        rate is included by aliasing, so that its integral is the variance ``rms(channel)^2``.
 
         Parameters
         ----------

@@ -302,12 +302,12 @@ def modulus_margin(loop: Loop) -> float:
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        Loop, as for `loop_gain`. Stability is judged first: for a model by its poles, and for a
-        measured plant by a Nyquist count as in `report_loops`. The count assumes that the plant has
-        no unstable poles. It assumes free rigid-body modes if the response is proportional to 1/f^2
-        at the lowest frequencies. For a measured plant, S is evaluated at its frequencies, and
-        between them at the modes that the data show. If the actuators have several units (N and N
-        m), the result is the margin with scaled axes, `LoopReport.scaled_margin`.
+        As for `loop_gain`. Stability is judged first: for a model by its poles, and for a measured
+        plant by a Nyquist count as in `report_loops`. The count assumes that the plant has no
+        unstable poles. If a response is proportional to 1/f^2 at the lowest frequencies, the motion
+        counts as a free rigid-body motion. For a measured plant, S is evaluated at its frequencies,
+        and between them at the modes that are visible in the data. If the actuators have several
+        units (N and N m), the result is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------

@@ -227,7 +227,7 @@ def servo_bandwidth(
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Upper bound on the largest singular value of the sensitivity S at u. A peak of 2 is 6 dB.
+        Upper bound on the largest singular value of S at u; 2 is 6 dB.
 
     Returns
     -------
