@@ -55,7 +55,7 @@ from .other_machines import (
 class ClosedLoop(Value):
     """A plant with its controller, ``u = K y``, with named signals.
 
-    Made by `close_loop`. A plant has inputs w (noises, disturbances, references) and u (commands),
+    `close_loop` makes it. A plant has inputs w (noises, disturbances, references) and u (commands),
     and outputs z (motions and errors at points of interest) and y (sensors, references).
 
     Parameters
@@ -396,8 +396,8 @@ class ClosedLoop(Value):
         Raises
         ------
         AssumptionError, ModelError
-            When the loop is unstable; when the plant's modes are coupled by damping, the plant was
-            not assembled from a structure, a sensor measures accelerations, or a number is out of
+            When the loop is unstable, damping couples the plant's modes, the plant was not
+            assembled from a structure, a sensor measures accelerations, or a number is out of
             range.
 
         Warns
@@ -426,8 +426,8 @@ class ClosedLoop(Value):
         Raises
         ------
         AssumptionError, ModelError
-            When the loop is not stable, or white noise reaches an output directly; when the noise
-            of the plant is not known, or the variance is infinite.
+            When the loop is not stable, white noise reaches an output directly, the noise of the
+            plant is not known, or the variance is infinite.
         CertificateError
             When two Lyapunov equations give different variances.
         """
@@ -534,9 +534,9 @@ def close_loop(
     Warns
     -----
     FlexplantWarning
-        When the closed loop is unstable, or is unstable with the truncated modes, or the tolerance
-        of a mode of an uncertain plant is less than twice its uncertainty; the loop is returned
-        anyway. Marginal poles (a free rigid-body mode) are only named in its repr.
+        When the closed loop is unstable, also if only the truncated modes make it so, or a mode of
+        an uncertain plant tolerates less than twice its uncertainty. The loop is returned anyway.
+        Marginal poles (a free rigid-body mode) are only named in its repr.
 
     Raises
     ------

@@ -229,8 +229,8 @@ def report_loops(
     Raises
     ------
     LabelError, ModelError
-        When channels of plant and controller do not match; when `loop` has another type, or a
-        number of poles is not valid.
+        When channels of plant and controller do not match, `loop` has another type, or a number of
+        poles is not valid.
 
     Examples
     --------
@@ -339,7 +339,9 @@ LOW = 0.1
 
 @dataclass(frozen=True, eq=False)
 class LoopFigures(Value):
-    """Figures of one closed loop. S is its response from the reference to the error at the POI.
+    """Figures of one closed loop, from its sensitivity S.
+
+    S is the response from the reference to the error at the point of interest (POI).
 
     Parameters
     ----------
@@ -353,7 +355,7 @@ class LoopFigures(Value):
     peak, peak_freq : float [1], [Hz]
         The largest |S| and its frequency.
     low : float [1]
-        |S| at `low_freq`.
+        Value of |S| at `low_freq`.
     low_freq : float [Hz]
         Frequency of `low`, equal for all loops of a comparison.
     margin : float

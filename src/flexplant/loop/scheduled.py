@@ -22,7 +22,7 @@ from .closed import ClosedLoop, close_loop
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScheduledLoop(Value):
-    """Closed loops of one machine at several positions; made by `schedule_loops`.
+    """Closed loops of one machine at several positions: the result of `schedule_loops`.
 
     Between these positions the matrices of the controller are interpolated linearly. All designs
     have the same states in the same coordinates. The commands therefore stay continuous while the
@@ -31,7 +31,7 @@ class ScheduledLoop(Value):
     Parameters
     ----------
     position : str
-        The scheduling variable.
+        Name of the scheduling variable.
     places : (k,) array [m or rad]
         Increasing values of the scheduling variable at which loops are given.
     loops : sequence of k ClosedLoop

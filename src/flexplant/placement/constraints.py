@@ -343,12 +343,6 @@ class OffPoi(Constraint):
     the positive ones. All other points of a relative POI are not excluded, because sensors may
     measure against the frame.
 
-    Sensors are never placed at a POI, except those that the plant already has there. A radius
-    excludes the whole die; a negative radius allows all places. A relative POI such as
-    ``at={"tip:x": 1, "frame:x": -1}`` lies at its points of positive weight. It lies at the other
-    points if the plant's own relative sensors touch only the positive ones. The reference points
-    are not excluded: other sensors may measure against the frame.
-
     Parameters
     ----------
     radius : float [m]

@@ -121,7 +121,7 @@ class ModeInformation(ByShapes):
     elastic: bool = field(default=False, metadata=checked(flag))
 
     def of(self, plant: StandardPlant, shapes: PlacedShapes) -> ModeRows:
-        """Return the information of choices."""
+        """Return the object that scores choices by their Fisher information."""
         kept = shapes.elastic if self.elastic else slice(None)
         # units in which the best of the sensors has noise 1: constants do not decide
         rows = shapes.phi[:, kept] * (1e-12 / shapes.asd)[:, None]

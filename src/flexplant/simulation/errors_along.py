@@ -88,8 +88,8 @@ def rms_along(
 ) -> PathRms:
     """Return the standard deviation of every channel of a loop whose machine moves.
 
-    The covariance P of the states of plant and controller is computed sample by sample as ``P[k +
-    1] = A[k] P[k] A[k]' + G[k] G[k]'``, without random numbers. A is the system matrix of the
+    The covariance P of the states of plant and controller is computed without random numbers, by
+    ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` from sample to sample. A is the system matrix of the
     closed loop at the position of the sample, and G the gain from white noises of unit variance to
     the states. In a ClosedLoop the controller with its observer is constant. In a ScheduledLoop it
     changes with the position.

@@ -166,9 +166,9 @@ def design_feedforward(
     ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the mass and k_3 the mass
     times the delay. k_4 contains half the square of the delay, and the negative compliance of the
     flexible modes between actuators and POI (point of interest). For a machine on springs k_0 and
-    k_1 are stiffness and damping. The coefficients are Cauchy integrals on a circle around zero. It
-    is the largest circle on which two radii agree and inside which the series equals the inverse.
-    Zeros of P lie outside of it.
+    k_1 are stiffness and damping. The coefficients are Cauchy integrals on a circle around zero.
+    The circle is the largest one for which the results of two radii agree and inside which the
+    series equals the inverse. Zeros of P lie outside of it.
 
     The frame of a machine on isolators gives P zeros at low frequency. Above their frequency, the
     power series is wrong. If the plant is sampled, its stable zeros below a hundredth of the rate
@@ -186,7 +186,7 @@ def design_feedforward(
     move differently. Poles of the controller and zeros of P may be as slow as the moves. The errors
     are weighted with the spectrum of the move. If no move is given, the spectrum is that of a move
     with a duration of about ``3 / bandwidth`` of the loop. The feedforward then has no force at
-    rest if the plant needs none. Gains of a lower order are the best of that order.
+    rest if the plant needs none. With a lower `order`, the gains are the best ones of that order.
 
     Parameters
     ----------
@@ -223,8 +223,8 @@ def design_feedforward(
     AssumptionError
         When the actuators cannot move the axes of the POI independently.
     ModelError
-        When the plant was not assembled from a structure or is weighted, or the order is not 2 to
-        4; when a move is given without a loop, or elements without a move.
+        When the plant was not assembled from a structure or is weighted, the order is not 2 to 4, a
+        move is given without a loop, or elements are given without a move.
 
     Warns
     -----

@@ -232,7 +232,7 @@ def lqg(
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `lqr` and `lqe`.
+        As for `lqr` and `lqe`.
 
     Examples
     --------

@@ -69,10 +69,10 @@ def design_servo(
     - spring line: ``k F(s) / s``; response that is zero at zero frequency: ``k F(s)``.
 
     Here w_i is the corner of the integral action, and F is a second-order roll-off with the
-    notches. Between two lines, the law with the smaller peak of |S| at u is used. The gain k makes
-    the loop gain of the axis 1 at the bandwidth. If |S| at u then exceeds 6 dB next to a resonance,
-    k is computed from the response at s = sigma, if this keeps 6 dB. If a mode lies above the
-    bandwidth within a factor of 4, a wide lead is tried: the number 4 in the mass line's law
+    notches. If the slope lies between two lines, the law with the smaller peak of |S| at u is used.
+    The gain k makes the loop gain of the axis 1 at the bandwidth. If |S| at u exceeds 6 dB next to
+    a resonance, k is found from the response at s = sigma, if this keeps 6 dB. If a mode lies
+    within a factor of 4 above the bandwidth, a wide lead is tried: each 4 in the mass line's law
     becomes 16, or 64 if 16 does not keep 6 dB. It suppresses the error up to a higher frequency,
     but less at low frequencies, and passes more noise to the actuators. A notch has the damping of
     its mode. Its frequency is that of the mode, or lower for a fast mode, so that errors of the

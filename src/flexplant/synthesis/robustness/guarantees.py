@@ -129,10 +129,10 @@ def robust_stability(
     A Delta is an uncertainty that is scaled to size 1. The structured singular value mu is one over
     the size of the smallest Deltas that make the loop unstable. Deltas of frequencies, damping and
     parameters are real numbers. All neglected modes together are one full complex block. Unmodelled
-    dynamics and the blocks of `uncertain_system` keep their kind. The bound holds at all
-    frequencies, also between grid points. A sampled loop is examined with its sampling and delay.
-    The result is checked on machines that are drawn from the uncertainty. The loop of each machine
-    is computed exactly.
+    dynamics and the blocks of `uncertain_system` are real, complex or full, as they were defined.
+    The bound holds at all frequencies, also between grid points. A sampled loop is examined with
+    its sampling and delay. The result is checked on machines that are drawn from the uncertainty.
+    The loop of each machine is computed exactly.
 
     Parameters
     ----------
