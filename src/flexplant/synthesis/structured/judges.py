@@ -248,7 +248,7 @@ class Judge(Protocol):
         """Return the number (infinite for an unstable loop), and the place where it occurs."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
-        """Return logarithms of functions near the number, including the one at `place`."""
+        """Return logarithms of functions near the number, including the one at the place."""
         # `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
         # the place alone counts
 
