@@ -53,8 +53,7 @@ def tune_loops(
     margins. `close_loop` takes `design.system`, and `write_c` exports it. With ``before=`` and
     ``after=`` several axes are decoupled; `decouple` computes both. If the measured frequencies do
     not resolve a resonance, the loop gain is kept small there. The result is the best of many
-    starts, without proof that it is optimal. A warning is given if the peak is exceeded. The page
-    `algorithms` describes the method.
+    starts, without proof that it is optimal. The page `algorithms` describes the method.
 
     The law of an axis depends on the slope of its response: that of a mass (-40 dB per decade), of
     a damper (-20 dB) or of a spring (0 dB). If there is a single axis and it is unstable, or
