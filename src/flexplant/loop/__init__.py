@@ -5,10 +5,10 @@
   ``budget`` by source.
 - `sensitivity`, `complementary_sensitivity`, `control_sensitivity`, `loop_gain`, `bandwidth`.
 - `report_loops`: crossovers, gain, phase and modulus margins of each loop, broken at u or y.
-- `DelayedLoop`: loops with a continuous delay, and PD laws, without sampling them.
-- `compare_loops`: several designs, or one on model and machine, in one table.
+- `DelayedLoop`: loops with a delay in continuous time. They need not be sampled.
+- `compare_loops`: several designs, or one design on model and machine, in one table.
 
-Every quantity also accepts a measured `fx.Frf` as plant; `in_axes` transforms it to decoupled axes.
+The plant may also be a measured `fx.Frf`. `in_axes` transforms it to decoupled axes.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -21,9 +21,9 @@ Every quantity also accepts a measured `fx.Frf` as plant; `in_axes` transforms i
 >>> round(report["u1"].phase_margin), round(loop.rms("die:error") * 1e9)
 (41, 247)
 
-Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, for a loop
-gain L (a system or a measured `fx.Frf`), for ``(plant, controller)`` or a closed loop;
-``loopsens``: `sensitivity` and similar functions.
+Names in MATLAB: ``margin`` and ``allmargin`` correspond to `report_loops` and `fx.modulus_margin`.
+They take a loop gain L (a system or a measured `fx.Frf`), ``(plant, controller)`` or a closed loop.
+``loopsens`` corresponds to `sensitivity` and similar functions.
 """
 
 from ..certificates import Certificate as Certificate

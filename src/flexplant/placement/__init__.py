@@ -3,12 +3,12 @@
 - `place_sensors(plant, candidates, count)`: the best choice for the error at the POI.
 - `place_actuators`, `place_both`: the same for forces, and for both together.
 - `score_sensors`, `score_actuators`: the score of each candidate alone.
-- `sensor_map`: the error over a grid of places of one more sensor.
-- `pareto_curve`: the best score over the number of devices.
+- `sensor_map`: the error with one more sensor, for each place of a grid.
+- `pareto_curve`: the best score for each number of devices.
 
-Criteria are objects (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as are constraints
+Criteria are objects (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...). So are constraints
 (`Excluded`, `OffPoi`, `MinimumDistance`, ...) and searches (`Exchange`, `Exhaustive`,
-`BranchAndBound`, which proves its answer).
+`BranchAndBound`). `BranchAndBound` proves its answer.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()

@@ -1,16 +1,16 @@
 """Set-points, sampled-data runs of a closed loop, and error metrics.
 
-- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with nonlinear `elements=`
-  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, your own) and
-  optionally between samples; the noise is that of `fx.design_kalman`.
-- `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
-- `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk; `input_shaper` (ZV, ZVD, EI,
-  robust to a change of the frequency) and `quiet_setpoint` leave modes at rest;
-  `residual_vibration` predicts the remaining vibration on the evaluation model.
+- `simulate(loop, reference=, duration=, rng=)` returns a `Response`. The noise is that of
+  `fx.design_kalman`. `elements=` adds nonlinear elements: `Saturation`, `Quantiser`, `Hysteresis`,
+  `Dropout`, `Jitter`, `Friction` or your own. `finer=` also gives the motion between samples.
+- `spectral_noise`: noise with a measured or a 1/f spectrum, for `simulate(disturbance=)`.
+- `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk. `input_shaper` (ZV, ZVD, EI)
+  and `quiet_setpoint` leave modes at rest. `residual_vibration` predicts the remaining vibration on
+  the evaluation model.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
-- `Specification`: limits on margins and errors; a verdict compares them with achieved values.
+- `Specification`: limits on margins and errors. Its verdict compares them with achieved values.
 - `rms_along(loop, moving=)`: the errors of a moving machine along its path.
-- `study(machines, pipeline, executor=)`: one pipeline for many machines, with resume.
+- `study(machines, pipeline, executor=)`: one pipeline for many machines. It continues after a stop.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -28,7 +28,8 @@ model correspond to `simulate`.
 
 **Many machines.** A pipeline is a plain function that takes one machine and returns a row of the
 table. `examples/fleet.py` has the whole chain: measure, update, calibrate, design, verify on the
-machine. With the names of the README's script, one controller for machines with other masses:
+machine. The pipeline below tries one controller on machines with other masses. It continues the
+script of the README and uses its names:
 
 ```python
 MASSES = [0.3, 0.6]  # kg

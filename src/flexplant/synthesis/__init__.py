@@ -3,20 +3,21 @@
 A `Controller` holds the results of its checks: the norm by two methods, stability, the loop on the
 evaluation model of the plant (with the truncated modes), and the allowed error of each mode.
 
-- `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: its largest
-  bandwidth.
+- `design_servo(plant, bandwidth=)`: decoupled PID on the estimate. `servo_bandwidth` gives its
+  largest bandwidth.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
 - `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf`;
   `design_structured` (fixed order, PID and notches; your own objective derives from
   `MeasuredObjective`).
-- `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: also for a measured FRF
-  without a model.
+- `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`. A measured FRF without a
+  model suffices.
 - `damp_modes`: velocity feedback, positive position feedback, integral resonant control.
 - `mu`, `robust_stability`, `robust_performance`, `worst_case_gain`, `design_mu`: guarantees for
-  uncertain plants, from machines (``plant.uncertain``) or your own blocks (`uncertain_system`).
+  uncertain plants. ``plant.uncertain`` makes them from machines, `uncertain_system` from your own
+  blocks.
 
-For the implementation: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
-`second_order_sections`; `fx.export.write_c` and `fx.export.write_fmu` write code.
+`reduce_controller`, `discretise_controller`, `anti_windup_form` and `second_order_sections` prepare
+a controller for implementation. `fx.export.write_c` and `fx.export.write_fmu` write code.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -42,7 +43,8 @@ For the implementation: `reduce_controller`, `discretise_controller`, `anti_wind
 | ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
 | ``ultidyn``, ``uss`` | `fx.plant.UnmodelledDynamics`, `uncertain_system` |
 
-Dense methods suit plants of up to some 500 states; `Lmi` and `design_lmi` take 20.
+The methods use dense matrices and suit plants of up to about 500 states. `Lmi` and `design_lmi`
+accept up to 20 states.
 """
 
 from ..plant.uncertainty.delta_blocks import FullBlock as FullBlock
