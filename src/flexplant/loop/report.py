@@ -393,13 +393,14 @@ class LoopComparison(Value):
         Input and output of the sensitivity S, such as ``die:ref to die:error``. Empty when the
         loops have no reference.
     sampled : bool
-        Whether `decay` of the rows is a spectral radius.
+        Whether the loops are sampled. Then `decay` of the rows is the spectral radius. For
+        continuous loops it is the spectral abscissa.
     unjudged : sequence of str
         Names of the loops whose plants have no evaluation model.
     intervals : mapping {name: str}
-        Text of the intervals of margin and bandwidth over the machines that agree with a
-        measurement, or the reason why there are no intervals. Only loops whose plants know such
-        machines are included.
+        Text of the intervals of margin and bandwidth, or the reason why there are none. An interval
+        holds 95 % of the machines that the measurement of a fit allows (`FitMachines`). A loop is
+        included only if such machines were given to its plant.
     """
 
     rows: Mapping[str, LoopFigures]

@@ -58,7 +58,7 @@ _NO_MODES = ModalRealisation(
 
 @dataclass(frozen=True, eq=False)
 class PlantChannel(Value):
-    """A channel of imported state-space matrices as a port: a row of C or a column of B.
+    """A port that stands for a channel of a plant without a structure: a row of C or a column of B.
 
     Parameters
     ----------

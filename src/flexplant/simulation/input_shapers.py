@@ -51,8 +51,8 @@ class InputShaper(Value):
     def residual(self, freq: npt.ArrayLike, damping: npt.ArrayLike) -> FloatArray:
         """Return the remaining vibration of modes relative to that without the shaper.
 
-        After an impulse it is ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta omega t_i) e^(j omega_d
-        t_i)|`` [Singer1990]_.
+        For a command that is an impulse, the ratio is ``V = e^(-zeta omega t_n) |sum_i a_i e^(zeta
+        omega t_i) e^(j omega_d t_i)|`` [Singer1990]_.
 
         Parameters
         ----------

@@ -111,9 +111,9 @@ class Element(Protocol):
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
         """Return the function that acts on the values (runs,) of the channel, sample by sample.
 
-        If the element acts on a disturbance, the function receives values of the channel of y that
-        the attribute `reads` of the element names. It then returns the force, such as that of a
-        mechanical stop or a stiffening spring.
+        If the element acts on a disturbance, its attribute `reads` is the name of a channel of y.
+        The function then receives the values of this channel and returns the force, such as that of
+        a mechanical stop or a stiffening spring.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class Element(Protocol):
             Sampling time of the controller.
         generators : sequence of Generator
             Random generators, one for each run, so that a run does not depend on the others. Each
-            call resets the memory of the element.
+            call of `begin` starts with an empty memory of the element.
         """
         ...
 
@@ -149,7 +149,7 @@ class Hysteresis(Value):
     width: float = field(metadata=checked(positive))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the function that applies the play, for the given number of runs."""
+        """Return the function that applies the play, with one state for each generator."""
         now = np.zeros(len(generators))
 
         def play(values: FloatArray) -> FloatArray:
@@ -183,7 +183,7 @@ class Dropout(Value):
     )
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the function that loses samples for the given number of runs."""
+        """Return the function that loses samples, in a separate run for each generator."""
         last = np.full(len(generators), np.nan)
 
         def read(values: FloatArray) -> FloatArray:
@@ -227,7 +227,7 @@ class Friction(Value):
     reads: str = field(metadata=checked(instance, kind=str, hint="Name a channel of y."))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the forces for the given number of runs, zero at the first sample."""
+        """Return the function that computes the forces, which are zero at the first sample."""
         force, last = np.zeros(len(generators)), np.full(len(generators), np.nan)
 
         def pull(motion: FloatArray) -> FloatArray:

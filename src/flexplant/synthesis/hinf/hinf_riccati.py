@@ -65,19 +65,22 @@ class Riccati(Value):
     The equations make two assumptions. First, the feedthrough D12 from u to z and the feedthrough
     D21 from w to y have full rank. Second, w excites and z observes every mode on the stability
     boundary (undamped mode). If a rank is missing, a small noise on each sensor and a small effort
-    of each actuator are added. They are at most 1e-3 of the plant's own signals at the speed of its
-    loop. If w does not excite an undamped mode, a small disturbance at the actuators is added to w.
-    If z does not observe one, a small multiple of the sensors is added to z. A mode counts as
-    undamped if its decay rate is less than 1e-6 of the speed of the loop, or less than 1e-2 if
-    several such modes lie close together. The loop is verified without these additions. The notes
-    of the controller state what was added and how much gamma increases by it.
+    of each actuator are added. Their size is measured at the speed of the loop [rad/s]. This is an
+    estimate, from the weights and the plant, of the frequency up to which the loop acts. There the
+    noise is at most 1e-3 of the signal that w causes at the sensor, and the effort is at most 1e-3
+    of the signal that u causes in z. If w does not excite an undamped mode, a small disturbance at
+    the actuators is added to w. If z does not observe one, a small multiple of the sensors is added
+    to z. A mode counts as undamped if its decay rate is less than 1e-6 of the speed of the loop, or
+    less than 1e-2 if several such modes lie close together. The loop is verified without these
+    additions. The notes of the controller state what was added and how much gamma increases by it.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. If D12 and D21 have full rank, it is 0.5 %
-        by default, or 0.3 % if something is added for an undamped mode or to a tiny effort or
-        noise. Otherwise it is 5 % by default.
+        Relative distance from the smallest gamma found. The default is 0.5 % if D12 and D21 have
+        full rank and nothing is added to the plant. It is 0.3 % if the ranks are full but something
+        is added, because of an undamped mode or because a direct term is tiny. It is 5 % if a rank
+        is missing.
     tolerance : float
         Relative width of the interval of gamma at which the bisection stops.
     progress : bool, optional
@@ -102,7 +105,7 @@ class Riccati(Value):
     progress: bool | None = None
 
     def solve(self, problem: Prepared) -> SolvedController:
-        """Return the controller of a prepared problem.
+        """Return the controller of the plant that `design_hinf` has scaled and checked.
 
         Raises
         ------

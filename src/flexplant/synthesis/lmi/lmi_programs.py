@@ -286,7 +286,7 @@ class Lmi(Value):
     max_states: int = field(default=20, metadata=checked(whole))
 
     def solve(self, problem: Prepared) -> SolvedController:
-        """Return the controller of a prepared problem.
+        """Return the controller of the plant that `design_hinf` has scaled and checked.
 
         Raises
         ------
