@@ -92,8 +92,8 @@ def tune_loops(
     Warns
     -----
     FlexplantWarning
-        When the peak is exceeded. The warning states the largest |S|, the channel at which it occurs,
-        and its frequency. The `notes` of the result contain the same text.
+        When the peak is exceeded. The warning states the largest |S|, the channel at which it
+        occurs, and its frequency. The `notes` of the result contain the same text.
 
     Examples
     --------
