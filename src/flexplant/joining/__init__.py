@@ -1,10 +1,12 @@
-"""Joining of components by joints and patches, with certificates; also of measured FRFs.
+"""Joining of components, which are models or measured FRFs, by joints and patches.
 
-- `joined(components, joints)`: models and reduced models become one; labels are ``"stage/41:z"``.
+- `joined(components, joints)`: makes one machine of components and checks it. Its labels begin with
+  the name of the component, such as ``"stage/41:z"``.
 - `Joint`: rigid, or springs and dampers, between places of two components.
-- `Patch`: surfaces whose meshes do not match; `coincident_joints` for meshes that do.
+- `Patch`: joins surfaces whose meshes do not match.
+- `coincident_joints`: joins surfaces whose meshes match, node by node.
 - `Pose`: position and orientation of a component.
-- `uncoupled`: takes a component out of a measured machine's responses.
+- `uncoupled`: removes a component from the measured responses of a machine.
 
 >>> import flexplant as fx
 >>> stage = fx.chain(masses=[2.0, 1.0], stiffnesses=[1e5])

@@ -157,7 +157,8 @@ class PlacedShape(Interpolation):
     own, pose : Interpolation, Pose
         Interpolation of the component in its own coordinates, and its pose.
     C : (n, n) sparse array
-        Map of its DOFs from its own directions to those of the machine, ``q = C q_own``.
+        Matrix of ``q = C q_own``. It changes the DOFs q_own in the component's own directions into
+        the DOFs q in the directions of the machine.
 
     Examples
     --------
@@ -176,20 +177,20 @@ class PlacedShape(Interpolation):
     C: sp.csc_array
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion `direction` at a point of it."""
+        """Return the weights (n,) with which the DOFs give the motion at a point."""
         return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
         places = self.pose.own_points(points)
         found = sum(share * self.own.rows(places, own) for own, share in self._shares(direction))
         return np.asarray((self.C @ np.asarray(found).T).T)
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
+        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None.
 
-        After a rotation of the component, the DOF combines several directions of its node. All of
-        these must be known.
+        After a rotation of the component, the DOF combines several directions of its node. The
+        motions of the node in all these directions must be known.
         """
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
@@ -221,7 +222,8 @@ class JoinedShape(Interpolation):
     parts : sequence of DofSet
         DOFs of the placed components with their shapes.
     expansion : (n_all, n) sparse array, optional
-        Matrix that gives all DOFs of all components from the remaining ones. None: all remain.
+        Matrix that computes the DOFs of all components from the n DOFs of the machine. None: the
+        joints removed no DOF.
     motions : (n_all, k) array, optional
         All motions that a reduced machine can make, one in each column. They show whether the
         places of two components at one point move together.
@@ -244,10 +246,10 @@ class JoinedShape(Interpolation):
     motions: FloatArray | None = None
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of the DOFs in the motion `direction` at a point.
+        """Return the weights (n,) with which the DOFs give the motion at a point.
 
-        The point must lie on a component that has this motion. If it also lies on another
-        component, both must move together there; otherwise a LabelError is raised.
+        The point must lie on a component that can move in the given direction. If it also lies on
+        another component, both must move together there. Otherwise a LabelError is raised.
         """
         found: dict[str, FloatArray] = {}
         failed: list[str] = []
@@ -273,7 +275,7 @@ class JoinedShape(Interpolation):
         return rows[0]
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None."""
         for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
             rest = label.removeprefix(f"{name}/")
             if rest == label:
@@ -304,12 +306,14 @@ _ORTHOGONAL = SAME
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pose(Value):
-    """Position and orientation of a component: its point p moves to ``R p + shift``.
+    """Position and orientation of a component in a machine.
+
+    The point p of the component is at ``R p + shift`` in the machine.
 
     Parameters
     ----------
     shift : (3,) array [m]
-        New position of its origin.
+        Position of the component's origin in the machine.
     rotation : (3,) array [rad] or (3, 3) array
         Either the rotation vector or the rotation matrix R. The rotation vector gives a rotation
         about the origin of the component: its direction is the axis of the rotation, and its length
@@ -364,11 +368,11 @@ class Pose(Value):
         return np.asarray((xyz - self.shift) @ self.rotation)
 
     def own_ground(self) -> FloatArray:
-        """Return the (6, 6) map of ground motion about the machine's origin to the component's.
+        """Return the (6, 6) matrix that maps a ground motion from the machine to the component.
 
-        The ground moves by the translation v and the rotation w, both in the machine's coordinates.
-        In the component these are the translation ``R^T (v + w x shift)`` and the rotation
-        ``R^T w``.
+        In the coordinates of the machine, the ground motion is a translation v and a rotation w
+        about the machine's origin. In the coordinates of the component, it is the translation
+        ``R^T (v + w x shift)`` and the rotation ``R^T w`` about the component's origin.
         """
         x, y, z = self.shift
         back = self.rotation.T

@@ -142,23 +142,24 @@ def uncoupled(
 ) -> Frf:
     """Return the responses of a machine without some of its components.
 
-    The negative of a known component is coupled to the machine at its joints, so that the remainder
-    responds as if the component had never been joined. This is decoupling by LM-FBS, Lagrange
-    multiplier frequency-based substructuring. A spring between the component and the remainder
-    stays attached to the remainder; its other end is then free.
+    The responses of each known component are multiplied by -1 and joined to the machine at the
+    joints of the component. The remainder then responds as if the component had never been joined.
+    This is decoupling by LM-FBS, Lagrange multiplier frequency-based substructuring. A spring
+    between the component and the remainder stays attached to the remainder, with a free end.
 
-    The result is a difference: where the component dominates the machine, errors of 1 % in the
-    responses may be larger than the result. The variances of the responses give the variance of the
-    result to first order; the errors of different responses are assumed independent. If no response
-    has a variance, an error of 1 % in each response is assumed, and only for the warning below. For
-    exact responses, set their ``variance`` to 0.
+    The result is a difference of responses. Where the component dominates the machine, errors of
+    1 % in the responses may be larger than the result. The variance of the result is computed from
+    the variances of the responses to first order. It is assumed that the errors of different
+    responses are independent. If no response has a variance, the result has none. The warning below
+    then assumes an error of 1 % in each response. For exact responses, set ``variance`` to 0.
 
     Parameters
     ----------
     machine : Frf
-        Responses of the whole machine, with channels named "stage/41:z" as by `joined`. At the
-        joints of the removed component it needs channels that are both outputs and inputs: those of
-        the component, or of the other end of a rigid joint.
+        Responses of the whole machine, with channels named as by `joined`, for example
+        "stage/41:z". Along each axis of a joint of a removed component, one channel must be both an
+        output and an input. This is the channel of the component. If the joint is rigid, it may
+        also be the channel at the other end.
     known : mapping {str: Frf}
         Components to remove, at the same frequencies.
     joints : Joint or sequence of Joint
@@ -168,10 +169,10 @@ def uncoupled(
         lever arms.
     extended : bool
         Whether to use more channels than those of the joints: all channels of the known components
-        that are also outputs or inputs of the machine. This gives more equations than unknown
-        forces. They are solved by least squares, with a rank that is limited to that of the joints.
-        It helps where the channels at the joints hardly determine the forces of the joints. An
-        additional channel may be only an output or only an input.
+        that are also outputs or inputs of the machine. There are then more equations than unknown
+        forces, and they are solved by least squares. The solution keeps as many singular values as
+        the joints have independent forces. The additional channels help where the channels at the
+        joints hardly determine these forces. Each may be only an output or only an input.
 
     Returns
     -------
@@ -186,8 +187,8 @@ def uncoupled(
     Warns
     -----
     FlexplantWarning
-        When the interface is so badly conditioned that measurement errors would hide the result, or
-        errors exceed the result at some lines.
+        When the matrix of the joints has such a large condition number that measurement errors
+        would hide the result, or when errors exceed the result at some frequencies.
 
     References
     ----------

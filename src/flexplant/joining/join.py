@@ -63,58 +63,61 @@ def joined(
     The rigid joints are the constraints ``B q = 0`` on the coordinates q of all components. They
     are fulfilled by ``q = T q_k``, where q_k are the coordinates that remain. The machine then has
     the mass ``T^T M T``, the stiffness ``T^T (K + b k b^T) T`` and the damping
-    ``T^T (D + b c b^T) T``. M, K and D are the block-diagonal matrices of all components, ``b^T q``
-    is the stretch of a spring or damper, k its stiffness and c its rate. The dependent coordinates
-    are found by QR with column pivoting, separately for groups of constraints that share
-    coordinates. Joints that repeat others are allowed.
+    ``T^T (D + b c b^T) T``. M, K and D are the block-diagonal matrices of all components. The
+    stretch of a spring or damper is ``b^T q``, its stiffness is k, and its damping (force per
+    velocity) is c. QR with column pivoting finds the coordinates that depend on others. Constraints
+    without common coordinates are treated separately. Joints that repeat others are allowed.
 
     Parameters
     ----------
     components : mapping {str: FEModel or ReducedModel}, or {str: Frf}
-        Components by name. Labels of the machine begin with the name: "stage/41:z". Either all or
-        none of the components are measured responses. A joint of measured responses needs, at each
-        of its ends, the motion as an output and the force as an input: the output is named "41:z",
-        the input "41:z" or "u 41:z".
+        Components by name. Labels of the machine begin with the name, for example "stage/41:z".
+        Models and measured responses cannot be joined with each other. A joint of measured
+        responses needs two channels at each of its ends: the motion as an output and the force as
+        an input. The output is named "41:z", and the input "41:z" or "u 41:z".
     joints : Joint or sequence of Joint
-        Joints between the components. The second end of a rigid joint follows the first.
+        Joints between the components. If a rigid joint makes two DOFs equal, the machine usually
+        keeps the DOF of the component that is listed first.
     placed : mapping {str: Pose}, optional
-        Poses of components. None: no component is moved. Labels and coordinates of the result are
-        those of the machine.
+        Poses of components in the machine. None: no component is moved. The result has the labels
+        and the coordinates of the machine.
     name : str, optional
         Name of an FEModel, for display.
     dofs : mapping {str: DofSet}, optional
-        Positions of the nodes of measured components in the coordinates of the machine, for joints
-        with lever arms and patches. The mean motion of a `Patch` is computed from the outputs on
-        it, and its force is distributed over the inputs on it. The outputs and the inputs may be at
-        different places; this is the virtual point transformation.
+        Positions of the nodes of measured components, in the coordinates of the machine. Patches
+        and joints with lever arms need them. The mean motion of a `Patch` is computed from the
+        outputs on it, and its force is distributed over the inputs on it. The outputs and the
+        inputs may be at different places. This is called the virtual point transformation.
 
     Returns
     -------
     FEModel, ReducedModel or Frf
-        A sparse FEModel from FEModels; a ReducedModel when a component is reduced. DOFs that the
-        rigid joints remove can still be used as places, by their labels. The attribute `joining` of
-        a model holds the checks of `JoiningReport`. Modes that the reduction of a component left
-        out are lost. For measured responses the result is ``Y - Y B^T (B Y B^T + Z)^-1 B Y``. Here
-        Y is the block-diagonal matrix of the components' responses, B y the stretch of the joints
-        in the motions y, and Z the compliance of springs and dampers. This method is called LM-FBS,
-        Lagrange multiplier frequency-based substructuring. The variances of the responses give
-        those of the machine to first order; errors of different components are assumed independent.
+        A sparse FEModel when all components are FEModels, and a ReducedModel when a component is
+        reduced. DOFs that the rigid joints remove can still be used as places, by their labels. The
+        attribute `joining` of a model is a `JoiningReport`. The machine does not contain the modes
+        that the reduction of a component left out. For measured responses the result is
+        ``Y - Y B^T (B Y B^T + Z)^-1 B Y``. Here Y is the block-diagonal matrix of the components'
+        responses. When the components move by y, the joints are stretched by ``B y``. Z is the
+        compliance of springs and dampers. This method is called LM-FBS, Lagrange multiplier
+        frequency-based substructuring. The variance of the result is computed from the variances of
+        the responses to first order. It is assumed that the errors of different components are
+        independent.
 
     Raises
     ------
     ModelError
         When a rigid joint would hold the machine against the ground, a component has a wrong type,
-        a spring is so stiff that the digits of its components are lost, or full matrices would be
-        too large.
+        or full matrices would be too large. Also when a spring is so stiff that adding it to the
+        stiffness matrix would round off the stiffness of its components.
     CertificateError
         When the machine fails its checks.
 
     Warns
     -----
     FlexplantWarning
-        When springs and dampers hold the machine against the ground, a reduced component has no
-        static shape for the load of a joint, joints nearly repeat each other, only some components
-        have damping, or errors exceed the responses of the machine.
+        When springs and dampers hold the machine against the ground, joints nearly repeat each
+        other, only some components have damping, or errors exceed the responses of the machine.
+        Also when a reduced component has no static shape for the load of a joint.
 
     References
     ----------
@@ -480,14 +483,14 @@ class JoiningReport(Value):
     Parameters
     ----------
     gap : float
-        Largest opening of a rigid joint over all motions of the machine. The opening is a
-        difference of the motions of both ends; it is given relative to the sum of their magnitudes.
+        Largest opening of a rigid joint over all motions of the machine. The opening is the
+        difference of the motions of both ends, divided by the sum of their magnitudes.
     balance : float
-        Largest resultant on the machine of a unit force in a joint between two components. Moments
-        are divided by the size of the machine. The resultant is zero where the forces on both
-        components are equal and opposite. It is not zero when a rigid-body motion of the whole
-        machine stretches the joint. `joined` warns of springs with a resultant; rigid joints must
-        not have one.
+        Largest resultant force or moment on the machine when a joint between two components carries
+        a unit force. Moments are divided by the size of the machine. The resultant is zero if the
+        forces on both components are equal and opposite and act on one line. It is not zero when a
+        rigid-body motion of the whole machine stretches the joint. `joined` warns of springs with a
+        resultant, and refuses such rigid joints.
     mass : float [kg]
         Mass of the machine; NaN if the machine has no displacement DOFs.
     inertia_error : float
@@ -498,18 +501,18 @@ class JoiningReport(Value):
     rigid : mapping {str: int}
         Number of rigid-body motions of each component before joining.
     pieces : mapping {str: int}
-        Number of rigid-body motions of each connected part of the machine, by the names of its
-        components, "stage, frame".
+        Number of rigid-body motions of each connected part of the machine. The key is a text with
+        the names of its components, such as "stage, frame".
     n_rigid : int
         Number of rigid-body motions of the machine.
     rigid_force : float
-        Largest elastic force K q in the rigid-body motions q of the machine, which should be zero.
-        It is given relative to the force without cancellation, |K| |q|.
+        Largest elastic force K q in a rigid-body motion q of the machine. It should be zero. It is
+        given relative to ``|K| |q|``, the same sum with magnitudes, in which no terms cancel.
     patches : mapping {str: float}
-        For each joint of a patch, the relative difference between two compliances of the joint:
-        that of a patch that may bend, and that of a rigid patch. The largest value over the axes of
-        the joint is given. The compliance of a bonded patch lies between the two, so that the error
-        of either assumption is smaller than this difference.
+        Error of the compliance of each joint with a patch. The compliance is computed with a patch
+        that may bend, and with a rigid patch. The value is the relative difference of the two, the
+        largest over the axes of the joint. The compliance of a bonded patch lies between them, so
+        that the error of either assumption is smaller than this difference.
 
     Examples
     --------
@@ -534,7 +537,7 @@ class JoiningReport(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """Invariants of the machine, each relative to the terms that cancel."""
+        """The errors `gap`, `inertia_error`, `rigid_force` and `balance` as a `Certificate`."""
         return Certificate(
             (
                 Verified("gap", self.gap, "opening of the rigid joints", MISSED),

@@ -26,8 +26,8 @@ End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"
 class Joint(Value):
     """A joint between two places of components, or between one and the ground.
 
-    A joint is rigid unless it has a stiffness or a rate. Along each axis, both sides have the same
-    motion at the point of the joint, or are connected by a spring and a damper.
+    A joint without `stiffness` and `rate` is rigid: both ends have the same motion along each axis.
+    Otherwise a spring and a damper connect the two ends along each axis.
 
     Parameters
     ----------
@@ -39,15 +39,15 @@ class Joint(Value):
         Joined axes among x, y, z, rx, ry, rz, in the directions of the machine. None: the axis of a
         DOF, or the axes of both ends where these are the same.
     stiffness : float or one for each axis [N/m, N m/rad], optional
-        Stiffness of springs; negative ones attract, as magnets do.
+        Stiffness of the spring. It is negative where the ends attract each other, as magnets do.
     rate : float or one for each axis [N s/m, N m s/rad], optional
-        Damping of dampers.
+        Damping of the damper (force per velocity).
     point : (3,) array [m], optional
-        Point where the joint acts. Each end moves at this point as if a rigid lever arm connected
-        the two, so that the rotation of the end adds to its displacement. None: the point is the
-        first end. An end that is given as a DOF has no lever arm. A node without rotations uses the
-        rotation of its neighbours. This is allowed for lever arms up to 1e-4 of the machine's size,
-        which occur when coordinates are written with few digits.
+        Point where the joint acts. A rigid lever arm connects each end to this point, so that a
+        rotation of the end adds to the displacement of the point. None: the point is the first end.
+        An end that is given as a DOF has no lever arm. At a node without rotations, the rotation
+        follows from the displacements of neighbouring nodes. This is allowed for lever arms of up
+        to 1e-4 of the machine's size. Such short arms occur when coordinates have few digits.
 
     Examples
     --------
@@ -103,7 +103,7 @@ class Joint(Value):
 
     @property
     def is_rigid(self) -> bool:
-        """Whether both sides have the same motion along its axes."""
+        """Whether both ends have the same motion along the axes of the joint."""
         return self.stiffness is None and self.rate is None
 
     def values(self, axes: Sequence[str]) -> tuple[FloatArray, FloatArray]:
@@ -154,26 +154,27 @@ def _end_text(end: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Patch(Value):
-    """Nodes of a component whose mean motion is joined, as by NASTRAN's RBE3.
+    """Nodes of a component that are joined by their mean motion, as by NASTRAN's RBE3.
 
-    Displacements u of the nodes have the mean motion ``v = (A^T W A)^-1 A^T W u``, where A are the
-    rigid-body motions about the point of the patch: it is the closest rigid motion. W is the
-    diagonal matrix of the weights. A force on the patch is distributed over its nodes with the same
-    weights, and the patch may bend, so that it is too soft. A rigid patch (RBE2) is too stiff. The
-    stiffness of a real bonded patch lies between the two. `JoiningReport` states how far the two
-    differ.
+    The mean motion v is the rigid-body motion of the patch that is closest to the displacements u
+    of its nodes: ``v = (A^T W A)^-1 A^T W u``. The columns of A are the rigid-body motions about
+    the point of the patch, and W is the diagonal matrix of the weights. A force on the patch is
+    distributed over its nodes with the same weights. The patch may bend, which makes it too soft. A
+    rigid patch (RBE2) is too stiff. The stiffness of a real bonded patch lies between the two.
+    `JoiningReport` states how far the two differ.
 
     Parameters
     ----------
     component : str
-        Component of the nodes; "machine/stage" for a component of a joined machine.
+        Name of the component that has the nodes. If this component belongs to a machine that was
+        itself joined, both names are given, such as "machine/stage".
     nodes : sequence of int, optional
         Node numbers. None: all nodes of the component in the box.
     box : (2, 3) array [m], optional
-        Lowest and highest corner, in the coordinates of the machine.
+        Lowest and highest corner of a box, in the coordinates of the machine.
     at : (3,) array [m], optional
-        Reference point of the motion in the coordinates of the machine; None: the mean of the
-        nodes.
+        Point about which the patch rotates, in the coordinates of the machine. None: the mean of
+        the positions of the nodes.
     weights : (m,) array, optional
         Weights of the nodes in the order of `nodes`, for example their areas. None: equal weights.
 
@@ -222,7 +223,7 @@ class Patch(Value):
         return f"<Patch of {self.component}, {where}>"
 
     def rows(self, dofs: DofSet) -> IntArray:
-        """Return the rows (m,) of the displacements of its nodes among the component's DOFs."""
+        """Return the positions (m,) of the nodes' displacements among the component's DOFs."""
         inner = [name for name in dofs.components if self.component.endswith(f"/{name}")]
         if self.nodes is not None and dofs.components and not inner:
             raise LabelError(
@@ -247,8 +248,10 @@ class Patch(Value):
     def mean(self, dofs: DofSet, point: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
         """Return the mean motions of the patch at a point.
 
-        Returns the six motions from the displacements of the nodes (6, m), zero for undetermined
-        ones; A, the displacements from the six motions (m, 6); and which of the six are determined.
+        The method returns three things. The first is the matrix (6, m) that computes the six mean
+        motions from the displacements of the nodes. Its rows are zero for motions that the nodes do
+        not determine. The second is the matrix A (m, 6) of the displacements in the six rigid-body
+        motions. The third is the list of the motions that are determined.
         """
         rows = self.rows(dofs)
         return mean_motions(dofs._taken(rows), point, self._weight_of(dofs, rows))

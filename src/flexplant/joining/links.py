@@ -170,19 +170,19 @@ def coincident_joints(
 ) -> list[Joint]:
     """Return rigid joints of all coincident nodes of different components.
 
-    Use it for components whose meshes match at the interface. Each joint connects the directions
-    that both nodes have.
+    Use it for components whose meshes match where they touch. Each joint acts along all axes along
+    which both nodes have a DOF.
 
     Parameters
     ----------
     components : mapping {str: FEModel or ReducedModel}
-        Components as for `joined`; all nodes of a reduced model count.
+        Components as for `joined`. All nodes of the full structure of a reduced model are compared.
     placed : mapping {str: Pose}, optional
         Poses as for `joined`.
     box : (2, 3) array [m], optional
-        Box in the machine that limits the nodes.
+        Lowest and highest corner of a box in the machine. Only nodes in it are joined.
     tolerance : float [m], optional
-        Largest distance of coincident nodes; None: 1e-6 of the machine's size.
+        Largest distance of coincident nodes. None: 1e-6 times the size of the machine.
 
     Raises
     ------
