@@ -537,7 +537,7 @@ class JoiningReport(Value):
 
     @property
     def certificate(self) -> Certificate:
-        """The errors `gap`, `inertia_error`, `rigid_force` and `balance` as a `Certificate`."""
+        """The errors `gap`, `inertia_error`, `rigid_force` and `balance` as a Certificate."""
         return Certificate(
             (
                 Verified("gap", self.gap, "opening of the rigid joints", MISSED),

@@ -1,15 +1,16 @@
-"""Modes of a structure: the eigenvalue problem solved, counted and checked; attachment vectors.
+"""Modes of a structure, computed and checked, with or without residual attachment vectors.
 
 `solve_modes` gives the lowest modes, mass-normalised, with rigid-body modes at exactly 0. A Sturm
-count proves that no mode is missing: the signs in a factorisation of ``K - s M`` count the modes
-below a frequency. Each mode has a residual. `compliance_at=` keeps the static compliance of the
-truncated modes at the places where forces act. Modes are numbered from 1.
+count proves that no mode is missing: ``K - omega^2 M`` has as many negative eigenvalues as there
+are modes below omega. The residual of each mode shows how well it satisfies the eigenvalue
+equation. `compliance_at=` keeps the static compliance of the truncated modes at the places where
+forces act, by residual attachment vectors. Modes are numbered from 1.
 
 - `solve_modes(model, count=, damping=, compliance_at=)`: small and large models.
 - `Modes.at`: shapes at a label or a point; `Modes.freq`, ``omega``, ``zeta``, ``phi``.
 - `Modes.calibrated`: the modes with measured frequencies and damping ratios.
 - `Modes.mesh_error`: error of each frequency of a mesh, estimated from a second mesh (`MeshError`).
-- `normal_form`: real modes of damping that is not modal.
+- `normal_form`: poles and shapes for any matrices M, D and K.
 
 >>> import flexplant as fx
 >>> plate = fx.kirchhoff_plate(

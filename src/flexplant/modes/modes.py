@@ -42,7 +42,7 @@ class MeshError(Value):
     Parameters
     ----------
     modes : (m,) array
-        Numbers of elastic modes from 1, rigid-body modes included.
+        Numbers of the elastic modes. They count from 1 and include rigid-body modes.
     freq : (m,) array [Hz]
         Frequencies of the coarse mesh.
     limit : (m,) array [Hz]
@@ -224,10 +224,11 @@ _OF_VECTORS = checked(real_array, shape=("vector_dofs",))
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Modes(Placed, Value):
-    """The first k modes of a structure, mass-normalised (paper, eq. (2), (3) and (5)).
+    """The first k modes of a structure, mass-normalised (equations (2), (3) and (5) of [paper]_).
 
-    ``q = phi p`` with ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Modes are numbered from 1,
-    rigid-body modes included: mode 4 of a free plate is its first elastic mode.
+    The motion is ``q = phi p``. The modal coordinates p follow from the forces f by equation (5),
+    ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Mode numbers count from 1 and include rigid-body
+    modes. Mode 4 of a free plate is therefore its first elastic mode.
 
     Springs of negative stiffness (magnets) make rigid-body modes unstable. The unstable modes stand
     after the modes at 0. Their frequencies are negative, as finite-element programs print them:
@@ -235,7 +236,7 @@ class Modes(Placed, Value):
     ``|omega| (-zeta +- sqrt(zeta^2 + 1))``.
 
     Residual attachment vectors extend the basis. Such a vector is the static displacement under a
-    unit force at a chosen place, less the part that the k modes describe. The vectors are made
+    unit force at a chosen place, minus the part that the k modes describe. The vectors are made
     M-orthogonal to the modes and to each other, and K is diagonal in them. Equation (5) therefore
     holds for the basis `[phi, vectors]` too, with `vector_omega` as frequencies.
 
@@ -245,11 +246,11 @@ class Modes(Placed, Value):
         Undamped frequencies: first the rigid-body modes, at exactly 0, then the unstable modes,
         with negative values, then the elastic modes.
     zeta : (k,) array [-]
-        Damping ratios: entries of ``2 Z Omega`` divided by ``2 |omega|``.
+        Damping ratios: the diagonal of ``2 Z Omega``, divided by ``2 |omega|``.
     phi : (n, k) array [1/sqrt(kg)]
-        Mode shapes. They are complex where the damping is not proportional; a shape with the pole
-        lambda then has ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``. The two real poles of an
-        unstable mode have the shapes ``Re phi +- Im phi``, scaled as in `NormalForm`.
+        Mode shapes. They are complex where the damping is not proportional. They are then scaled
+        so that ``phi^T (2 lambda M + D) phi = 2i Im(lambda)`` with the pole lambda. The two real
+        poles of an unstable mode have the shapes ``Re phi +- Im phi``, scaled as in `NormalForm`.
     dofs : DofSet
         DOFs of the n rows.
     n_rigid : int
@@ -257,26 +258,25 @@ class Modes(Placed, Value):
     vectors, vector_omega, vector_zeta : (n, m), (m,), (m,) arrays
         Residual attachment vectors, with their frequencies [rad/s] and damping ratios.
     vector_dofs : sequence of m str
-        Places of the forces of the vectors. Each vector is a combination of the displacements of
-        all these places, since the combinations make K diagonal.
+        Places of the unit forces. Each vector combines the displacements under all these forces.
+        The combinations are chosen such that K is diagonal.
     residual : (k,) array
-        ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, 0 for rigid-body modes, as
-        `solve_modes` found it; empty where it is not known.
+        Error ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, computed by `solve_modes`. It
+        is 0 for rigid-body modes. Empty: not known.
     rounding : (k,) array
-        Relative error of each frequency that rounding of K's entries to double precision can cause,
-        with any solver: ``eps |phi|^T |K| |phi| / (2 omega^2)`` with the machine precision eps, 0
-        for rigid-body modes; empty where it is not known.
+        Relative error of each frequency, with any solver, when the entries of K are rounded to
+        double precision: ``eps |phi|^T |K| |phi| / (2 omega^2)`` with the machine precision eps. It
+        is 0 for rigid-body modes. Empty: not known.
     certificate : Certificate
-        Checks made by `solve_modes`: `orthonormality` (largest entry of phi^T M phi - I),
-        `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
-        `rigid_rounding` [Hz] (the suspension frequency below which a suspension cannot be told from
-        rounding of K's entries, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``), and for a large model
-        `counted` and `found`: the numbers of modes below the frequency `shift` [Hz] that the signs
-        of a factorisation count (Sturm) and that the solver found.
+        Checks made by `solve_modes`. `orthonormality` is the largest entry of phi^T M phi - I.
+        `rigid_residual` is ||K R|| / || |K| |R| || with the rigid-body motions R. `rigid_rounding`
+        [Hz] is ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: a suspension with a lower frequency cannot be
+        distinguished from rounding of K. For a large model, `found` is the number of modes that the
+        solver found below the frequency `shift` [Hz], and `counted` is that of a Sturm count.
     notes : sequence of str
         Remarks on modes read from a file: assumptions, changes and missing items.
     calibration : MeasuredModes, optional
-        The measured poles that `calibrated` put in.
+        Measured poles that `calibrated` used, if it was called.
 
     Raises
     ------
@@ -399,7 +399,7 @@ class Modes(Placed, Value):
     def poles(self) -> ComplexArray:
         """Poles (k,) [rad/s] in the upper half plane; those of rigid-body modes are exactly 0.
 
-        ``-zeta omega + i omega sqrt(1 - zeta^2)``; for an unstable mode, its positive real pole.
+        A pole is ``-zeta omega + i omega sqrt(1 - zeta^2)``, or the positive real one if unstable.
         """
         return pole_pairs(self.omega, self.zeta)[0]
 
@@ -411,22 +411,22 @@ class Modes(Placed, Value):
 
     @property
     def basis_omega(self) -> FloatArray:
-        """Frequencies (k + m,) [rad/s] of the basis: equation (5) is diagonal in it."""
+        """Undamped frequencies (k + m,) [rad/s] of modes and attachment vectors."""
         return np.concatenate([self.omega, self.vector_omega])
 
     @property
     def basis_squares(self) -> FloatArray:
-        """Omega^2 (k + m,) [1/s^2] in equation (5), negative for unstable modes."""
+        """Diagonal (k + m,) of Omega^2 [1/s^2] in equation (5), negative for unstable modes."""
         return signed_square(self.basis_omega)
 
     @property
     def basis_rates(self) -> FloatArray:
-        """2 Z Omega (k + m,) [1/s] in equation (5)."""
+        """Diagonal (k + m,) of 2 Z Omega [1/s] in equation (5)."""
         return np.asarray(2.0 * self.basis_zeta * np.abs(self.basis_omega))
 
     @property
     def basis_zeta(self) -> FloatArray:
-        """Damping ratios (k + m,) of the basis."""
+        """Damping ratios (k + m,) of modes and attachment vectors."""
         return np.concatenate([self.zeta, self.vector_zeta])
 
     def select(self, columns: Sequence[int] | IntArray) -> Modes:
@@ -450,8 +450,8 @@ class Modes(Placed, Value):
     def calibrated(self, measured: Any) -> Modes:
         """Return the modes with measured frequencies and damping ratios; the shapes stay.
 
-        Measured poles have relative errors of 1e-5 to 1e-4. The frequencies of a finite-element
-        model are off by 1e-3 to 1e-2, while its shapes are much less affected.
+        The relative error of a measured frequency is typically 1e-5 to 1e-4. That of a frequency of
+        a finite-element model is 1e-3 to 1e-2, while its shapes are much more accurate.
 
         Parameters
         ----------
@@ -481,9 +481,10 @@ class Modes(Placed, Value):
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
         """Return the frequency errors of the mesh by Richardson extrapolation.
 
-        Errors fall with the size of the elements to the power `order`. With the ratio r of element
-        sizes, an infinitely fine mesh has the frequency ``f_fine + (f_fine - f) / (r^order - 1)``.
-        Errors that both meshes share (missing shear or mass, wrong material) do not show.
+        Errors are proportional to the element size to the power `order`. This mesh has elements r
+        times as large as the finer mesh. If a mode has the frequency f here and f_fine there, it is
+        ``f_fine + (f_fine - f) / (r^order - 1)`` for an infinitely fine mesh. Errors that both
+        meshes share (missing shear or mass, wrong material) are not found.
 
         Parameters
         ----------
@@ -503,17 +504,17 @@ class Modes(Placed, Value):
     def extrapolated(self, coarser: Modes, *, order: float = 2.0) -> Modes:
         """Return the modes with frequencies extrapolated from this mesh and a coarser one.
 
-        Richardson's rule, as in `mesh_error`: ``f + (f - f_coarse) / (r^order - 1)`` with the ratio
-        r of element sizes. A mode may have no partner in the coarser mesh, for example when several
-        modes have one frequency. The relative correction of its neighbours in frequency is then
-        interpolated.
-        Mode shapes, damping ratios and rigid-body modes stay as they are.
+        By Richardson's rule, a mode with the frequencies f here and f_coarse in the coarser mesh
+        gets ``f + (f - f_coarse) / (r^order - 1)``, where r is the ratio of the element sizes. A
+        mode may have no partner in the coarser mesh, for example when several modes have the same
+        frequency. Its relative correction is then interpolated between neighbouring frequencies.
+        Mode shapes, damping ratios and rigid-body modes do not change.
 
         Parameters
         ----------
         coarser : Modes
             Modes of the same structure with larger elements, for example 1.5 or 2 times as large.
-            Solve a few more modes here than are needed, so that the highest find a partner.
+            Solve a few more of them than of this mesh, so that each mode here finds a partner.
         order : float
             Order of convergence; 2 for plates and for bricks of eight nodes.
 
@@ -545,9 +546,9 @@ class Modes(Placed, Value):
     def orthonormal_basis(self) -> FloatArray:
         """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
-        For complex modes, M is not needed: ``B B'`` is the initial acceleration per force of the
-        modes, ``sum Re(phi phi' lambda / (i Im lambda))``. A rigid-body mode adds ``phi_r phi_r'``,
-        an unstable mode ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` (see `NormalForm`).
+        For complex modes, B is found without M. ``B B'`` is the initial acceleration per force, a
+        sum over the modes. An elastic mode adds ``Re(phi phi' lambda / (i Im lambda))``, a rigid
+        one ``phi phi'`` and an unstable one ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` (`NormalForm`).
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
@@ -567,9 +568,9 @@ class Modes(Placed, Value):
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return loads (n, r) with the modal forces of ``M motions``, for motions (n, r).
+        """Return loads (n, r) that have the same modal forces as ``M motions``.
 
-        The motions must be combinations of the shapes.
+        The motions (n, r) must be combinations of the shapes.
         """
         # any load with these modal forces will do: B' f = c, where motions = B c
         basis = self.orthonormal_basis

@@ -31,8 +31,8 @@ class NormalForm(Value):
     poles : (k,) complex array [rad/s]
         Poles in the upper half plane, sorted by magnitude in each of three groups: first the
         rigid-body poles (exactly 0), then the positive real poles of unstable modes, then the
-        others. A spring of negative stiffness gives an unstable mode a pair of real poles: s1 > 0,
-        which grows and stands here, and s2 < 0, which decays and stands in `decaying`.
+        others. An unstable mode, caused by a spring of negative stiffness, has two real poles. The
+        growing pole s1 > 0 is listed here, and the decaying pole s2 < 0 in `decaying`.
     phi : (n, k) array
         Mode shapes with ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``, where lambda is the pole.
         They are real and mass-normalised when D is proportional, and complex otherwise. Rigid-body
@@ -80,21 +80,21 @@ class NormalForm(Value):
 
     @property
     def omega(self) -> FloatArray:
-        """Undamped frequencies (k,) [rad/s]; ``-sqrt(-s1 s2)`` for an unstable mode."""
+        """Undamped frequencies (k,) [rad/s]. An unstable mode has ``-sqrt(-s1 s2)``."""
         omega, unstable = np.abs(self.poles), self._unstable
         omega[unstable] = -np.sqrt(-self.decaying * self.poles[unstable].real)
         return omega
 
     @property
     def zeta(self) -> FloatArray:
-        """Damping ratios (k,); ``-(s1 + s2) / (2 |omega|)`` for an unstable mode."""
+        """Damping ratios (k,). An unstable mode has ``-(s1 + s2) / (2 |omega|)``."""
         omega, rate = np.abs(self.omega), -self.poles.real
         rate[self._unstable] = 0.5 * (rate[self._unstable] - self.decaying)
         rate[: self.n_rigid] = 0.0
         return np.asarray(rate / divisor(omega))
 
     def overdamped_below(self, rate: float) -> str:
-        """Return a note on the overdamped poles of magnitude up to `rate` [1/s], or ""."""
+        """Return a note on overdamped poles with magnitudes up to `rate` [1/s]; "" without any."""
         slow = self.overdamped[np.abs(self.overdamped) <= rate]
         if not slow.size:
             return ""
@@ -140,7 +140,7 @@ def normal_form(
     Returns
     -------
     NormalForm
-        All n modes, or the lowest.
+        Poles and shapes of all n modes, or of the lowest ones.
 
     Raises
     ------
@@ -152,9 +152,9 @@ def normal_form(
 
     Notes
     -----
-    An eigenvalue solver for (K, M) gives rigid-body frequencies of rounding size, some of them
-    imaginary. Here the rigid-body motions are removed from the problem first. Rigid-body modes are
-    undamped by convention.
+    An eigenvalue solver for (K, M) would give small rigid-body frequencies by rounding, some of
+    them imaginary. Here the rigid-body motions are removed from the problem first. Rigid-body modes
+    are undamped by convention.
 
     Examples
     --------

@@ -64,20 +64,20 @@ def solve_modes(
     factor: Cholmod | None = None,
     progress: bool | None = None,
 ) -> Modes:
-    """Return the lowest modes of a structure, mass-normalised, rigid-body modes exactly at 0.
+    """Return the lowest modes of a structure, with rigid-body modes at exactly 0.
 
     Parameters
     ----------
     model : FEModel
         Structure whose modes are computed.
     count : int, optional
-        Number of modes, rigid-body modes included. When only one of two modes with the same
-        frequency is within this number, its shape is an arbitrary combination of the two.
+        Number of modes, rigid-body modes included. If two modes have the same frequency and only
+        one of them is returned, its shape is an arbitrary combination of the two.
     below : float [Hz], optional
         Highest frequency of the modes that are kept. Without `count` and `below`, all modes of a
         small model are returned.
     damping : ModalDamping or Rayleigh, optional
-        Damping used in place of the model's D. None: the model's D, or no damping without D.
+        Damping used in place of the model's D. None: the model's D, or no damping if it has no D.
         ``ModalDamping(solve_modes(model, count=9).zeta, others=0.005)`` keeps the damping ratios
         that D gives the first nine modes, for example those of a machine on isolators.
     compliance_at : place or sequence of places
@@ -87,7 +87,8 @@ def solve_modes(
     compliance_damping : Damping or float, optional
         Damping of the attachment vectors. None: the damping of the modes.
     factor : Cholmod, optional
-        Sparse factorisation that replaces the library's own for a large model.
+        Sparse factorisation by CHOLMOD in place of the library's own, for a large model. CHOLMOD
+        must be installed separately.
     progress : bool, optional
         Whether to show a progress bar. None: a bar is shown on a terminal or in a notebook, for
         work of more than two seconds.
@@ -95,12 +96,12 @@ def solve_modes(
     Returns
     -------
     Modes
-        Modes with complex shapes where the model's own D is not proportional. Three checks are
-        made: the residuals, the M-orthonormality, and that no mode is missing. Each undamped
-        frequency has a relative error of at most 1e-8 or its `rounding`, whichever is larger. This
-        also holds for soft suspensions next to stiff elements, fine meshes and stiff springs to
-        ground. Springs of negative stiffness give unstable modes, with negative frequencies (see
-        `Modes`).
+        Mass-normalised modes. Their shapes are complex if the model's own D is not proportional.
+        The residuals and the M-orthonormality are checked, and a count shows that no mode is
+        missing. Each undamped frequency has a relative error of at most 1e-8 or its `rounding`,
+        whichever is larger. This also holds for soft suspensions next to stiff elements, fine
+        meshes and stiff springs to ground. Springs of negative stiffness give unstable modes, with
+        negative frequencies (see `Modes`).
 
     Raises
     ------
@@ -113,7 +114,8 @@ def solve_modes(
     Warns
     -----
     FlexplantWarning
-        When overdamped motions have real poles among the modes. The modes do not include them.
+        When overdamped motions have real poles in the frequency range of the modes. The result does
+        not include these motions.
 
     References
     ----------

@@ -286,11 +286,11 @@ def attachment_vectors(
 def static_response(model: Any, loads: FloatArray) -> FloatArray:
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
-    The equation is ``K u = f - M R R^T f``, with the M-orthonormal rigid-body motions R (n, r). Its
-    right-hand side is the load minus the inertia forces of the rigid-body acceleration that the
-    load causes, so it is in equilibrium. A large model is solved with its sparse factorisation. A
-    small model is held at r DOFs that prevent its rigid-body motions; no force acts at these
-    supports, since the load is in equilibrium.
+    The equation is ``K u = f - M R R^T f``, with the M-orthonormal rigid-body motions R (n, r). The
+    term ``M R R^T f`` is the inertia force of the rigid-body acceleration that the load f causes.
+    The right-hand side is therefore in equilibrium. A large model is solved with its sparse
+    factorisation. A small model is held at r DOFs that prevent its rigid-body motions. The forces
+    at these supports are zero because of the equilibrium.
 
     Parameters
     ----------
@@ -302,6 +302,7 @@ def static_response(model: Any, loads: FloatArray) -> FloatArray:
     Returns
     -------
     (n, m) array [m, rad]
+        Displacements and rotations u, a column for each case.
 
     Raises
     ------

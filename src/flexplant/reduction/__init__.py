@@ -1,14 +1,15 @@
-"""Model reduction: fewer degrees of freedom, same input-output behaviour, with error bounds.
+"""Model reduction: models with few degrees of freedom that respond like the full model.
 
-A `ReducedModel` has small M, D and K, in physical DOFs where the method keeps them, and the matrix
-T that expands its motion to the whole structure.
+A `ReducedModel` has small matrices M, D and K. Its matrix T expands its motion to the whole
+structure. With many methods its coordinates are DOFs of the structure.
 
 - `reduce(modes, DesiredDofs(labels))`: the method of the paper, with chosen DOFs and exact modes.
 - `select_dofs(modes, count)`: DOFs whose motions distinguish the modes well.
 - other methods: `ModalTruncation`, `ModalBalanced`, `Guyan`, `Irs`, `Serep`, `CraigBampton`,
-  `Rubin`, `MacNeal`, `Krylov`; a new method is a class with one function.
-- `ReducedModel.quality(model, band=, inputs=, outputs=)`: frequencies, shapes, responses, bound.
-- `rank_modes`: which modes matter between ports.
+  `Rubin`, `MacNeal`, `Krylov`. Your own method is a class with one function.
+- `ReducedModel.quality(model, band=, inputs=, outputs=)`: errors of frequencies, shapes and
+  responses, compared with the error bound of the method.
+- `rank_modes`: sorts modes by their contribution to the response from inputs to outputs.
 
 >>> import flexplant as fx
 >>> plate = fx.kirchhoff_plate(

@@ -105,16 +105,17 @@ class DofPartition:
 class Guyan(ReductionMethod):
     """Static condensation to a few DOFs: ``T = [I; -Kss^-1 Ksm]``.
 
-    Here m marks the kept DOFs (masters) and s the condensed ones (slaves). The model is exact at
-    0 Hz for loads on the kept DOFs, and for rigid-body motions. Every frequency is at or above the
-    true frequency (Rayleigh-Ritz). It approaches the true frequency from above when DOFs are added.
+    Kss and Ksm are blocks of K. Here m marks the kept DOFs (masters) and s the condensed ones
+    (slaves). The model is exact at 0 Hz for loads on the kept DOFs, and for rigid-body motions.
+    Every frequency is at or above the true frequency (Rayleigh-Ritz). It approaches the true
+    frequency from above when DOFs are added.
 
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
         Kept DOFs. When they are held, the structure must not move as a rigid body.
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model's own modes; None: ``T^T D T``.
+        Damping of the modes of the reduced model. None: its damping matrix is ``T^T D T``.
 
     References
     ----------
@@ -132,7 +133,7 @@ class Guyan(ReductionMethod):
     dofs: Iterable[str] = field(metadata=checked(labels_given, name="kept DOFs"))
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the condensed model; `reduce` is the public way."""
+        """Return the condensed model. Call `reduce` instead of this method."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
         part = DofPartition(model, labels)
         return projected_model(
@@ -149,10 +150,10 @@ class Guyan(ReductionMethod):
 class Irs(ReductionMethod):
     """Improved reduced system: static condensation with the inertia of the condensed DOFs.
 
-    ``T_1 = T_s + S M T_s M_s^-1 K_s`` with ``S = diag(0, Kss^-1)`` and the expansion T_s and the
-    matrices M_s, K_s of `Guyan`. One iteration is the IRS of O'Callahan. In further iterations the
-    previous T, with its reduced mass and stiffness, replaces T_s, M_s and K_s in the second term.
-    They converge to `Serep`, which has the lowest k modes exactly.
+    `Guyan` gives the matrix T_s and the reduced matrices M_s and K_s. The first iteration is the
+    IRS of O'Callahan, ``T_1 = T_s + S M T_s M_s^-1 K_s`` with ``S = diag(0, Kss^-1)``. In further
+    iterations, the previous T and its reduced mass and stiffness replace T_s, M_s and K_s in the
+    second term. The iterations converge to `Serep`, in which the lowest k modes are exact.
 
     Parameters
     ----------
@@ -165,8 +166,8 @@ class Irs(ReductionMethod):
 
     Notes
     -----
-    The error of a mode falls in each iteration by about the ratio of its omega^2 to the lowest
-    omega^2 of the structure with the kept DOFs held.
+    Each iteration multiplies the error of a mode by about ``(omega / omega_s)^2``. Here omega is
+    the frequency of the mode, and omega_s is the lowest frequency when the kept DOFs are held.
 
     References
     ----------
@@ -188,7 +189,7 @@ class Irs(ReductionMethod):
     tolerance: float = field(default=1e-12, kw_only=True, metadata=checked(positive, zero=True))
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the condensed model; `reduce` is the public way."""
+        """Return the condensed model. Call `reduce` instead of this method."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
         part = DofPartition(model, labels)
         rigid = model.rigid_body[part.kept]
@@ -239,20 +240,20 @@ class Serep(ReductionMethod):
     """System equivalent reduction (SEREP): k chosen modes are exact in a model of k DOFs.
 
     ``T = phi phi_kk^-1`` as in `DesiredDofs` (paper, eq. (6) to (8)), where phi_kk holds the rows
-    of phi at the kept DOFs. In contrast to `DesiredDofs` the modes are solved by this method, and
-    the matrices are ``T^T M T``, ``T^T K T`` and, for any D, ``T^T D T``.
+    of phi at the kept DOFs. In contrast to `DesiredDofs`, this method solves for the modes itself.
+    The reduced matrices are ``T^T M T``, ``T^T K T`` and ``T^T D T``, and D may be any matrix.
 
     Parameters
     ----------
     dofs, damping
         Kept DOFs, and damping of the reduced model, as for `Guyan`.
     modes : sequence of int, optional
-        Mode numbers, counted from 1: one for each DOF, all rigid-body modes among them. None: the
-        lowest modes.
+        Numbers of the modes that are exact, counted from 1. Their number is that of the kept DOFs,
+        and all rigid-body modes must be included. None: the lowest modes.
 
     Notes
     -----
-    Fewer modes than DOFs are refused, since M* would be singular.
+    Fewer modes than DOFs are refused, since the reduced mass matrix would be singular.
 
     References
     ----------
@@ -279,7 +280,7 @@ class Serep(ReductionMethod):
             )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the model in these DOFs; `reduce` is the public way."""
+        """Return the model in these DOFs. Call `reduce` instead of this method."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
         numbers = tuple(self.modes or range(1, len(labels) + 1))
         modes = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
@@ -325,11 +326,11 @@ class CraigBampton(ReductionMethod):
         Kept DOFs, where loads and other structures attach. When they are held, the structure must
         not move as a rigid body.
     modes : int
-        Number of fixed-interface modes; 0 is static condensation.
+        Number of fixed-interface modes. With 0, the method is static condensation.
     below : float [Hz], optional
         Highest frequency of the fixed-interface modes, in place of `modes`.
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model's own modes; None: ``T^T D T``.
+        Damping of the modes of the reduced model. None: its damping matrix is ``T^T D T``.
 
     References
     ----------
@@ -353,7 +354,7 @@ class CraigBampton(ReductionMethod):
             raise ModelError("give the number of fixed-interface modes or below=, not both.")
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model; `reduce` is the public way."""
+        """Return the reduced model. Call `reduce` instead of this method."""
         model, labels = fe_model(structure, self), tuple(self.boundary)
         part = DofPartition(model, labels)
         fixed = np.zeros((part.others.size, 0))
@@ -395,7 +396,7 @@ class _FreeInterface(ReductionMethod):
     _kind: ClassVar[str]
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model; `reduce` is the public way."""
+        """Return the reduced model. Call `reduce` instead of this method."""
         model, labels, massless = fe_model(structure, self), tuple(self.boundary), self._massless
         modes = solve_modes(
             model, damping=ModalDamping(0.0), count=self.modes, compliance_at=list(labels)
@@ -464,11 +465,11 @@ class Rubin(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, with its inertia.
 
     The motions are combinations of the modes of the structure with a free boundary and of residual
-    attachment vectors: the static displacements under a unit force at each boundary DOF, less the
-    part that the modes describe. The coordinates are the boundary DOFs, then the modal coordinates
-    ("mode 1", ...). The modes are exact. The response to loads on the boundary is exact up to order
-    omega^2. All other frequencies are above the true ones. For a free structure the residual
-    flexibility holds for loads in equilibrium with its inertia (inertia relief).
+    attachment vectors. Such a vector is the static displacement under a unit force at a boundary
+    DOF, minus the part that the modes describe. The coordinates are the boundary DOFs, then the
+    modal coordinates ("mode 1", ...). The modes are exact. The response to loads on the boundary is
+    exact up to order omega^2. All other frequencies are above the true ones. In a free structure,
+    the inertia forces of the rigid-body acceleration balance the unit force (inertia relief).
 
     Parameters
     ----------
@@ -477,7 +478,7 @@ class Rubin(_FreeInterface):
     modes : int
         Number of free modes, rigid-body modes included.
     damping : ModalDamping or Rayleigh, optional
-        Damping of modes and attachment vectors; None: ``T^T D T``.
+        Damping of modes and attachment vectors. None: the damping matrix is ``T^T D T``.
 
     References
     ----------
@@ -499,16 +500,16 @@ class Rubin(_FreeInterface):
 class MacNeal(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, without inertia.
 
-    This method differs from `Rubin` in the truncated part of the response, which is static. The
-    boundary coordinates have no mass (their rows of M* are zero), and the poles are only those of
-    the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model has a
-    feedthrough. The boundary can receive mass by coupling or by an update.
+    In contrast to `Rubin`, the truncated modes contribute only their static response. The boundary
+    coordinates have no mass: their rows of the reduced mass matrix are zero. The poles are only
+    those of the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model
+    has a feedthrough. The boundary gets mass when the model is joined to others or updated.
 
     Parameters
     ----------
     boundary, modes, damping
         Kept DOFs, number of free modes, and damping, as for `Rubin`. The damping applies to the
-        modes only. None: the part of D that acts on the modes.
+        modes only. Without it, the part of D that acts on the modes is used.
 
     References
     ----------

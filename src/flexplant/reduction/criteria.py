@@ -42,7 +42,7 @@ class SelectionCriterion(Value):
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return the positions of the rows of `pool` (p, k) that are chosen.
 
-        They are chosen in addition to the rows `required` (q, k); `count` is their number.
+        The number of chosen rows is `count`. The rows `required` (q, k) are kept in any case.
         """
 
     @abstractmethod
@@ -70,7 +70,7 @@ class PivotedQr(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return which rows of the pool to take."""
+        """Return the positions of the chosen rows of `pool`."""
         if not count:
             return []
         if required.shape[0]:
@@ -89,10 +89,10 @@ class EffectiveIndependence(SelectionCriterion):
     """Effective independence: drop the DOF that adds least to the information on the modes.
 
     The search starts with all candidates. Their information on the modes is ``Q = phi^H phi``. Row
-    i of phi has the share ``E_i = phi_i Q^-1 phi_i^H`` in it, from 0 to 1. At 1, the other rows
-    cannot distinguish all modes. The row with the lowest share is dropped, Q^-1 is updated, and
-    this is repeated. When fewer DOFs than modes are wanted, dropping stops at the number of modes,
-    and `PivotedQr` chooses from the rows that are left.
+    i of phi has the share ``E_i = phi_i Q^-1 phi_i^H`` in it, a number from 0 to 1. If the share is
+    1, the modes cannot be distinguished without this row. The row with the lowest share is dropped,
+    Q^-1 is updated, and this is repeated. If fewer DOFs than modes are wanted, the search stops
+    when as many rows as modes are left. `PivotedQr` then chooses among these rows.
 
     References
     ----------
@@ -107,7 +107,7 @@ class EffectiveIndependence(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return which rows of the pool to take."""
+        """Return the positions of the chosen rows of `pool`."""
         if not count:
             return []
         fixed, p = required.shape[0], pool.shape[0]
@@ -152,10 +152,10 @@ def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Greedy(SelectionCriterion):
-    """Choice of one DOF after the other, each for the largest smallest singular value of phi_kk.
+    """Choice of one DOF after the other, each to make the smallest singular value largest.
 
-    phi_kk holds the rows of the modes at the chosen DOFs. The value of a DOF is the smallest
-    singular value directly after this DOF was chosen.
+    The singular values are those of phi_kk, which holds the rows of the modes at the chosen DOFs.
+    The value of a DOF is the smallest singular value directly after this DOF was chosen.
 
     Examples
     --------
@@ -166,7 +166,7 @@ class Greedy(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return which rows of the pool to take."""
+        """Return the positions of the chosen rows of `pool`."""
         taken: Any = np.array(required)
         free = np.ones(pool.shape[0], dtype=bool)
         found: list[int] = []
@@ -179,7 +179,7 @@ class Greedy(SelectionCriterion):
         return found
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return, for each row, the smallest singular value of this row and those before it."""
+        """Return the smallest singular value of each row together with all rows before it."""
         return np.array([la.svdvals(rows[: i + 1])[-1] for i in range(rows.shape[0])])
 
 
@@ -261,8 +261,8 @@ def select_dofs(
     modes : Modes
         Modes, real or complex, with their attachment vectors.
     count : int
-        Number of DOFs, at most the number of modes plus that of attachment vectors. `DesiredDofs`
-        keeps all modes only when it is equal to this sum.
+        Number of DOFs, at most the number of modes plus the number of attachment vectors. With
+        exactly this sum, `DesiredDofs` keeps all modes. With fewer DOFs, it keeps fewer modes.
     candidates : iterable of str, optional
         Labels to choose from; None: all displacements (no rotations).
     required : iterable of str

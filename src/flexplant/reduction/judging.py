@@ -353,21 +353,22 @@ class ReductionQuality(Value):
     mac : (m,) array
         Modal assurance criterion (MAC) of each full mode and its reduced mode, with the mass matrix
         as weight for an FEModel: 1 for equal shapes, 0 for orthogonal ones. The shapes of repeated
-        modes are an arbitrary basis of a subspace. For them, these are the squared cosines of the
-        angles between the two subspaces.
+        modes are an arbitrary basis of a subspace. The values of repeated modes are therefore the
+        squared cosines of the angles between the subspaces of the two models.
     group : (m,) array of int
-        Number of the first mode whose shape cannot be distinguished from the shape of this mode.
-        When one of several repeated modes has no partner, it is not known which one.
+        Number of the group of each mode, which is the number of the first mode in the group. Shapes
+        of modes in a group cannot be distinguished. If one mode of a group has no partner in the
+        reduced model, it is not known which one.
     check_freq : (f,) array [Hz]
         Frequencies at which the responses are compared.
     frf_error : (p, q) array
         Largest error of each channel over the band, relative to the largest response of the
         channel. Rows are outputs, and columns are inputs.
     silent : (p, q) array of bool
-        True for channels of the full model that consist of rounding. Their response is below 1e-9
-        of a reference: the geometric mean of the largest responses of the input and of the output
-        to forces at their own places. Errors of these channels are relative to this reference. The
-        printed worst channel is not one of them.
+        True for channels whose response in the full model is only rounding, below 1e-9 of a
+        reference. The reference is the geometric mean of two largest responses: at the input to a
+        force at the input, and at the output to a force at the output. The errors of such a channel
+        are relative to the reference. These channels are left out when the worst one is printed.
     resonance_error : (p, q) array
         Largest error at a resonance of either model, relative to the largest response of any
         channel of both models at this frequency. NaN without a resonance in the band, and for
@@ -377,9 +378,9 @@ class ReductionQuality(Value):
         two models there. It is 1 where only one model has the antiresonance, and NaN without an
         antiresonance. For silent channels it is relative to the reference of `silent`.
     static_error : (p, q) array
-        Error of the elastic static compliance G_ij, relative to sqrt(G_ii G_jj). Where this root
-        is only rounding, the error is relative to the responses of both places at the upper end of
-        the band.
+        Error of the elastic static compliance G_ij from input j to output i, relative to
+        ``sqrt(G_ii G_jj)``. If this root is only rounding, the error is relative to the responses
+        of both places at the upper end of the band.
     true_error : float [m/N]
         Largest singular value of the error of the response at the check frequencies.
     orthogonality : float
@@ -395,8 +396,8 @@ class ReductionQuality(Value):
         Difference between these responses and direct solutions with the full matrices, relative to
         the peak. NaN where the full structure is given by Modes.
     bound : ErrorBound, optional
-        Bound of the error that the reduction method gives without computing responses, when it
-        holds for these channels.
+        Bound of the error, computed by the reduction method without responses. None if the method
+        has no bound for these channels.
     bounded : bool
         Whether the bound covers all compared modes. The bound of a reduction of some modes does not
         hold for the other modes of the model.
@@ -435,7 +436,7 @@ class ReductionQuality(Value):
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
-        """Groups of elastic modes, by number, whose shapes cannot be distinguished."""
+        """Groups of mode numbers: elastic modes whose shapes cannot be distinguished."""
         elastic = self.full_freq > 0
         firsts = np.unique(self.group[elastic])
         groups = [self.modes[elastic & (self.group == first)].tolist() for first in firsts]

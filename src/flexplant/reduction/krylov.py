@@ -27,7 +27,7 @@ from .reduced import ReducedModel
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Krylov(ReductionMethod):
-    """Second-order rational Krylov reduction: it matches the response at given frequencies.
+    """Second-order rational Krylov reduction, which matches the response at given frequencies.
 
     The response to the inputs is X(s) = (s^2 M + s D + K)^-1 B with s = 2 pi i f. At each given
     frequency f, X and its first `moments` - 1 derivatives with respect to s are computed. Their
@@ -35,23 +35,24 @@ class Krylov(ReductionMethod):
     orthonormal in M, so that M* is the unit matrix. The coordinates are "krylov 1", ...
 
     A moment is a coefficient of the Taylor series of the response at s. From the inputs to any
-    place, the first `moments` coefficients agree with those of the full model. Between the inputs,
-    twice this number agree, since the matrices are symmetric. Without D, the series is one in s^2.
-    All frequencies of the reduced model are above the true ones (Rayleigh-Ritz).
+    place, the first `moments` coefficients agree with those of the full model. If the output is at
+    the place of an input, twice this number agree, since the matrices are symmetric. Without D, the
+    series is taken in s^2. All frequencies of the reduced model are above the true ones
+    (Rayleigh-Ritz).
 
     Parameters
     ----------
     inputs : place or sequence of places
         Places of loads: DOF labels, points (z) or mappings.
     freq : float or sequence of float [Hz]
-        Frequencies at which the response is matched. A resonance of an undamped model is refused. 0
-        matches the static response (for a free structure, the response to loads in equilibrium with
-        its inertia).
+        Frequencies at which the response is matched. A resonance of an undamped model is refused. A
+        frequency of 0 matches the static response. For a free structure, this is the response to
+        the loads together with the inertia forces that balance them.
     moments : int
         Number of moments at each frequency.
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model's modes; the basis is then that of the undamped structure.
-        None: the model's D, which also acts on the basis.
+        Damping of the modes of the reduced model. T is then computed without damping. None: the
+        model's D, which is also used to compute T.
 
     References
     ----------
@@ -84,7 +85,7 @@ class Krylov(ReductionMethod):
         self._set(freq=freq)
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model; `reduce` is the public way."""
+        """Return the reduced model. Call `reduce` instead of this method."""
         model = fe_model(structure, self)
         listed: Any = self.inputs
         labels_of(listed, model.dofs)

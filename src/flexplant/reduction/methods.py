@@ -114,9 +114,9 @@ def projected_model(
     singular: str = "",
     static_at: Sequence[str] = (),
 ) -> ReducedModel:
-    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
+    """Return the reduced model with the matrices ``T^T M T``, ``T^T K T`` and ``T^T D T``.
 
-    Your own reduction computes T and returns the result of this function; see `ReductionMethod`.
+    Use this function in your own reduction method, after it has computed T (`ReductionMethod`).
 
     Parameters
     ----------
@@ -125,11 +125,11 @@ def projected_model(
     T : (n, k) array
         Columns that span the kept motions, including the rigid-body motions.
     dofs : DofSet
-        DOFs of the k coordinates; empty where the coordinates are not DOFs.
+        DOFs of the k coordinates. Empty: the coordinates are not DOFs.
     method : str
         Name of the method, which messages and the printed model show.
     coordinates : sequence of str
-        Names of the coordinates, where these are not all DOFs.
+        Names of the coordinates. They are needed if not all coordinates are DOFs.
     damping : Damping, optional
         Damping of the reduced model in place of the model's D.
     condition, condition_of : float, str
@@ -144,6 +144,7 @@ def projected_model(
     Returns
     -------
     ReducedModel
+        Model whose motions are combinations of the columns of T.
 
     Raises
     ------
@@ -213,7 +214,7 @@ class ReductionMethod(Value):
     Parameters
     ----------
     damping : ModalDamping or Rayleigh, optional
-        Damping of the reduced model in place of its D, with an FEModel.
+        Damping that replaces D when an FEModel is reduced.
 
     Examples
     --------
@@ -243,10 +244,10 @@ class DesiredDofs(ReductionMethod):
         then kept, and the model stores the other modes as `truncated`. For an FEModel, the number
         of modes that are solved is that of the labels minus that of the places in `static_at`.
     static_at : place or sequence of places
-        Places where attachment vectors keep the static compliance of truncated modes, with an
-        FEModel.
+        Places where attachment vectors keep the static compliance of truncated modes. Only for an
+        FEModel, since `Modes` already contain their attachment vectors.
     damping : ModalDamping or Rayleigh, optional
-        Damping of modes and vectors in place of the model's D, with an FEModel.
+        Damping of modes and vectors in place of the model's D. Only for an FEModel.
 
     References
     ----------
@@ -268,7 +269,7 @@ class DesiredDofs(ReductionMethod):
         return f"<DesiredDofs: {len(labels)} ({some_names(labels, 3)})>"
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the model in these DOFs; `reduce` is the public way."""
+        """Return the model in these DOFs. Call `reduce` instead of this method."""
         modes = self._modes(structure)
         labels = tuple(self.dofs)
         modes.dofs.indices(labels)

@@ -30,9 +30,10 @@ def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeRanking(Value):
-    """Which elastic modes matter to which channels, as `rank_modes` finds them.
+    """Importance of each elastic mode for each channel, computed by `rank_modes`.
 
-    b holds the displacements of a mode at the inputs, and c those at the outputs.
+    A channel is a pair of an input and an output. The vector b holds the displacements of a mode at
+    the inputs, and c those at the outputs.
 
     Parameters
     ----------
@@ -49,8 +50,8 @@ class ModeRanking(Value):
         Largest singular value of the response of each mode over all frequencies.
     exact : (2 m,) array [m/N]
         Hankel singular values of the model of all elastic modes together, from Lyapunov equations,
-        the largest first. Each mode has two. They are close to its `total` when damping is low and
-        the modes are well separated.
+        the largest first. There are two for each mode. They are close to its `total` if damping is
+        low and the modes are well separated.
     inputs, outputs : sequence of str
         Names of the inputs and outputs.
 
@@ -101,20 +102,20 @@ class ModeRanking(Value):
 def rank_modes(
     modes: Modes, *, inputs: Place | Iterable[Place], outputs: Place | Iterable[Place] = ()
 ) -> ModeRanking:
-    """Return which elastic modes matter to which channels, by Hankel values.
+    """Return the importance of each elastic mode for each channel, by Hankel singular values.
 
     The two Hankel singular values of a single lightly damped mode are about
     ``||c|| ||b|| / (4 zeta omega^2)``. Here b holds the modal forces of unit forces at the inputs,
-    and c holds the displacements of the mode at the outputs. The values are nearly the same in a
-    model of many modes, when the frequencies differ by much more than the widths of the resonances.
+    and c holds the displacements of the mode at the outputs. In a model of many modes the values
+    are nearly the same if the frequencies differ by much more than the widths of the resonances.
 
     Parameters
     ----------
     modes : Modes
         Real and damped modes; attachment vectors are ignored.
     inputs, outputs : place or sequence of places
-        Places of forces and displacements: DOF labels, points (z) or mappings. Without outputs,
-        they are the inputs.
+        Places of forces and displacements: DOF labels, points (z) or mappings. Without `outputs`,
+        the displacements are taken at the inputs.
 
     Raises
     ------
@@ -205,13 +206,14 @@ class ErrorBound(Value):
     rule : str
         Rule from which the bound follows.
     terms : (k, 3) array, optional
-        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode,
-        with its displacements b at the inputs and c at the outputs. `ErrorBound.below` uses them.
+        Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode.
+        Here b holds the displacements of the mode at the inputs, and c those at the outputs.
+        `ErrorBound.below` uses these terms.
     static : float [m/N], optional
         Exact error at 0 Hz.
     covers : int, optional
-        Number of modes of the structure that the bound covers, where only some were solved. The
-        contribution of other modes is not included. None: all modes.
+        Number of modes of the structure that the bound covers, if only some were solved. The bound
+        does not include the contribution of the other modes. None: it covers all modes.
 
     Examples
     --------
@@ -243,10 +245,11 @@ class ErrorBound(Value):
     def below(self, freq: float) -> float:
         """Return the bound [m/N] for all frequencies up to `freq` [Hz].
 
-        A neglected mode i has the gain g_i and the response g_i h_i(w), which is far below its peak
-        when the mode lies above `freq`. The bound is the smallest of three values: `value`, the sum
-        of the largest ``g_i |h_i(w)|`` up to `freq`, and the static error plus the sum of the
-        largest ``g_i |h_i(w) - h_i(0)|``. The second value needs `terms`, the third also `static`.
+        A neglected mode i has the response ``g_i h_i(w)`` with the gain g_i. If the mode lies above
+        `freq`, its response up to `freq` is far below its peak. The bound is the smallest of three
+        values. The first is `value`. The second is the sum over the modes of the largest
+        ``g_i |h_i(w)|`` up to `freq`, and it needs `terms`. The third is the static error plus the
+        sum of the largest ``g_i |h_i(w) - h_i(0)|``, and it needs `terms` and `static`.
         """
         top = 2 * np.pi * positive(freq, "freq")
         if self.terms is None:

@@ -40,6 +40,9 @@ _COLUMNS = checked(real_array, shape=("coordinates", None))
 class ReducedModel(Value):
     """A reduced structure ``M* q_k'' + D* q_k' + K* q_k = T^T f``, ``q_n = T q_k``.
 
+    The k coordinates q_k are those of the reduced model. The n DOFs q_n are those of the full
+    structure, on which the forces f act.
+
     Parameters
     ----------
     M, D, K : (k, k) arrays
@@ -53,9 +56,8 @@ class ReducedModel(Value):
     full_dofs : DofSet
         The n DOFs of the full structure, with its shape functions.
     rigid_body : (k, r) array
-        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. They are stored, since an
-        eigenvalue solver for (K*, M*) would give their frequencies as small numbers of rounding
-        size, some of them imaginary.
+        Rigid-body motions in the k coordinates, with ``K rigid_body = 0``. They are stored because
+        an eigenvalue solver for (K*, M*) would round their frequencies to small numbers, not 0.
     method : str
         Name of the reduction method.
     condition : float
@@ -69,12 +71,12 @@ class ReducedModel(Value):
     bound : ErrorBound, optional
         Bound of the error between channels, where the method has one.
     truncated : Modes, optional
-        Modes of the full structure, with the rows `full_dofs`, that were solved but left out by
-        `reduce`. They are M-orthogonal to the kept modes. They stay the same when an update changes
-        M, D or K; newly solved modes of the changed full structure are then more accurate.
+        Modes of the full structure that were solved but left out by `reduce`, with the rows
+        `full_dofs`. They are M-orthogonal to the kept modes. An update changes M, D and K but not
+        these modes. After it, modes of the updated full structure would be more accurate.
     n_vectors : int
-        Number of columns of the basis that are residual attachment vectors (see `Modes`). The same
-        number of modes of this model are not modes of the structure: they represent the static
+        Number of residual attachment vectors in the basis (see `Modes`). The reduced model has this
+        number of additional modes, which are not modes of the structure. They represent the static
         compliance of the truncated modes.
     static_at : sequence of str
         Places whose static compliance is exact.
@@ -83,7 +85,7 @@ class ReducedModel(Value):
     joining : Value, optional
         Record of how a machine was joined, with its checks; None after an update.
     calibration : MeasuredModes, optional
-        The measured poles that `calibrated` put in.
+        Measured poles that `calibrated` used, if it was called.
     machines : Machines, optional
         Uncertainty of the machine that remains after an update.
 
@@ -164,7 +166,7 @@ class ReducedModel(Value):
         return len(self.dofs) == self.n_dof
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs for motions (k,) or (k, m), complex or not."""
+        """Return the motion ``T q`` of all n DOFs for real or complex motions q (k,) or (k, m)."""
         listed = complex_array(q, "q") if isinstance(q, list | tuple) else q
         shape = (self.n_dof,) if np.ndim(listed) == 1 else (self.n_dof, None)
         check: Any = complex_array if np.iscomplexobj(q) else real_array
@@ -239,11 +241,11 @@ class ReducedModel(Value):
     def condensed(self) -> tuple[ReducedModel, FloatArray, FloatArray]:
         """Return the model without its massless coordinates, and their flexibility.
 
-        Massless coordinates follow the others and the loads without delay:
-        ``q_k = S q_c + G T^T f``, exactly. The method returns three things: the model in the c
-        coordinates with mass, the matrix S (k, c), and the flexibility G (k, k) [m/N], which is the
-        immediate displacement per load on the coordinates. When all coordinates have mass, the
-        model does not change and G is zero.
+        Massless coordinates follow the other coordinates and the loads without delay. The equation
+        ``q_k = S q_c + G T^T f`` is therefore exact, where q_c are the c coordinates with mass. The
+        method returns three things: the model in the coordinates q_c, the matrix S (k, c), and the
+        flexibility G (k, k) [m/N]. G gives the immediate displacement under the loads. If all
+        coordinates have mass, the model does not change and G is zero.
 
         Raises
         ------
@@ -301,10 +303,11 @@ class ReducedModel(Value):
     def completed(self) -> ReducedModel:
         """Return the model with the truncated modes as further coordinates.
 
-        ``M = diag(M*, I)``, ``D = diag(D*, 2 Z Omega)``, ``K = diag(K*, Omega^2)``,
-        ``T = [T, phi]`` with the shapes phi of the truncated modes, from equations (5) and (8) of
-        the paper. Static coordinates ("static 1", ...) are dropped, since the truncated modes
-        contain their compliance. Without truncated modes, the model itself is returned.
+        The result has the matrices ``M = diag(M*, I)``, ``D = diag(D*, 2 Z Omega)``,
+        ``K = diag(K*, Omega^2)`` and ``T = [T, phi]``. Here phi, Omega and Z are the shapes,
+        frequencies and damping ratios of the truncated modes (equations (5) and (8) of the paper).
+        Static coordinates ("static 1", ...) are dropped, since the truncated modes contain their
+        compliance. Without truncated modes, the model itself is returned.
 
         Raises
         ------
@@ -339,20 +342,20 @@ class ReducedModel(Value):
     def modes(self) -> Modes:
         """Return all modes of the reduced model, with rigid-body modes at exactly 0.
 
-        The rows of the shapes are the kept DOFs where all coordinates are DOFs. Otherwise they are
-        the DOFs of the full structure, ``T phi_k``. The shapes are complex where D is not
-        proportional, for example after a damper was added. Massless coordinates and overdamped
-        motions give no modes.
+        If all coordinates are DOFs, the shapes have a row for each of these DOFs. Otherwise the
+        shapes phi_k are expanded by ``T phi_k`` and have a row for each DOF of the full structure.
+        They are complex where D is not proportional, for example after a damper was added. Massless
+        coordinates and overdamped motions give no modes.
 
         Raises
         ------
         ModelError
-            When M has lost its positive definiteness, or D damps the rigid-body motions.
+            When M is not positive definite, or D damps the rigid-body motions.
 
         Warns
         -----
         FlexplantWarning
-            When overdamped motions have real poles among the modes.
+            When overdamped motions have real poles in the frequency range of the modes.
         """
         model, _, _ = self.condensed()
         held, k = model.rigid_body, model.n_dof
@@ -384,16 +387,18 @@ class ReducedModel(Value):
         band : (float, float) [Hz]
             Frequency band of the comparison.
         inputs, outputs : places
-            Places of forces and displacements: DOF labels, points (z) or mappings. Without inputs,
-            the channels are those of the bound. Without outputs, they are the inputs.
+            Places of forces and displacements: DOF labels, points (z) or mappings. Without
+            `inputs`, the channels are those of the error bound. With `inputs` but without
+            `outputs`, the displacements are taken at the inputs.
         count : int, optional
             Number of modes that are compared. None: all modes up to the end of the band.
         freq : (m,) array [Hz], optional
             Check frequencies. None: the resonances and antiresonances of both models in the band,
             and a grid over the band.
         loss : float, optional
-            Loss factor of both models when the FEModel has no D: ``K (1 + i loss)``. None: twice
-            the mean damping ratio of the reduced model, or 0.01 when that model is undamped.
+            Loss factor that replaces the damping of both models if the FEModel has no D. Their
+            stiffness is then ``K (1 + i loss)``. None: twice the mean damping ratio of the reduced
+            model, or 0.01 if that model is undamped.
 
         Raises
         ------

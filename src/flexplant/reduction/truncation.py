@@ -29,23 +29,26 @@ _RESIDUE = "residual flexibility over twice the damping (Cauchy-Schwarz)"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalTruncation(ReductionMethod):
-    """The lowest (or chosen) modes alone (paper, eq. (5)), with or without static correction.
+    """The lowest or chosen modes (equation (5) of [paper]_), with or without static correction.
 
-    The coordinates are "mode 1", ..., then "static 1", ... With `static_at`, residual attachment
-    vectors (see `Modes`) keep the static compliance of the truncated modes at these places.
+    The coordinates of the modes are named "mode 1", "mode 2" and so on. With `static_at`, residual
+    attachment vectors (see `Modes`) keep the static compliance of the truncated modes at these
+    places. Their coordinates are named "static 1", "static 2" and so on.
 
     Parameters
     ----------
     count : int, optional
         Number of modes, rigid-body modes included.
     modes : sequence of int, optional
-        Mode numbers from 1 in place of `count`, with all rigid-body modes.
+        Numbers of the kept modes, counted from 1, in place of `count`. They must include all
+        rigid-body modes.
     static_at : place or sequence of places
         Places where the static compliance is kept.
     inputs, outputs : place or sequence of places
-        Channels of the error bound. Without outputs, they are the inputs.
+        Places of forces and displacements for the error bound. Without `outputs`, the displacements
+        are taken at the inputs.
     damping : ModalDamping or Rayleigh, optional
-        Damping of modes and vectors in place of the model's D, with an FEModel.
+        Damping of modes and vectors in place of the model's D. Only for an FEModel.
 
     Notes
     -----
@@ -60,8 +63,8 @@ class ModalTruncation(ReductionMethod):
     inputs and outputs, and G is the residual flexibility, from one static solution. With
     `static_at`, the peaks of the attachment vectors are added.
 
-    Below a frequency, modes above it are far from their peaks. `ErrorBound.below` gives a bound for
-    this band that is often smaller by orders of magnitude.
+    `ErrorBound.below` gives a bound for the frequencies up to a limit. Modes above the limit are
+    far from their peaks there, so that this bound is often smaller by orders of magnitude.
 
     Examples
     --------
@@ -92,7 +95,7 @@ class ModalTruncation(ReductionMethod):
         return tuple(range(1, int(self.count or 0) + 1))
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the truncated model; `reduce` is the public way."""
+        """Return the truncated model. Call `reduce` instead of this method."""
         numbers, model = self._numbers, structure
         static: Any = self.static_at
         if isinstance(model, Modes):
@@ -160,21 +163,22 @@ class ModalBalanced(ReductionMethod):
     count : int
         Number of modes, rigid-body modes included.
     inputs, outputs : place or sequence of places
-        Places of forces and displacements. Without outputs, they are the inputs.
+        Places of forces and displacements. Without `outputs`, the displacements are taken at the
+        inputs.
     among : int, optional
-        Number of lowest modes from which the method chooses, with an FEModel. None: all modes of a
-        small model.
+        Number of lowest modes from which the method chooses. Only for an FEModel. None: all modes
+        of a small model.
     static_at, damping
         Places of static correction, and damping, as for `ModalTruncation`.
 
     Notes
     -----
     The error bound is the sum of the peaks of the neglected modes. It is exact for one neglected
-    mode. It covers the solved modes only (`ErrorBound.covers`), which may not be all modes with
-    `among` or `Modes`. `ErrorBound.below` gives a smaller bound for a band. The usual bound, twice
-    the sum of the neglected Hankel singular values [Glover1984]_, holds for the truncation of the
-    exactly balanced model (`flexplant.balanced`), which is not of second order. These values are
-    `ModeRanking.exact`.
+    mode. It covers only the modes that were solved (`ErrorBound.covers`). With `among` or `Modes`,
+    these may not be all modes. `ErrorBound.below` gives a smaller bound for a band. The usual bound
+    is twice the sum of the neglected Hankel singular values [Glover1984]_, which are listed in
+    `ModeRanking.exact`. It holds for the truncation of the exactly balanced model
+    (`flexplant.balanced`), which is not of second order.
 
     References
     ----------
@@ -203,7 +207,7 @@ class ModalBalanced(ReductionMethod):
             raise ModelError("ModalBalanced needs inputs, since Hankel values belong to channels.")
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the truncated model; `reduce` is the public way."""
+        """Return the truncated model. Call `reduce` instead of this method."""
         modes = structure
         if not isinstance(modes, Modes):
             modes = solve_modes(modes, count=self.among, damping=self.damping)
