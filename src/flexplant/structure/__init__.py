@@ -1,17 +1,17 @@
 r"""Structure of a machine: finite-element matrices with labelled degrees of freedom, and damping.
 
-An `FEModel` holds M, D and K with the DOFs of their rows; ``"41:z"`` is the motion of node 41 in z.
-It is read from files (`fx.read_model`), or meshed here:
+An `FEModel` holds M, D and K with the DOFs of their rows. The label ``"41:z"`` is the motion of
+node 41 in z. `fx.read_model` reads a model from files. The functions here make and change models:
 
 - `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `solid_block` and
-  `chain` make meshes; thickness and modulus may vary over a plate.
+  `chain` make meshes. Thickness and modulus may vary over a plate.
 - `FEModel.with_parts` adds `PointMass`, `Spring` and `Damper` to any model; `FEModel.fixed` holds
   DOFs.
-- `ModalDamping` (one ratio, one for each mode, or measured ones) and `Rayleigh` give damping; a
-  complex K is read as modal damping.
-- `check`: report on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
-- `interpolated`: shapes between the nodes of matrices without elements, so that a point of
-  interest (POI) may be anywhere between them.
+- `ModalDamping` (one ratio, one for each mode, or measured ones) and `Rayleigh` give damping. The
+  imaginary part of a complex K becomes modal damping.
+- `check`: reports on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
+- `interpolated`: adds an interpolation between nodes to a model without known elements. A point of
+  interest (POI) may then be anywhere between the nodes.
 
 >>> import flexplant as fx
 >>> plate = fx.plate(
@@ -26,7 +26,8 @@ It is read from files (`fx.read_model`), or meshed here:
 0.5
 
 Names elsewhere: Ansys MASS21, COMBIN14; Nastran CONM2, CELAS2, CDAMP2; Abaqus \*MASS, \*SPRING.
-Structures are linear and time-invariant, M, D and K symmetric: no gyroscopic terms, no contact.
+Structures are linear and time-invariant, and M, D and K are symmetric. Gyroscopic terms and contact
+are not modelled.
 """
 
 from ..rooms import public_names as _public_names

@@ -43,7 +43,8 @@ class PointMass(Value):
         Mass. When the place is the label of a rotation, it is a moment of inertia [kg m^2].
     inertia : float or (3,) array [kg m^2]
         Moments of inertia about axes along x, y and z through the centre of the mass. They act on
-        the rotations that the model has at the point, or that follow from its displacements.
+        the rotations of the model at the point. A model without rotational DOFs computes these
+        rotations from its displacements.
 
     Examples
     --------
@@ -75,7 +76,7 @@ class PointMass(Value):
         self._set(inertia=tuple(about.tolist()))
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return (matrix, row, weight): the weight times row^T row is added to M."""
+        """Return tuples ("M", row, weight). Each adds weight row^T row to the matrix M."""
         if isinstance(self.at, str | Mapping):
             return [("M", dofs.row(self.at), self.mass)]
         moved = [d for d in ("x", "y", "z") if d in dofs.directions]
@@ -97,9 +98,10 @@ class Spring(Value):
     at : str, (3,) array [m] or mapping
         One end: a DOF label, a point, or a mapping of DOF labels to weights.
     stiffness : float [N/m or N m/rad]
-        Stiffness of the spring. It is negative where magnets attract, as in reluctance actuators:
-        the force grows with the displacement. Modes and plants take a negative stiffness that moves
-        the structure as a rigid body; one that bends it is refused when the modes are solved.
+        Stiffness of the spring. It may be negative, as for attracting magnets in reluctance
+        actuators, whose force increases the displacement. A negative stiffness may make rigid-body
+        motions unstable. `solve_modes` and `assemble_plant` accept such a model. They refuse a
+        model in which a deformation of the structure is unstable.
     direction : str
         Direction of the motion at a point: x, y, z, rx, ry, rz. Not used for a DOF label.
     to : place, optional
@@ -122,7 +124,7 @@ class Spring(Value):
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return (matrix, row, weight): the weight times row^T row is added to K."""
+        """Return a tuple ("K", row, weight), which adds weight row^T row to the matrix K."""
         return [("K", _stretch(self, dofs), self.stiffness)]
 
 
@@ -160,7 +162,7 @@ class Damper(Value):
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return (matrix, row, weight): the weight times row^T row is added to D."""
+        """Return a tuple ("D", row, weight), which adds weight row^T row to the matrix D."""
         return [("D", _stretch(self, dofs), self.rate)]
 
 

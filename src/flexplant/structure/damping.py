@@ -29,7 +29,7 @@ from .definite import elastic_modes
 
 
 class Damping(Value):
-    """How a structure is damped, as a damping ratio for any frequency.
+    """The base class of damping laws, which give a damping ratio for each frequency.
 
     Examples
     --------
@@ -57,7 +57,8 @@ _OTHERS = checked(between, low=0.0, high=1.0, hint="1 % is 0.01. Check per cent.
 class ModalDamping(Damping):
     """Modal damping: one damping ratio for all modes, or one for each mode.
 
-    Rigid-body modes are undamped unless stated: a free structure dissipates nothing in them.
+    Rigid-body modes are undamped by default, since a free structure does not dissipate energy in
+    them.
 
     Parameters
     ----------
@@ -65,11 +66,11 @@ class ModalDamping(Damping):
         Damping ratio in [0, 1). An array has one entry for each mode, also for rigid-body modes.
         The entries of rigid-body modes are not used.
     others : float [-], optional
-        Damping ratio of all modes beyond the array; without it there must be one entry for each
-        mode.
+        Damping ratio of all modes after those of the array. Without it, the array needs one entry
+        for each mode.
     rigid : float [1/s]
         Decay rate c of rigid-body motions, whose velocity decays as ``exp(-c t)``. Only
-        ``FEModel.with_damping`` uses it. `assemble_plant` accepts such a model, with dense
+        ``FEModel.with_damping`` uses it. `assemble_plant` accepts the resulting model, with dense
         matrices. `solve_modes` refuses it, since it computes undamped rigid-body modes only.
 
     Examples
@@ -103,7 +104,7 @@ class ModalDamping(Damping):
     def from_measured(
         cls, poles: Any, *, modes: Sequence[int] | None = None, others: float
     ) -> ModalDamping:
-        """Return the damping of measured poles: ``zeta = -Re(p) / |p|``.
+        """Return the damping of measured poles p, whose damping ratios are ``-Re(p) / |p|``.
 
         Parameters
         ----------
@@ -174,7 +175,7 @@ class ModalDamping(Damping):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rayleigh(Damping):
-    """Damping ``D = alpha M + beta K``: ratio ``alpha / (2 omega) + beta omega / 2``.
+    """Damping ``D = alpha M + beta K``, with ratios ``alpha / (2 omega) + beta omega / 2``.
 
     Rigid-body modes are undamped by default, since a free structure does not dissipate energy in
     them.
@@ -206,10 +207,10 @@ class Rayleigh(Damping):
 
     @classmethod
     def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:
-        """Return the Rayleigh damping that is nearest to ratios at frequencies.
+        """Return the Rayleigh damping with given damping ratios at given frequencies.
 
-        Two ratios are matched exactly. More are fitted by least squares, with alpha and beta not
-        negative.
+        Two ratios are matched exactly. More than two are fitted by least squares, in which alpha
+        and beta do not become negative.
 
         Parameters
         ----------

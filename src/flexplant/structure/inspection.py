@@ -27,13 +27,13 @@ from .zero_energy_motions import ZeroEnergy, held_by_rounding, most_moved, nearl
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelCheck(Value):
-    """Findings of `check`, line by line; prints as a table.
+    """Findings of `check`, which print as a table with one line for each subject.
 
     Parameters
     ----------
     lines : tuple of (verdict, subject, finding, next step)
-        Verdicts are "ok", "note" (the finding deserves attention) and "fail" (data are missing or
-        wrong).
+        Lines of the table. The verdict is "ok", "note" (the finding deserves attention) or "fail"
+        (data are missing or wrong).
     mass : (3,) array [kg]
         Mass in translation along x, y, z; NaN for a direction without a DOF.
     center : (3,) array [m]
@@ -90,12 +90,12 @@ class ModelCheck(Value):
         return not self.of("fail")
 
     def of(self, verdict: str) -> tuple[str, ...]:
-        """Return the subjects with a verdict: "ok", "note" or "fail".
+        """Return the subjects of the lines with a given verdict.
 
         Parameters
         ----------
         verdict : str
-            Verdict of the returned lines.
+            Verdict "ok", "note" or "fail".
         """
         one_of(verdict, "verdict", ("ok", "note", "fail"))
         return tuple(subject for found, subject, _, _ in self.lines if found == verdict)

@@ -27,8 +27,8 @@ Interpolated = TypeVar("Interpolated", bound=Value)
 def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """Return a model (or its modes, or a DofSet) whose shapes are interpolated between its nodes.
 
-    Use this function for imported models, whose elements are not known. Places may then be any
-    point between the nodes, not only labels. Such a model is interpolated only on this request.
+    Use this function for imported models, whose elements are not known. A place may then be any
+    point between the nodes, in addition to labels. Without this function, only labels are allowed.
 
     Parameters
     ----------
@@ -51,11 +51,12 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     Notes
     -----
     Each displacement is a sum of radial basis functions r^3 and a linear part (RBFInterpolator of
-    SciPy). The interpolation is exact at the nodes and for rigid-body motion. Where the model has
-    no rotations, they are half the curl of the displacements. Where only one slope is known, such
-    as rx = dz/dy or ry = -dz/dx on a plate, the rotation is this slope. With up to 600 nodes the
-    field is smooth. With more nodes, the 80 nodes nearest to the point are used. The field may then
-    jump, by about the interpolation error, where other nodes become the nearest ones.
+    SciPy). The interpolation is exact at the nodes and for rigid-body motion. If the model has no
+    rotational DOFs, rotations are half the curl of the displacements. If only one slope is known,
+    such as rx = dz/dy or ry = -dz/dx on a plate, the rotation is this slope. With up to 600 nodes
+    the interpolated displacements are smooth. With more nodes, only the 80 nodes nearest to the
+    point are used. Where these change from point to point, the displacements may jump by about the
+    interpolation error.
 
     Examples
     --------
@@ -83,7 +84,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScatteredShape(Interpolation):
-    """Interpolation by radial basis functions between the nodes of a model; made by `interpolated`.
+    """Interpolation between nodes by radial basis functions, which `interpolated` makes.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ class ScatteredShape(Interpolation):
     margin: float = field(default=0.0, metadata=checked(positive, zero=True, unit="m"))
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of the DOFs: their sum ``weights @ q`` is the motion at a point.
+        """Return the weights (n,) with which the DOFs give the motion at a point.
 
         Raises
         ------
@@ -121,7 +122,7 @@ class ScatteredShape(Interpolation):
         return np.asarray(self.rows(real_array(xyz, "xyz", (3,))[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
         places = real_array(points, "points", (None, 3))
         require_known("motion", [direction], DIRECTIONS)
         if direction in self.directions:

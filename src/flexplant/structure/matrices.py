@@ -28,10 +28,11 @@ from .zero_energy_motions import endangered, freed, held_by_rounding, shown_digi
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FEMatrices(Value):
-    """Matrices of ``M q'' + D q' + K q = f`` as a file holds them; `check` reports what is wrong.
+    """Matrices of ``M q'' + D q' + K q = f`` as they were read from a file, with their errors.
 
-    An FEModel needs a positive definite M, known DOFs and coordinates; FEMatrices need none of
-    these. `model` makes an FEModel when all is available, and otherwise says what is missing.
+    An FEModel needs a positive definite M, known DOFs and coordinates. FEMatrices can do without
+    them. `check` reports the errors. The method `model` makes an FEModel, or raises an error that
+    says what is missing.
 
     Parameters
     ----------
@@ -43,22 +44,22 @@ class FEMatrices(Value):
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping; M may be singular.
     dofs : DofSet, optional
-        DOFs of the rows. None: not known yet; `with_dofs` adds them.
+        DOFs of the rows. None: the DOFs are not known yet, and `with_dofs` can add them.
     digits : int, optional
-        Number of significant decimal digits of the entries of K: those printed in a text file, or 7
-        for single precision. None: double precision.
+        Number of significant decimal digits of the entries of K. This is the number printed in a
+        text file, or 7 for single precision. None: double precision.
     source : str, optional
         Origin of the matrices, for display.
     constrained : sequence of str
         Labels of fixed DOFs in the file, which were dropped.
     located : bool
-        Whether the coordinates in `dofs` are known. False: the file has no coordinates and they are
-        zero.
+        Whether the coordinates in `dofs` are known. False: the file contains no coordinates, and
+        those in `dofs` are zero.
     notes : sequence of str
         Changes that were made when the file was read, such as a completed triangle or dropped empty
         rows.
     loss_factor : float
-        Loss factor eta of a complex K; the mean over the rows where it differs over the structure.
+        Loss factor eta of a complex K. If it differs over the structure, the mean over the rows.
 
     Raises
     ------
@@ -154,13 +155,13 @@ class FEMatrices(Value):
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """The DOFs without mass: their labels, or row numbers from 1 where the DOFs are unknown."""
+        """Labels of the DOFs without mass, or "row 1", "row 2", ... if the DOFs are unknown."""
         if self.M is None:
             return ()
         return self.names(np.flatnonzero(empty_rows(self.M)))
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
-        """Return the labels of rows (from 0); 'row 1', 'row 2', ... where the DOFs are unknown."""
+        """Return the labels of rows (counted from 0), or "row 1", ... if the DOFs are unknown."""
         if self.dofs is None:
             return tuple(f"row {row + 1}" for row in rows.tolist())
         labels = self.dofs.labels
@@ -213,8 +214,8 @@ class FEMatrices(Value):
         """Return the matrices without the rows of held DOFs; `constrained` keeps their labels.
 
         Some solvers write such rows. They are empty in every matrix, or have no mass and only a
-        diagonal entry in K. The DOF stays at rest, so that the result does not change when it is
-        dropped.
+        diagonal entry in K. Such a DOF stays at rest, so that dropping it does not change the
+        result.
         """
         held = held_rows(self.K, self.M, self.D)
         if not held.any() or held.all():
@@ -241,7 +242,7 @@ class FEMatrices(Value):
         Parameters
         ----------
         length, mass, time : str or float
-            Present units, such as "mm", "t", "s"; or the size of one unit in SI.
+            Present units, such as "mm", "t", "s", or the size of each unit in SI units.
 
         Returns
         -------
@@ -268,8 +269,8 @@ class FEMatrices(Value):
     def rotated(self, rotations: Any) -> FEMatrices:
         """Return the matrices in global directions, from nodes with local coordinate systems.
 
-        The direction cosines C of a node give ``q_local = C q_global``, for its three displacements
-        and its three rotations alike, and hence ``K_global = C^T K_local C``.
+        The direction cosines C of a node give ``q_local = C q_global`` for its three displacements,
+        and in the same way for its three rotations. It follows that ``K_global = C^T K_local C``.
 
         Parameters
         ----------
@@ -315,7 +316,8 @@ class FEMatrices(Value):
         ModelError
             When M is missing, a matrix is not symmetric, or K is not positive semidefinite.
         SolverError
-            When residuals, or a Sturm count of the frequencies below, do not confirm the answer.
+            When the residuals are too large, or when a Sturm count finds another number of
+            frequencies.
 
         Examples
         --------
@@ -339,8 +341,9 @@ class FEMatrices(Value):
         Parameters
         ----------
         massless : "refuse" or "condense"
-            Treatment of DOFs without mass. "condense" removes them statically,
-            ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
+            Treatment of DOFs without mass. "refuse" raises an error. "condense" removes these DOFs
+            s statically from the others m, ``K = K_mm - K_ms K_ss^-1 K_sm``. This is exact, since
+            the DOFs s have no inertia.
         free : bool
             Whether to free rigid-body motions that are held only because K lost digits (text,
             single precision), as `freed` does.
@@ -350,9 +353,9 @@ class FEMatrices(Value):
         Raises
         ------
         ModelError
-            When M is missing or singular, the DOFs are not known, coordinates are missing and
-            needed because the structure can move freely, DOFs have no mass and `massless` is
-            "refuse", or `free` is True and the structure is held by its stiffness.
+            When M is missing or singular, or the DOFs are not known. When the structure can move
+            freely and its coordinates are not known. When DOFs have no mass and `massless` is
+            "refuse". When `free` is True although the structure is held by its stiffness.
 
         Warns
         -----
@@ -415,7 +418,7 @@ class FEMatrices(Value):
         return model
 
     def freed(self) -> FEMatrices:
-        """Return the matrices with the rigid-body motions free that only rounding of K holds.
+        """Return the matrices with free rigid-body motions, if only rounding of K holds these.
 
         The new stiffness is ``K' = P^T K P`` with ``P = I - R R^T M``, where R holds the rigid-body
         motions. The elastic modes are M-orthogonal to R and do not change. Use this method for

@@ -59,8 +59,8 @@ class FEModel(Placed, Value):
         Name of the model, as it is printed.
     held_inertia : (n, 6) array, optional
         Forces ``M_fs r_s`` that the held DOFs s exert on the free DOFs f through the mass matrix
-        when the ground accelerates, one column for each of the six rigid-body motions of the ground
-        about the origin. `fixed` computes them.
+        when the ground accelerates. There is one column for each of the six rigid-body motions of
+        the ground about the origin. `fixed` computes them.
     joint_motions : (n, m) array, optional
         M-orthonormal motions that a joined machine makes without deforming: its components move as
         rigid bodies, as far as the joints (a slide, a hinge) allow. They replace the rigid-body
@@ -179,11 +179,11 @@ class FEModel(Placed, Value):
         """The rigid-body motions R (n, r), with ``K R = 0`` and ``R^T M R = I``.
 
         They follow from the coordinates and are therefore exact. The order is x, y, z, rx, ry, rz,
-        without the motions that do not exist; rotations turn about the centre of gravity. A held
-        structure has none, (n, 0). Pieces that neither K nor M connects have separate motions, and
-        those of the largest piece come first. Where the coordinates have few digits (down to four),
-        rotations are the null vectors of K closest to the rotations of the geometry. A motion that
-        is held by a spring, however soft, is not included.
+        and rotations turn about the centre of gravity. Motions in which the structure is not free
+        are left out. A held structure has no such motions, and the array is (n, 0). Even a soft
+        spring holds a motion. Pieces that neither K nor M connects have separate motions, and those
+        of the largest piece come first. If the coordinates have few digits (down to four), the
+        rotations are the null vectors of K that are closest to the rotations of the geometry.
         """
         return np.asarray(
             frozen(rigid_body_basis(self.M, self.K, self.body_motions, self.dofs.xyz))
@@ -221,7 +221,7 @@ class FEModel(Placed, Value):
         return load if self.held_inertia is None else load + self.held_inertia @ ground
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return how strongly DOFs held by `fixed` prevent each of the six rigid-body motions (6,).
+        """Return how much the DOFs held by `fixed` prevent each of six rigid-body motions (6,).
 
         Springs to ground do not count, since the DOFs can still make the motion. For a motion r the
         result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
@@ -247,9 +247,9 @@ class FEModel(Placed, Value):
     def with_damping(self, damping: Damping | MatrixLike) -> FEModel:
         """Return the model with the matrix D of a damping law, or with a measured D.
 
-        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix. Rayleigh
-        damping is ``alpha M + beta K``. Both leave rigid-body motions undamped, unless the law has
-        damping for them (`rigid`).
+        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` with the shapes Phi of all n modes. This is
+        a full matrix. Rayleigh damping is ``alpha M + beta K``. Both leave rigid-body motions
+        undamped, unless the argument `rigid` of the law was given.
 
         Parameters
         ----------
@@ -259,7 +259,7 @@ class FEModel(Placed, Value):
         Raises
         ------
         ModelError
-            When a full D is needed and the model is too large for one; when a given D is not
+            When the model is too large for the full D of modal damping, or when a given D is not
             symmetric or not positive semi-definite.
         """
         if not isinstance(damping, Damping):
@@ -285,8 +285,8 @@ class FEModel(Placed, Value):
     def with_parts(self, parts: Iterable[Part] | Part) -> FEModel:
         """Return the model with point masses, springs and dampers added.
 
-        Each part adds ``weight row^T row`` to M, K or D. The row gives the motion at the part,
-        interpolated where its place is between nodes.
+        Each part adds ``weight row^T row`` to M, K or D. The weight is its mass, stiffness or
+        damping. The row gives the motion at its place, interpolated if it lies between nodes.
 
         Parameters
         ----------
@@ -309,9 +309,9 @@ class FEModel(Placed, Value):
     def fixed(self, labels: Iterable[str]) -> FEModel:
         """Return the model with some DOFs held still: their rows and columns are taken out.
 
-        Points between nodes can still be used. The forces that the mass of the held DOFs causes
-        when the ground moves are kept in `held_inertia`. Parts that are added later act on free
-        DOFs only.
+        Points between nodes can still be used. When the ground moves, the mass of the held DOFs
+        causes forces on the free DOFs. These are kept in `held_inertia`. Parts that are added later
+        act on free DOFs only.
 
         Parameters
         ----------
@@ -359,13 +359,14 @@ class FEModel(Placed, Value):
         Parameters
         ----------
         length, mass, time : str or float
-            Present units, such as "mm", "t", "s"; or the size of one unit in SI. Forces follow: mm,
-            t and s give N.
+            Present units, such as "mm", "t", "s", or the size of each unit in SI units. The unit of
+            force follows from them. It is N for mm, t and s.
 
         Raises
         ------
         ModelError
-            When a unit is unknown, or the DOFs carry an interpolation (convert first).
+            When a unit is unknown, or the model has an interpolation. Convert the model before
+            `interpolated` adds one.
 
         Examples
         --------

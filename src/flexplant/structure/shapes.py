@@ -104,10 +104,11 @@ class PlateShape(GridShape):
         return self.elements, None, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion z, rx or ry at a point.
+        """Return the weights (n,) with which the DOFs give the motion z, rx or ry at a point.
 
-        Between elements z is continuous; the slope across an edge is not (the element is
-        non-conforming), and the element on the side of larger coordinates is taken.
+        Between elements z is continuous. The slope across an edge is not, since the elements are
+        non-conforming. On an edge, the slope in the element with the larger coordinates is
+        returned.
         """
         require_known("motion", [direction], ("z", "rx", "ry"), "a plate in bending")
         point = real_array(xyz, "xyz", (3,))
@@ -133,7 +134,7 @@ class PlateShape(GridShape):
         return np.asarray(terms @ plate_coefficients(a, b))
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one."""
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
         points = real_array(points, "points", (None, 3))
         grid, size, count = self._grid, np.array(self.size), np.array(self.elements)
         place = np.clip(points[:, :2] / size, 0.0, 1.0) * count
@@ -168,7 +169,7 @@ class PlateShape(GridShape):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BeamShape(GridShape):
-    """The shape functions of a beam along x: cubic between its nodes.
+    """The shape functions of a beam along x, which are cubic between its nodes.
 
     Parameters
     ----------
@@ -194,7 +195,7 @@ class BeamShape(GridShape):
         return (self.elements,), None, 2
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion z or ry of the section at a point.
+        """Return the weights (n,) with which the DOFs give the motion z or ry of a section.
 
         Raises
         ------
@@ -222,7 +223,7 @@ class BeamShape(GridShape):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BlockShape(GridShape):
-    """The shape functions of a box of eight-node bricks: trilinear.
+    """The trilinear shape functions of a box of eight-node bricks.
 
     Parameters
     ----------
@@ -252,7 +253,7 @@ class BlockShape(GridShape):
         return self.elements, self.present, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of the DOFs: ``weights @ q`` is the motion at a point.
+        """Return the weights (n,) with which the DOFs give the motion at a point.
 
         The internal bending modes of an element are computed from the displacements of its corners.
         Rotations rx, ry, rz are half the curl of the displacements. They jump slightly between two

@@ -39,30 +39,32 @@ def chain(
     spacing: float = 1.0,
     name: str | None = None,
 ) -> FEModel:
-    """Return masses in a row along x, springs and dampers between neighbours.
+    """Return a chain of masses along x, with springs and dampers between neighbours.
 
-    ``m_i x_i'' = k_{i-1} (x_{i-1} - x_i) + k_i (x_{i+1} - x_i) - g_i x_i`` with the stiffness g_i
-    to the ground. Dampers between neighbours add their forces in the same way.
+    Mass i has the equation of motion
+    ``m_i x_i'' = k_{i-1} (x_{i-1} - x_i) + k_i (x_{i+1} - x_i) - g_i x_i``. Here k_i is the
+    stiffness between the masses i and i + 1, and g_i is the stiffness to the ground. Dampers
+    between neighbours add their forces in the same way.
 
     Parameters
     ----------
     masses : (n,) array [kg]
-        Masses; their DOFs are "1:x", "2:x", ...
+        Masses. Their DOFs are "1:x", "2:x", ...
     stiffnesses : (n - 1,) array [N/m]
         Stiffnesses of the springs between neighbours.
     dampings : (n - 1,) array [N s/m], optional
-        Dampers between neighbours; without them the model has no D.
+        Damping between neighbours. None: the model has no D.
     ground : float or (n,) array [N/m]
         Stiffnesses from each mass to the ground.
     spacing : float [m]
-        Distance of neighbours; only the coordinates depend on it.
+        Distance between neighbours. Only the coordinates depend on it.
     name : str, optional
         Name of the model, as it is printed.
 
     Returns
     -------
     FEModel
-        Sparse, of n DOFs.
+        Model with n DOFs and sparse matrices.
 
     Raises
     ------
@@ -136,10 +138,10 @@ def beam(
     except those that are held at an end. The model is accurate for wave lengths well above ten
     times the height.
 
-    With `poisson_ratio` the beam has shear deformation and rotary inertia (Timoshenko):
-    ``rho A z'' = (k G A (z_x - t))_x``, ``rho I t'' = (E I t_x)_x + k G A (z_x - t)`` with the
-    slope t of the section. Its elements are exact in statics [FriedmanKosmatka1993]_, and ry is the
-    rotation -t of the section.
+    With `poisson_ratio` the beam has shear deformation and rotary inertia (Timoshenko). Its
+    equations are ``rho A z'' = (k G A (z_x - t))_x`` and
+    ``rho I t'' = (E I t_x)_x + k G A (z_x - t)``, where t is the slope of the section. Its elements
+    are exact in statics [FriedmanKosmatka1993]_, and ry is the rotation -t of the section.
 
     Parameters
     ----------
@@ -163,7 +165,8 @@ def beam(
     Returns
     -------
     FEModel
-        Sparse, without D, interpolating with the cubic shape functions.
+        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
+        cubic shape functions.
 
     Raises
     ------
@@ -242,8 +245,8 @@ def kirchhoff_plate(
     The elements are those of Adini, Clough and Melosh: four nodes, non-conforming, with the
     complete cubic polynomial and the terms x^3 y and x y^3. Stiffness and consistent mass are
     integrated exactly. The plate lies in the x-y plane with one corner at the origin and its middle
-    plane at z = 0. Nodes are numbered from 1, x fastest; each has the DOFs z [m], rx = dz/dy and ry
-    = -dz/dx [rad].
+    plane at z = 0. Nodes are numbered from 1 along x, row by row. Each has the DOFs z [m],
+    rx = dz/dy and ry = -dz/dx [rad].
 
     Thickness, density and the constants of the material may each be one number, an array (nx, ny)
     with a number for each element, or a function of the centre (x, y) of an element.
@@ -318,12 +321,12 @@ def solid_block(
     holes: FloatArray | Callable[[float, float, float], bool] | None = None,
     name: str | None = None,
 ) -> FEModel:
-    """Return a free rectangular block of eight-node bricks, corner at the origin.
+    """Return a free rectangular block of eight-node bricks, with one corner at the origin.
 
-    Displacements are trilinear, with the incompatible modes of Wilson and Taylor inside each
+    Displacements are trilinear. The incompatible modes of Wilson and Taylor are added inside each
     element, so that the elements are not too stiff in bending (locking). The mass matrix is
-    consistent. Nodes are numbered from 1, x fastest, then y, z; each has the DOFs x, y, z [m]. With
-    holes, nodes keep the numbers of the full block.
+    consistent. Nodes are numbered from 1, first along x, then y, then z. Each has the DOFs x, y and
+    z [m]. With holes, nodes keep the numbers of the full block.
 
     Parameters
     ----------

@@ -20,9 +20,9 @@ from .model import FEModel
 def slides(model: FEModel) -> dict[str, FloatArray]:
     """Return the zero-energy motions that are not rigid-body motions, each named by a DOF.
 
-    A carriage on its guide, a joint or a screw moves without elastic energy; a drive controls this
-    motion. In an imported model it is a zero-energy motion, which `solve_modes` refuses as a
-    mechanism until `sliding` declares it a slide.
+    A carriage on its guide, a joint or a screw moves without elastic energy, and a drive controls
+    this motion. In an imported model, `solve_modes` refuses such a motion as a mechanism. The
+    function `sliding` declares it as a slide, and `solve_modes` then accepts it.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
         Model with slides: motions without energy that are not rigid-body motions, such as that of a
         carriage on its guide.
     names : sequence of str, optional
-        Labels of the accepted slides, as `slides` gives them; all by default. `solve_modes` refuses
-        every other free motion as a mechanism.
+        Labels of the accepted slides, as `slides` returns them. None: all slides. `solve_modes`
+        refuses every other free motion as a mechanism.
 
     Raises
     ------

@@ -141,9 +141,9 @@ class ThickPlateShape(PlateShape):
     Parameters
     ----------
     size, thickness, elements
-        As for `PlateShape`.
+        Size, thickness and number of elements, as for `PlateShape`.
     softness : float or (ny, nx) array [m^2]
-        Ratio of bending stiffness to shear stiffness of the elements; 0 is a plate without shear
+        Ratio of bending stiffness to shear stiffness of the elements. 0: the plate has no shear
         deformation.
 
     Examples
@@ -181,16 +181,17 @@ def plate(
 ) -> FEModel:
     """Return a free rectangular plate in bending, with shear and rotary inertia (Mindlin).
 
-    ``rho h z'' = div(k G h (grad z - t))``, ``rho h^3 / 12 t'' = div m(t) + k G h (grad z - t)``
-    with the deflection z, the slopes t of the section, the bending moments m(t), the thickness h,
-    the density rho, the shear modulus G and the shear factor k [Mindlin1951]_. The elements have
-    four nodes, quadratic slopes and constant shear along each edge [Katili1993]_. They do not lock;
-    for a thin plate they become discrete Kirchhoff elements. Stiffness and consistent mass are
-    integrated exactly. Errors fall with the square of the element size.
+    The equations are ``rho h z'' = div(k G h (grad z - t))`` and
+    ``rho h^3 / 12 t'' = div m(t) + k G h (grad z - t)``. Here z is the deflection, t are the slopes
+    of the section, m(t) the bending moments, h the thickness, rho the density, G the shear modulus
+    and k the shear factor [Mindlin1951]_. The elements have four nodes, quadratic slopes and
+    constant shear along each edge [Katili1993]_. They are not too stiff for thin plates (locking),
+    where they become discrete Kirchhoff elements. Stiffness and consistent mass are integrated
+    exactly. Errors are proportional to the square of the element size.
 
     The plate lies in the x-y plane with one corner at the origin and its middle plane at z = 0.
-    Nodes are numbered from 1, x fastest; each has the DOFs z [m] and the rotations rx, ry [rad] of
-    the section, which are dz/dy and -dz/dx without shear deformation.
+    Nodes are numbered from 1 along x, row by row. Each has the DOFs z [m] and the rotations rx, ry
+    [rad] of the section. Without shear deformation, these are dz/dy and -dz/dx.
 
     Thickness, density and the constants of the material may each be one number, an array (nx, ny)
     with a number for each element, or a function of the centre (x, y) of an element.
@@ -202,9 +203,9 @@ def plate(
     thickness : float, (nx, ny) array or function [m]
         Thickness, symmetric about the middle plane.
     elements : (2,) array of int
-        Number of elements nx, ny. Near a free edge the twist changes over about one thickness.
-        Elements larger than this make the lowest frequency of a plate of 0.6 x 0.6 x 0.027 m up to
-        1 % too high.
+        Number of elements nx, ny. Near a free edge the twist changes within about one thickness.
+        Larger elements cannot follow this change. The lowest frequency of a plate of 0.6 x 0.6 x
+        0.027 m is then up to 1 % too high.
     density : float, (nx, ny) array or function [kg/m^3]
         Density of the material.
     youngs_modulus : float, (nx, ny) array or function [Pa]
