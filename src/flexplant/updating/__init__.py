@@ -2,14 +2,16 @@
 
 Errors of a model are found from measurements, together with their uncertainty.
 
-- `update(model, parameters, residuals)`: parameters are `AddedMass`, `AddedDamping`,
-  `AddedStiffness`, `MatrixParameter`, ...; residuals `Eigenvalues`, `ModeShapes`, `FrfResidual`,
-  `Antiresonances`, `StaticCompliance`; chi-square says whether they explain the data.
-- `localise(model, candidates, residuals)`: the place of an error, among candidates.
-- `identifiability`: parameters that the data determine; `validate` with data left out.
-- `UpdateResult.calibrated(measured)`: the measured poles in the model; `applied_to(full)`: the
-  updated full model.
-- `UpdateResult.uncertainty()`: remaining uncertainty of each mode, for tolerant controllers.
+- `update(model, parameters, residuals)`: finds the parameters that fit the measurements. Parameters
+  are `AddedMass`, `AddedDamping`, `AddedStiffness`, `MatrixParameter` and others. Residuals are
+  `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances` and `StaticCompliance`. Chi-square
+  shows whether the updated model explains the measurements.
+- `localise(model, candidates, residuals)`: finds the place of an error among candidates.
+- `identifiability`: shows which parameters the data determine.
+- `validate`: tests the updated model with data that were not fitted.
+- `UpdateResult.calibrated(measured)`: puts the measured poles into the updated model.
+- `UpdateResult.applied_to(full)`: updates the full model.
+- `UpdateResult.uncertainty()`: remaining uncertainty of each mode, for robust controllers.
 
 >>> import flexplant as fx
 >>> nominal = fx.chain(masses=[1.0, 0.3, 0.2], stiffnesses=[2e4, 3e4])

@@ -212,12 +212,12 @@ class ModalUncertainty(Value):
     modes : sequence of m int
         Numbers of elastic modes, counted from 1 with rigid-body modes.
     share : (2 m,) array
-        Half-widths of the 95 % intervals of frequencies, then of damping ratios.
+        Relative half-widths of the 95 % intervals of the frequencies, then of the damping ratios.
     covariance : (2 m, 2 m) array
-        Joint covariance of the logarithms of the frequencies, then of the damping ratios. It
+        Covariance of the logarithms of m frequencies and m damping ratios, in this order. It
         includes the noise of the measured poles, the uncertainty of the parameters and the model
-        error. The half-widths `share` also include bias, drift, the mesh error and the quantile of
-        Student's distribution.
+        error. The half-widths `share` also include bias, drift and the mesh error, and they are
+        quantiles of Student's distribution.
     poles : (m,) complex array [rad/s]
         Poles of the model.
 

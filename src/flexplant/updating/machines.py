@@ -48,7 +48,7 @@ class Machines(Value):
     machine that agrees with the measurement. The object is the result of ``fit.machines(measured)``
     and is passed to a plant by ``plant.uncertain(machines)``. A plant of
     ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal coordinates
-    of the plant's evaluation model, where the mass matrix is the unit matrix and Omega is the
+    of the plant's evaluation model. There, the mass matrix is the unit matrix I, and Omega is the
     diagonal matrix of the frequencies:
 
     - the deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
@@ -59,10 +59,11 @@ class Machines(Value):
     - the matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
       ``K' = Omega exp(E) Omega + sum dp dK``. The matrix E is symmetric. Its diagonal elements are
       ``2 (s e + (1 - r) t)`` with standard normal numbers e, and its other elements have the
-      standard deviation ``sqrt(2) s``. Frequencies and shapes therefore change together. For a mode
-      below the measured band and a mode in or above it, the element of E is smaller by the ratio of
-      their frequencies, because a body on isolators strains other springs than the measured modes.
-      The masses of rigid-body modes have the relative deviation 2 s, because they are not measured;
+      standard deviation ``sqrt(2) s``. Frequencies and shapes therefore change together. The
+      element of E between a mode below the measured band and a mode in or above it is smaller, by
+      the ratio of the two frequencies. Such a low mode is a motion on isolators, which strains
+      other springs than the measured modes. The masses of rigid-body modes have the relative
+      deviation 2 s, because they are not measured;
     - the poles of measured modes are drawn from their covariance. The damping ratios of other modes
       follow the predictive distribution (Student's) of the measured ratios.
 
@@ -106,12 +107,12 @@ class Machines(Value):
 
     @cached_property
     def missing(self) -> str:
-        """Reason why no interval exists, in one sentence; empty if there is an interval."""
+        """Reason why no interval can be computed, or an empty text if it can."""
         return self.trend.missing or next(iter(self.fit.unlike_shapes(self.measured)), "")
 
     @cached_property
     def damping_changes(self) -> FloatArray:
-        """Logarithms of the ratio of measured to computed damping ratios, for damped modes."""
+        """Logarithms ``ln(zeta_measured / zeta_model)`` of the damped modes."""
         poles = self.measured.poles
         found = -poles.real / np.abs(poles)
         return np.log(found[found > TYPED] / self._own_damping[found > TYPED])
@@ -160,7 +161,7 @@ class Machines(Value):
         return np.minimum(found.real, 0.0) + 1j * found.imag
 
     def located(self) -> list[Parameter]:
-        """Return the parameters with points in place of labels, which are valid on another mesh."""
+        """Return the parameters with points in place of labels, so that they fit other meshes."""
         model = self.fit.model
         dofs = getattr(model, "full_dofs", None) or model.dofs
         return [_located(q, dofs) for q in self.fit.unknowns]

@@ -74,11 +74,11 @@ class _GivenParameter(Parameter):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MatrixParameter(_GivenParameter):
-    """A parameter with given derivatives of the matrices: M + p dM, D + p dD, K + p dK.
+    """A parameter p that changes the matrices to M + p dM, D + p dD and K + p dK.
 
-    If p is the relative change of the stiffness of a group of elements, dK is the sum of their
-    element stiffness matrices. Matrices of the full structure are projected once by ``T^T dK T``
-    with the reduction matrix T of the model.
+    For example, p is the relative change of the stiffness of a group of elements. Then dK is the
+    sum of their element stiffness matrices. For a reduced model with the reduction matrix T,
+    matrices of the full structure are projected once by ``T^T dK T``.
 
     Parameters
     ----------
@@ -87,8 +87,9 @@ class MatrixParameter(_GivenParameter):
     dM, dD, dK : (k, k) or (n, n) array or sparse matrix, optional
         Symmetric matrices in the DOFs of the model or of the full structure.
     unit : str
-        Unit of p; empty for a relative change.
-    bounds, prior : as for `AddedMass`
+        Unit of p. Empty: p is a relative change.
+    bounds, prior : optional
+        Bounds and prior of p, as for `AddedMass`.
 
     Raises
     ------
@@ -118,22 +119,23 @@ class MatrixParameter(_GivenParameter):
         bounds: tuple[float, float] | None = None,
         prior: tuple[float, float] | None = None,
     ) -> MatrixParameter:
-        """Return the parameter p = v - value of a full model `build(v)`, by central differences.
+        """Return the parameter ``p = v - value`` of a full model ``build(v)``, by differences.
 
-        It is exact for quantities on which the matrices depend affinely, such as a density or
-        Young's modulus. If they do not (a bending stiffness is proportional to thickness^3), it
-        holds for small changes only. `PolynomialParameter.from_build` is exact for these.
+        The derivatives of the matrices are central differences. They are exact if the matrices are
+        linear functions of the quantity v, such as a density or Young's modulus. Otherwise they
+        hold for small changes only. An example is a thickness, since the bending stiffness is
+        proportional to its third power. `PolynomialParameter.from_build` is exact there.
 
         Parameters
         ----------
         name, unit, bounds, prior
-            As for the class. Bounds and prior refer to the change p.
+            As for the class. Bounds and prior are those of the change p.
         build : callable
-            Function from the value to an FEModel, with the same DOFs at every value.
+            Function of v that returns an FEModel, with the same DOFs for every v.
         value : float
-            Value of the model that is updated.
+            Value of v in the model that is updated.
         step : float, optional
-            Step of the difference; 1e-3 of the value by default.
+            Step of the difference. None: 1e-3 times the value.
 
         Raises
         ------
@@ -164,19 +166,21 @@ class MatrixParameter(_GivenParameter):
     ) -> list[MatrixParameter]:
         """Return a parameter for each region of elements: the relative change of one quantity.
 
-        ``quantity = value (1 + p)`` in the region, by central differences of the full model; its
-        matrices are projected through T once, when an update begins. Young's modulus and density
-        are exactly affine. For a thickness use `PolynomialParameter.from_build` for each region.
+        In a region with the parameter p, the quantity is ``value (1 + p)``. The derivatives of the
+        matrices are central differences of the full model. They are projected by the reduction
+        matrix once, when an update begins. They are exact for Young's modulus and density. For a
+        thickness use `PolynomialParameter.from_build` for each region.
 
         Parameters
         ----------
         build : callable
-            Function from an array with the quantity of every element to an FEModel.
+            Function of an array with the quantity of every element. It returns an FEModel.
         regions : mapping {name: bool array}
             Boolean masks that select the elements of each region. They have the shape of the
             argument of `build` and may overlap.
         value : float or array
-            Value in the model that is updated; an array has the shape of the regions.
+            Value of the quantity in the model that is updated. An array has the shape of the
+            regions.
         bounds, prior : optional
             Bounds and prior of each relative change, as for `AddedMass`.
 
@@ -232,10 +236,12 @@ class ModeDamping(Parameter):
     Parameters
     ----------
     mode : int
-        Number from 1, rigid-body modes included, of the undamped model that is updated.
+        Number of the mode in the undamped model that is updated. It counts from 1 and includes
+        rigid-body modes.
     name : str, optional
         Name of the parameter.
-    bounds, prior : as for `AddedMass`
+    bounds, prior : optional
+        Bounds and prior of the change, as for `AddedMass`.
 
     Examples
     --------
@@ -260,7 +266,7 @@ class ModeDamping(Parameter):
         return f"<ModeDamping: {self.name}>"
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (None, dD, None); LabelError if the model does not have the mode."""
+        """Return (None, dD, None), or raise a LabelError if the model does not have the mode."""
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         k, r = rigid.shape
         if not r < self.mode <= k:
@@ -341,20 +347,20 @@ CHECKS = (-0.97, -0.77, 0.31)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialParameter(_GivenParameter):
-    """A parameter with powers: ``M(p) = M + p M_1 + p^2 M_2 + ...``, likewise D and K.
+    """A parameter p with its powers: ``M(p) = M + p M_1 + p^2 M_2 + ...``, also for D and K.
 
-    Derivatives are exact at every p. A plate's thickness has K_1 to K_3 and M_1 (with rotary
-    inertia M_3).
+    Derivatives are exact at every p. For example, the stiffness of a plate depends on the first
+    three powers of its thickness (K_1, K_2, K_3), and its mass on the first one (M_1).
 
     Parameters
     ----------
     dM, dD, dK : sequences of (k, k) or (n, n) arrays or sparse matrices
-        Matrices M_1, M_2, ..., then D_1, ... and K_1, ..., each as in `MatrixParameter`. None
-        stands for a zero matrix.
+        Matrices M_1, M_2, ... in `dM`, D_1, ... in `dD` and K_1, ... in `dK`, each as in
+        `MatrixParameter`. None stands for a zero matrix.
     name, unit, bounds, prior
         As for `MatrixParameter`. The same errors are raised.
     missed : float
-        Largest error of the polynomials relative to the largest change of a matrix.
+        Largest error of the polynomials, relative to the largest change of a matrix.
 
     Examples
     --------
@@ -400,27 +406,28 @@ class PolynomialParameter(_GivenParameter):
         bounds: tuple[float, float] | None = None,
         prior: tuple[float, float] | None = None,
     ) -> PolynomialParameter:
-        """Return the parameter p = v - value of a full model `build(v)`, by interpolation.
+        """Return the parameter ``p = v - value`` of a full model ``build(v)``, by interpolation.
 
-        The polynomials interpolate the matrices at degree + 1 Chebyshev points and are checked at
-        three more points. They are exact if the matrices are polynomials of this degree (3 for a
-        plate's thickness). If the matrices are other smooth functions (of a length, an angle),
-        `missed` is the error of the polynomials, and bounds limit the parameter to the range in
-        which they were compared.
+        Polynomials in p interpolate the matrices at degree + 1 Chebyshev points. They are checked
+        at three more points. They are exact if the matrices are polynomials of this degree (3 for a
+        plate's thickness). If the matrices are other smooth functions (of a length or an angle),
+        the polynomials have the error `missed`. Bounds then limit the parameter to the range in
+        which the polynomials were checked.
 
         Parameters
         ----------
-        name, build, value, unit, bounds, prior : as for `MatrixParameter.from_difference`
+        name, build, value, unit, bounds, prior
+            As for `MatrixParameter.from_difference`.
         degree : int, optional
             Highest power. None: the first of 3, 6 and 12 that is accurate enough.
         width : float, optional
-            Width of the interval on either side of the value; a fifth of the value by default.
+            Width of the interpolated range on either side of the value. None: a fifth of the value.
 
         Raises
         ------
         ModelError, ShapeError
-            When the polynomials differ from the matrices by more than 1e-6 of their change between
-            the points, the matrices do not change, or the DOFs change.
+            When the polynomials have a relative error above 1e-6 of the change of the matrices,
+            when the matrices do not change, or when the DOFs change.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
@@ -444,12 +451,12 @@ class PolynomialParameter(_GivenParameter):
         return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
-        """Return the powers of a value, and their derivatives."""
+        """Return the powers of a value of p, and their derivatives."""
         k = np.arange(1, max(len(self._powers(label)) for label in PARTS) + 1, dtype=np.float64)
         return np.asarray(value**k), np.asarray(k * value ** (k - 1))
 
     def about(self, value: float) -> PolynomialParameter:
-        """Return the parameter counted from a value: ``(p + v)^k`` by the binomial theorem."""
+        """Return the parameter as a change from a value that the model already includes."""
         moved: dict[str, Any] = {}
         for label in PARTS:
             parts = self._powers(label)

@@ -48,7 +48,7 @@ class Parameter(Value):
         """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero."""
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and of D and K."""
+        """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and those for D and K."""
         return [self.matrices(model)]
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
@@ -74,7 +74,7 @@ class Parameter(Value):
         self._set(bounds=bounds, prior=prior)
 
     def text(self, value: float, deviation: float | None = None) -> str:
-        """Return name, value (with its standard deviation where there is one) and unit."""
+        """Return a text with name, value, standard deviation (if it is known) and unit."""
         said = f"{value:.6g}" if deviation is None else with_deviation(value, deviation)
         return f"{self.name} = {said} {self.unit}"
 
@@ -156,20 +156,21 @@ class AddedMass(PointParameter):
     Parameters
     ----------
     at : str, (3,) array [m] or mapping
-        DOF label, point (interpolated between nodes) or {label: weight}; the mass moves in this
-        direction only.
+        Place of the mass: a DOF label, a point (interpolated between nodes) or {label: weight}. The
+        mass has inertia in one direction only, except with "xyz".
     direction : str
-        Direction of the motion at a point; labels contain a direction. "xyz": the mass moves in all
-        three translations, as a `PointMass`; on a plate in bending only in z.
+        Direction of the motion at a point. A label contains its direction. With "xyz", the mass has
+        inertia in every translation that the model has, as a `PointMass`. On a plate in bending,
+        this is only z.
     name : str, optional
-        Name in results; by default made from the place.
+        Name of the parameter in results. None: the name is made from the place.
     to : str, (3,) array [m] or mapping, optional
         Place of the other end, for a parameter that acts between two places. By default the other
         end is the ground.
     bounds : (lowest, highest), optional
-        Limits of the parameter; None or infinity means unlimited.
+        Limits of the parameter. None or infinity: there is no limit.
     prior : (mean, standard deviation), optional
-        Prior knowledge as a normal distribution.
+        Normal distribution of the parameter that is known before the update.
 
     Examples
     --------
@@ -186,12 +187,12 @@ class AddedMass(PointParameter):
 
 
 class AddedDamping(PointParameter):
-    """A viscous damper [N s/m] between a place and the ground, or another: D + p r r^T.
+    """A viscous damper [N s/m] from a place to the ground or to another place: D + p r r^T.
 
     Parameters
     ----------
     at, direction, name, to, bounds, prior
-        As for `AddedMass`; {a: 1, b: -1} is a damper between two DOFs.
+        As for `AddedMass`. With ``at={a: 1, b: -1}``, the damper acts between the DOFs a and b.
 
     Examples
     --------
@@ -205,7 +206,7 @@ class AddedDamping(PointParameter):
 
 
 class AddedStiffness(PointParameter):
-    """A spring [N/m] between a place and the ground, or another: K + p r r^T.
+    """A spring [N/m] from a place to the ground or to another place: K + p r r^T.
 
     On a free structure, a spring to the ground turns the rigid-body modes that move it into
     suspension modes with a frequency proportional to sqrt(p). The derivative of sqrt(p) is infinite
@@ -214,7 +215,7 @@ class AddedStiffness(PointParameter):
     Parameters
     ----------
     at, direction, name, to, bounds, prior
-        As for `AddedMass`; {a: 1, b: -1} is a spring between two DOFs.
+        As for `AddedMass`. With ``at={a: 1, b: -1}``, the spring acts between the DOFs a and b.
 
     Examples
     --------

@@ -44,7 +44,7 @@ def splitting(family: Family, eigen: Eigen) -> Split:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities(Value):
-    """Derivatives of complex eigenvalues to parameters: S of the paper's (11).
+    """Derivatives of complex eigenvalues with respect to parameters (equation (11) of [paper]_).
 
     Parameters
     ----------
@@ -78,21 +78,22 @@ def eigenvalue_sensitivities(
 ) -> Sensitivities:
     """Return the sensitivities of the complex eigenvalues of a model to parameters.
 
-    ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)`` with right
-    and left eigenvectors x, y of ``lambda^2 M + lambda D + K`` (the paper, eq. (11)). The
-    eigenvectors of exactly repeated modes are first replaced by those combinations along which the
-    modes split when a parameter changes. These modes are in the order of increasing frequency for
-    an increasing parameter.
+    By equation (11) of the paper, the derivative is
+    ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)``. Here x and
+    y are right and left eigenvectors of ``lambda^2 M + lambda D + K``. When a parameter changes,
+    exactly repeated modes may split into different frequencies. Their eigenvectors are first
+    replaced by the combinations that these split modes have. The modes are sorted by the
+    frequencies that they have when the parameter increases.
 
     Parameters
     ----------
     model, parameters
-        As for `update`; full matrices are used for an FEModel.
+        Model and parameters, as for `update`. Full matrices are used for an FEModel.
     modes : sequence of int, optional
-        Mode numbers from 1, rigid-body modes included; all elastic modes by default.
+        Mode numbers, which count from 1 and include rigid-body modes. None: all elastic modes.
     values : (q,) array, optional
-        Values of the parameters at which derivatives are taken; zeros (the model itself) by
-        default.
+        Values of the parameters at which derivatives are taken. None: zeros, which is the model
+        itself.
 
     Returns
     -------
@@ -101,9 +102,9 @@ def eigenvalue_sensitivities(
     Raises
     ------
     LabelError, ModelError
-        When a mode number or a place is unknown, two parameters have the same name, the matrices
-        are indefinite at `values`, or several parameters split repeated modes along different
-        vectors, so that derivatives with respect to all of them do not exist.
+        When a mode number or a place is unknown, two parameters have the same name, or the matrices
+        are indefinite at `values`. Also when several parameters split repeated modes into different
+        shapes, because the derivatives do not exist then.
 
     References
     ----------

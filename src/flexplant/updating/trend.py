@@ -48,15 +48,15 @@ class Trend(Value):
     S : (m, q) array [1/unit]
         Derivatives of the logarithms of the model's frequencies to its parameters.
     moves : sequence of int
-        Positions, among all parameters of the fit, of the q that change frequencies.
+        Positions of the q parameters that change frequencies among all parameters of the fit.
     shaped : bool
         Whether the modes were numbered by measured shapes.
     unmeasured : sequence of int
         Numbers of the model's modes below `highest` that were not measured.
     unmeasured_freq : array [Hz]
-        Their frequencies.
+        Frequencies of the model's modes that were not measured.
     noise : (m,) array
-        Relative standard deviations of the measured frequencies by noise; empty if not known.
+        Relative standard deviations of the measured frequencies caused by noise. Empty: not known.
 
     Examples
     --------
@@ -80,12 +80,12 @@ class Trend(Value):
 
     @property
     def highest(self) -> float:
-        """The largest measured frequency [Hz], to which `slope` belongs."""
+        """The largest measured frequency [Hz]."""
         return float(np.max(self.freq))
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom ``m - q - 1``; below 1 the residual cannot be estimated."""
+        """Degrees of freedom ``m - q - 1``. Below 1, the scatter cannot be estimated."""
         return len(self.modes) - int(self.S.shape[1]) - 1
 
     @cached_property
@@ -107,7 +107,7 @@ class Trend(Value):
 
     @property
     def slope(self) -> float:
-        """Slope b: relative error, at the highest measured frequency, that grows with frequency."""
+        """Slope b: the relative frequency error of the trend at the highest measured frequency."""
         return float(self._regression[0][-1])
 
     @property
@@ -225,10 +225,12 @@ class Trend(Value):
         )
 
     def posterior(self, rng: np.random.Generator) -> tuple[float, FloatArray, float]:
-        """Return a draw of s, dp (q,) and b, given what was measured and a flat prior.
+        """Return a random draw of s, dp (q,) and b from their posterior distribution.
 
-        With the estimate s_hat, the draw of s is ``s^2 = dof s_hat^2 / chi^2_dof``. Given s, dp and
-        b are normally distributed about their estimates.
+        The prior is flat. With the estimate s_hat of s, the draw is
+        ``s^2 = dof s_hat^2 / chi^2_dof``, where chi^2_dof is a draw from the chi-square
+        distribution. For this s, dp and b are drawn from normal distributions about their
+        estimates.
         """
         if self.dof < 1:
             raise ModelError(f"the posterior does not exist: {self.missing}.")

@@ -142,13 +142,13 @@ class UpdateResult(Value):
     values : (q,) array
         Values of the parameters.
     covariance : (q, q) array or None
-        Covariance of the estimate. S are the sensitivities, ``J = [Re S; Im S]``, W the weights. If
-        the covariance C of the measurement is known, the covariance is ``G C G^T`` with the linear
-        estimator ``G = (J^T W J)^-1 J^T W``, for any weights. If C is not known, it is
-        ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which includes the
-        model error; None when 2 m = q. If only some residuals have a known covariance, s^2 is the
-        variance of the others. If `chi2` exceeds noise (`p_value` below 1e-4), C includes the
-        discrepancy; with responses C is multiplied by ``chi2 / dof`` instead.
+        Covariance of the estimate. It follows from ``J = [Re S; Im S]`` with the sensitivities S,
+        and from the weights W. If the covariance C of the measurement is known, the result is
+        ``G C G^T`` with the linear estimator ``G = (J^T W J)^-1 J^T W``. If C is not known, it is
+        ``s^2 (J^T W J)^-1``. The residual variance ``s^2 = e / (2 m - q)`` of m poles then includes
+        the model error. None: 2 m = q, so that s^2 is not known. If C is known for some residuals
+        only, s^2 is the variance of the others. If `chi2` exceeds noise (`p_value` below 1e-4), C
+        includes the discrepancy. With responses, C is multiplied by ``chi2 / dof`` instead.
     correlation : (q, q) array
         Correlation matrix of the estimate. It follows from `covariance` if the noise of all
         residuals is known. Otherwise errors with the covariance W^-1 are assumed.
@@ -167,9 +167,9 @@ class UpdateResult(Value):
     unknowns : sequence of Parameter
         Estimated parameters, as given to `update`.
     chi2 : float or None
-        Smallest sum of squares of the residuals (and priors) in units of their noise: about `dof`
-        when the model explains the measurement. Only residuals with known noise count; None without
-        such residuals.
+        Smallest sum of squares of the residuals (and priors), each divided by the standard
+        deviation of its noise. It is about `dof` if the model explains the measurement. Only
+        residuals with known noise count. None: there are no such residuals.
     dof : int
         Degrees of freedom: number of residuals and priors that count in `chi2`, minus the number of
         parameters that they determine. Parameters at a bound are not subtracted.
@@ -179,13 +179,13 @@ class UpdateResult(Value):
     residuals : sequence of Residual
         Fitted residuals.
     discrepancy : sequence of Discrepancy
-        Model error in each kind of residual, in addition to noise; empty where noise explains the
+        Model error in each kind of residual, in addition to noise. Empty: noise explains the
         residual.
     determined : sequence of str or None
         None if the data determine all parameters. Otherwise a text for each combination of
         parameters that the data determine to first order. Other combinations have no meaning.
     prior_std : (q,) array or None
-        Standard deviations of the used priors, infinite for a parameter without a prior; None if no
+        Standard deviations of the used priors, infinite for a parameter without a prior. None: no
         prior was used.
     """
 
@@ -220,15 +220,15 @@ class UpdateResult(Value):
 
     @property
     def p_value(self) -> float | None:
-        """Probability of a larger `chi2` by noise, None if not known.
+        """Probability that noise alone causes a larger `chi2`, None if it is not known.
 
-        Below 1e-4 the model has another error, or the noise was understated.
+        If it is below 1e-4, the model has another error, or the stated noise is too small.
         """
         return chance(self.chi2, self.dof)
 
     @property
     def fitted_poles(self) -> MeasuredModes | None:
-        """The fitted measured poles, None unless exactly one set was fitted."""
+        """The measured poles that were fitted. None if no set or several sets were fitted."""
         found = [r.measured for r in self.residuals if isinstance(r, Eigenvalues)]
         return found[0] if len(found) == 1 else None
 
@@ -241,7 +241,8 @@ class UpdateResult(Value):
     def negative_masses(self) -> tuple[str, ...]:
         """Names of added masses that are negative by more than two standard deviations.
 
-        If no mass was removed, the model is too heavy there, or the change is elsewhere.
+        If no mass was removed from the machine, either the model is too heavy at this place, or the
+        change is at another place.
         """
         margin = np.zeros(self.values.size) if self.std is None else 2 * self.std
         return tuple(
@@ -299,7 +300,7 @@ class UpdateResult(Value):
         return [f"  {line}" for line in lines]
 
     def unlike_shapes(self, measured: MeasuredModes | None = None) -> list[str]:
-        """Return a sentence for each measured shape that differs from the model; see `likeness`."""
+        """Return a sentence for each measured shape that differs from the updated model's."""
         return [
             f"mode {mode} has another shape than measured (MAC {mac:.2f}): what is promised of it "
             "does not hold"
@@ -311,19 +312,19 @@ class UpdateResult(Value):
         """Return the MAC of each measured shape with that of the updated model.
 
         Modes whose frequencies differ by at most 2 % mix differently in each machine. If several
-        such modes were measured, the result is the fraction of a measured shape that combinations
-        of their shapes in the model explain.
+        such modes were measured, a measured shape is compared with all combinations of their shapes
+        in the model. The result is then the fraction of the measured shape that these explain.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
-            Measured modes with shapes, as returned by ``numbered(..., at=...)``; by default the
-            fitted poles.
+            Measured modes with shapes, as returned by ``numbered(..., at=...)``. None: the fitted
+            poles.
 
         Returns
         -------
         dict {mode: float}
-            Empty where no shapes were measured at points.
+            MAC by mode number. It is empty if no shapes were measured at known points.
         """
         given = self.fitted_poles if measured is None else measured
         if given is None or given.shapes is None or given.xyz is None:
@@ -342,9 +343,9 @@ class UpdateResult(Value):
         """Return confidence (credible) intervals (q, 2) of the parameters for a level in 0 .. 1.
 
         The intervals follow the normal distribution. If the discrepancy was estimated, they follow
-        Student's distribution with the smallest degrees of freedom that the data of any kind of
-        residual give. One is subtracted, because no mode shows an error that is common to all
-        modes. A ModelError is raised if the covariance is not known.
+        Student's distribution. Its degrees of freedom are those of the data, the smallest number
+        over the kinds of residuals, minus one. One is subtracted because the data cannot show an
+        error that is common to all modes. A ModelError is raised if the covariance is not known.
         """
         from scipy.special import ndtri
 
@@ -353,10 +354,10 @@ class UpdateResult(Value):
         return np.column_stack([self.values - half, self.values + half])
 
     def widened(self, factor: float) -> FloatArray:
-        """Return the covariance (q, q) for data whose covariance is larger by a factor.
+        """Return the covariance (q, q) if the covariance of the data is multiplied by a factor.
 
-        The covariance of priors is not multiplied: every parameter is known at least as well as by
-        its prior. A ModelError is raised if the covariance is not known.
+        The covariance of the priors is not multiplied, so that the result for a parameter is never
+        larger than its prior. A ModelError is raised if the covariance is not known.
         """
         std, factor = self._known_std(), positive(factor, "factor")
         wide: FloatArray = np.asarray(self.covariance) * factor
@@ -418,9 +419,10 @@ class UpdateResult(Value):
     def applied_to(self, model: Any) -> Any:
         """Return another model of the same structure, such as the full FEModel, with the update.
 
-        The estimated values of the parameters go into M, D and K of the model as it was before the
-        update. Damping that is given later, in ``solve_modes(model, damping=)``, is not included:
-        give it first, ``fit.applied_to(model.with_damping(ModalDamping(0.01)))``.
+        The given model must not be updated yet. The estimated values of the parameters change its
+        M, D and K. Damping that is not part of the model, as in ``solve_modes(model, damping=)``,
+        is not included. Add it first, by
+        ``fit.applied_to(model.with_damping(ModalDamping(0.01)))``.
 
         Parameters
         ----------
@@ -431,8 +433,8 @@ class UpdateResult(Value):
         Raises
         ------
         ModelError, LabelError, ShapeError
-            When it is not a model, its matrices become indefinite, it does not have the place of a
-            parameter, or matrices of a parameter have another number of DOFs.
+            When the argument is not a model, its matrices become indefinite, it does not have the
+            place of a parameter, or the matrices of a parameter have another number of DOFs.
         """
         if not hasattr(model, "rigid_body") or not hasattr(model, "dofs"):
             raise ModelError(
@@ -446,8 +448,9 @@ class UpdateResult(Value):
     def calibrated(self, measured: Any) -> Any:
         """Return the updated model with the measured poles of some modes; see `ReducedModel`.
 
-        Shapes, POIs (points of interest) and unmeasured modes follow from the parameters. Measured
-        poles replace those of the model. An FEModel raises a ModelError: calibrate its `modes()`.
+        The measured poles replace those of the updated model. Shapes, motions of points of interest
+        and unmeasured modes stay those of the updated model. If the model is an FEModel, a
+        ModelError is raised. Use ``fit.modes().calibrated(measured)`` instead.
 
         Parameters
         ----------
@@ -499,29 +502,30 @@ class UpdateResult(Value):
     ) -> ModalUncertainty:
         """Return the uncertainty of frequencies and damping of modes, and their covariance.
 
-        The relative error of a mode is ``S dp + s (e + c)``. dp is the error of the parameters with
-        the sensitivities S, e an error of each mode, and c an error common to all modes. The
-        standard deviation s is estimated for frequencies and for damping ratios separately, from
-        the residual of the measured modes by restricted maximum likelihood. If few modes were
+        The relative error of a mode is ``S dp + s (e + c)``. Here dp is the error of the parameters
+        with the sensitivities S, e is an error of each mode, and c is an error common to all modes.
+        The standard deviation s is estimated from the residual of the measured modes by restricted
+        maximum likelihood, separately for frequencies and damping ratios. If few modes were
         measured, it is near 0.25 % for frequencies and 15 % for damping ratios. The covariance of
-        modes and parameters is their joint covariance, given the measured poles.
+        the modes takes into account that the measured poles are known.
 
         Parameters
         ----------
         measured : MeasuredModes, optional
             Modes with which the model is calibrated. The result then holds for
-            ``fit.calibrated(measured)``, where the uncertainty of a measured mode is two standard
-            deviations, and at least 0.1 % (damping ratio: 2 %). None: the result holds for `model`
-            and uses the fitted poles. Measured modes then have the residual of the update as error.
+            ``fit.calibrated(measured)``. The uncertainty of a measured mode is two standard
+            deviations of its pole, but at least 0.1 % (at least 2 % for the damping ratio). None:
+            the result holds for `model` and uses the fitted poles. The error of a measured mode is
+            then the residual of the update.
         mesh : MeshError, optional
-            Result of ``modes.mesh_error(finer)``. For modes that were not measured, 1.5 times this
-            error is included.
+            Result of ``modes.mesh_error(finer)``. The uncertainty of modes that were not measured
+            includes 1.5 times this error.
 
         Raises
         ------
         ModelError, LabelError
-            When `measured` has no numbers, or one is not of an elastic mode here; without it, when
-            no poles were fitted.
+            When `measured` has no mode numbers, or a number is not that of an elastic mode of the
+            model. Also when `measured` is not given and no poles were fitted.
 
         References
         ----------
@@ -538,8 +542,8 @@ class UpdateResult(Value):
         Parameters
         ----------
         count : int, optional
-            Number of modes, rigid-body modes included. None: all; an FEModel of more than 1500 DOFs
-            needs a count.
+            Number of modes, rigid-body modes included. None: all modes. An FEModel of more than
+            1500 DOFs needs a count.
 
         Raises
         ------

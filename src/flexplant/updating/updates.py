@@ -49,20 +49,20 @@ def update(
 ) -> UpdateResult:
     """Find the parameters with which the model reproduces the measurement.
 
-    ``fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``: `fit.values`,
-    `fit.std` and `fit.parameters` are the result, `fit.model` the updated model for
-    `assemble_plant`, `fit.applied_to(full)` the full one, and `fx.plot.update` draws all of it.
-    Start with poles (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. `identifiability`
-    shows which parameters the data determine, and `localise` finds the place of an error. Modes are
-    followed by number and shape, so that they may swap order. The method is described in
-    `algorithms`.
+    A typical call is ``fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``.
+    Its result is in `fit.parameters`, `fit.values` and `fit.std`. The updated model for
+    `assemble_plant` is `fit.model`, and the full one is `fit.applied_to(full)`. `fx.plot.update`
+    draws the result. Start with poles (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`.
+    `identifiability` shows which parameters the data determine, and `localise` finds the place of
+    an error. Modes are followed by number and shape, so that they may swap order. The method is
+    described in `algorithms`.
 
     Parameters
     ----------
     model : ReducedModel or FEModel
-        The model. An FEModel of more than 300 DOFs is updated in a basis of its modes, which is
-        computed again at the estimate until the estimate is constant; one of more than 20 000 DOFs
-        should be reduced.
+        Model to update. An FEModel of more than 300 DOFs is updated in a basis of its modes. The
+        basis is computed again at each estimate until the estimate is constant. An FEModel of more
+        than 20 000 DOFs should be reduced first.
     parameters : sequence of q Parameter
         Unknowns with their bounds and priors: `AddedMass`, `AddedDamping`, `AddedStiffness`,
         `ModeDamping`, `MatrixParameter`, `PolynomialParameter`, or a `Parameter` of your own.
@@ -70,69 +70,72 @@ def update(
         Measurements to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, or a `Residual` of your own, in any mixture.
     method : UpdateMethod, optional
-        `GaussNewton` or `TrustRegion`. None: the trust region; for poles without bounds and priors
-        Gauss-Newton, and the trust region only where it fails.
+        `GaussNewton` or `TrustRegion`. None: the trust region. If only poles are fitted, without
+        bounds and priors, Gauss-Newton is tried first, and the trust region if it fails.
     start : (q,) array [kg, N s/m, N/m], optional
-        Start values. None: zeros, or the means of priors, inside the bounds. Without start values,
-        responses are first fitted by the logarithm of their magnitude, and poles are fitted before
-        shapes, because these fits converge from farther away. Four other starts are always tried
-        (two with more than 100 DOFs) to find other minima, and print(fit) names those with a
-        similar chi-square. Up to 20 starts (or 4) are tried if no start leads to a solution. The
-        same holds if noise does not explain a residual of a tenth of the power of responses or of
-        0.1 % of a pole (`UpdateResult.starts`). After a solution is found, each further start gets
-        ten steps, and more if its cost is close to the best one. The search stops when eight starts
-        have reached the best minimum.
+        Start values. None: zeros or the means of priors, moved inside the bounds. Without start
+        values, responses are first fitted by the logarithm of their magnitude, and poles are fitted
+        before shapes. These fits converge from farther away. Four other starts are always tried to
+        find other minima (two with more than 100 DOFs). print(fit) names minima with a similar
+        chi-square. Up to 20 starts (4 with more than 100 DOFs) are tried if no start leads to a
+        solution. They are also tried if noise does not explain the residual and the residual is
+        large: a tenth of the power of responses, or 0.1 % of a pole. After a solution is found,
+        each further start gets ten steps, and more if its cost is close to the best one. The search
+        stops when eight starts have reached the best minimum. `UpdateResult.starts` lists them.
     starts : int or (s, q) array, optional
-        Start values, or their number; a number of starts is drawn between the bounds (or from the
-        priors), including `start`. The best result is kept. 1: only `start`.
+        Start values, or their number. A number of starts includes `start`, and the others are drawn
+        between the bounds or from the priors. The best result is kept. 1: only `start` is used.
     rng : int, SeedSequence or Generator
         Random generator of drawn starts, or its seed.
     prior : bool
-        Whether to use priors, which is possible if the noise of all residuals is known. Two finite
-        bounds without a prior imply one: zero (or the bound closest to it) is most probable, and
-        the farther bound is three standard deviations away.
+        Whether to use priors. They can be used only if the noise of all residuals is known. A
+        parameter with two finite bounds but no prior gets a prior from its bounds. Its mean is zero
+        (or the bound closest to zero), and the farther bound is three standard deviations away.
     max_iterations : int, optional
-        Largest number of steps from one start; by default 20 for Gauss-Newton, 200 for the others.
+        Largest number of steps from one start. None: 20 for Gauss-Newton, 200 for other methods.
     tolerance : float
         Relative tolerance of the search. The search ends when a full step changes every eigenvalue
         by less than this fraction, or when the residual is smaller than this fraction.
     full : FEModel, optional
-        FEModel of the reduced model. The reduction error may be larger than the noise, which
-        chi-square does not always show. Defect correction removes it: the full model is solved at
-        the estimate, the difference of its residuals from those of the reduced model is added, and
-        the fit is repeated. Damping comes from the full model's D, else from the reduced model.
+        FEModel from which the reduced model was made. The error of the reduction may be larger than
+        the noise, and chi-square does not always show this. With `full`, defect correction removes
+        the error. It solves the full model at the estimate, adds the difference between its
+        residuals and those of the reduced model, and repeats the fit. The damping is the full
+        model's D, or that of the reduced model if the full model has no D.
     rounds : int
-        Largest number of rounds of defect correction; fewer if one changes the estimate by less
-        than 0.01 standard deviations.
+        Largest number of rounds of defect correction. It stops earlier if a round changes the
+        estimate by less than 0.01 standard deviations.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. None: a bar is shown on a terminal or in a notebook, for
+        work of more than two seconds.
 
     Returns
     -------
     UpdateResult
-        Result; `converged` is False if the tolerance was not met, or the data do not determine the
-        parameters.
+        Parameters, covariance and updated model. `converged` is False if the tolerance was not met,
+        or the data do not determine the parameters.
 
     Warns
     -----
     FlexplantWarning
-        When the tolerance was not met; when the data, with active bounds and priors, do not
-        determine the parameters (the warning names the determined combinations); when a solution
-        is found, but not from the given `start`; when the last round of defect correction changed
-        the estimate by more than half a standard deviation; when the residual exceeds known noise
-        with a p-value below 1e-4. In the last case parameters and the model error of each kind of
-        residual are estimated together (`UpdateResult.discrepancy`); with responses the covariance
-        is multiplied by chi-square over its degrees of freedom, and no +- is printed.
+        When the tolerance was not met. When the data, with active bounds and priors, do not
+        determine the parameters (the warning names the determined combinations). When a solution is
+        found, but not from the given `start`. When the last round of defect correction changed the
+        estimate by more than half a standard deviation. When the residual exceeds known noise with
+        a p-value below 1e-4. The model error of each kind of residual is then estimated together
+        with the parameters (`UpdateResult.discrepancy`). If responses are fitted, the covariance is
+        instead multiplied by chi-square over its degrees of freedom, and no standard deviations are
+        printed.
 
     Raises
     ------
     ModelError
-        When the measured eigenvalues do not depend on a parameter, or cannot distinguish several
-        parameters (the sensitivity matrix S is singular), the matrices are indefinite at `start`,
-        or the FEModel refuses the result (for example a negative damper: give it bounds).
+        When the measured eigenvalues do not depend on a parameter or cannot distinguish several
+        parameters, so that the sensitivity matrix S is singular. When the matrices are indefinite
+        at `start`. When an FEModel cannot be made with the result, for example because of a
+        negative damper. Bounds prevent this.
     SolverError
-        When every step makes the model unphysical, or no start leads to a solution.
+        When every step makes the matrices indefinite, or no start leads to a solution.
 
     References
     ----------

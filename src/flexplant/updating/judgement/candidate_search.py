@@ -39,15 +39,14 @@ def localise(
 ) -> Localisation:
     """Find which of many candidate changes explains a measurement.
 
-    Arguments are as for `update`: ``found = fx.updating.localise(drawing, candidates, residuals)``,
-    with a candidate for every place, for example
-    ``[fx.AddedMass(at) for at in drawing.dofs.labels]``. `found.chosen` names up to `most` of them,
-    and is empty if no change explains the data better than the model itself. `found.ranking` sorts
-    all candidates by their separate effect. `found.alike_sets` are the sets that explain the data
-    equally well. On a symmetric structure there are many such sets: pass each of them to `update`,
-    or distinguish them by measured shapes or responses. `found.alike` contains all of their
-    members. Errors of the whole structure (Young's modulus, damping) are given as `nuisance`, which
-    are parameters that are fitted but are not candidates. The method is described in `algorithms`.
+    The call ``found = fx.updating.localise(drawing, candidates, residuals)`` has a candidate for
+    every place, for example ``[fx.AddedMass(at) for at in drawing.dofs.labels]``. `found.chosen`
+    names up to `most` of them. It is empty if no change explains the data better than the model
+    itself. `found.ranking` sorts all candidates by their separate effect. `found.alike_sets` are
+    the sets that explain the data equally well, and `found.alike` contains all their members. On a
+    symmetric structure there are many such sets. Pass each of them to `update`, or distinguish them
+    by measured shapes or responses. Errors of the whole structure (Young's modulus, damping) are
+    given as `nuisance`. The method is described in `algorithms`.
 
     Parameters
     ----------
@@ -59,14 +58,16 @@ def localise(
     residuals : sequence of Residual
         Residuals measured with the change.
     nuisance : sequence of Parameter, optional
-        Unknown parameters that are fitted in addition to the candidates; their priors are not used.
+        Unknown parameters that are fitted in addition, but are not candidates. Their priors are not
+        used.
     most : int
         Largest number of candidates that are chosen together.
     screen : int
-        Largest number of candidates that are fitted. Fitted are candidates with at least a quarter
-        of the first-order effect of the best one, and always ten.
+        Largest number of candidates that are fitted. A candidate is fitted if its effect to first
+        order is at least a quarter of the best one's. At least ten are fitted.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
+        Whether to show a progress bar. None: a bar is shown on a terminal for work of more than two
+        seconds.
 
     Returns
     -------
@@ -80,15 +81,15 @@ def localise(
     Raises
     ------
     ModelError, LabelError
-        As for `update`; or when `most` or `screen` is not valid, a nuisance parameter is also a
-        candidate, or there are not more data than nuisance parameters.
+        In the same cases as for `update`. Also when `most` or `screen` is not valid, a nuisance
+        parameter is also a candidate, or there are not more data than nuisance parameters.
 
     Notes
     -----
     The probability that a superfluous candidate is chosen is known. If k of c candidates are
     chosen, another one is added if it lowers chi-square by more than the price
-    ``ln n + 2 ln((c - k) / (k + 1))``, where n is the number of data. By chance the best of the
-    others does so with the probability ``(c - k) P(chi2_1 > price)``, where chi2_1 follows the
+    ``ln n + 2 ln((c - k) / (k + 1))``, where n is the number of data. Noise lowers chi-square by
+    more than this with the probability ``(c - k) P(chi2_1 > price)``, where chi2_1 follows the
     chi-square distribution with one degree of freedom. For 12 to 25 candidates, 20 to 24 data and
     one true change, this happens in 10 to 13 of 100 measurements. The `margin` is then small.
 
@@ -203,19 +204,19 @@ SHOWN, ROWS = 6, 12
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Localisation(Value):
-    """Which candidates explain a measurement.
+    """Result of `localise`: the candidates that explain a measurement.
 
     Parameters
     ----------
     candidates : sequence of c str
         Names of the candidates.
     values : (c,) array
-        Value of each candidate if it were the only change; NaN if the fit failed.
+        Value of each candidate if it were the only change. NaN: the fit failed.
     score : (c,) array
         Fraction of the residual's sum of squares that each candidate alone explains, at most 1.
     bic : (c,) array
         Extended Bayesian information criterion (BIC) of each candidate alone. It is chi-square plus
-        a penalty that grows with the number of parameters; smaller is better.
+        a penalty that grows with the number of parameters. A smaller value is better.
     chosen : sequence of str
         Set of candidates with the smallest BIC; empty if the model without a change has the
         smallest one.
@@ -234,14 +235,14 @@ class Localisation(Value):
     units : sequence of c str, optional
         Units of the candidates.
     next_best : sequence of str
-        The best fitted set that does not contain the whole chosen set; empty if this is the model
-        without a change.
+        The best of the fitted sets that do not contain all chosen candidates. It is empty if this
+        is the model without a change.
     next_bic : float
         BIC of `next_best`; infinite if no other set was fitted.
     alike_sets : sequence of tuples of str
-        Sets of the same size as the chosen one that explain the data equally well (BIC within 2 of
-        the least), the best first. On a symmetric structure these are all combinations of mirror
-        images that the data do not distinguish.
+        Sets of the same size as the chosen one that explain the data equally well, the best first.
+        Their BIC is at most 2 above the least one. On a symmetric structure these are all
+        combinations of mirror images that the data do not distinguish.
     """
 
     candidates: tuple[str, ...]
@@ -280,7 +281,7 @@ class Localisation(Value):
 
     @property
     def p_value(self) -> float | None:
-        """Probability of a larger `chi2` by noise, None if not known."""
+        """Probability that noise alone causes a larger `chi2`, None if it is not known."""
         return chance(self.chi2, self.dof)
 
     @property
@@ -291,13 +292,13 @@ class Localisation(Value):
 
     @property
     def leading(self) -> tuple[str, ...]:
-        """The best twelve single candidates, and chosen ones that are not among them."""
+        """The twelve best single candidates, and chosen candidates that are not among them."""
         best = self.ranking[:ROWS]
         return (*best, *(name for name in self.chosen if name not in best))
 
     @property
     def alike(self) -> tuple[str, ...]:
-        """Candidates of all `alike_sets`, the best set first: the true places are among them.
+        """Candidates of all `alike_sets`, the best set first.
 
         If no change is chosen, these are single candidates that the data cannot distinguish from
         the best one. Poles alone do not distinguish mirror images on a symmetric structure.
@@ -311,16 +312,16 @@ class Localisation(Value):
     def rivals(self) -> tuple[str, ...]:
         """Candidates that alone explain nearly as much as the best one, at most 1 % less.
 
-        The data distinguish those that are not `alike` from the best, but only by a small fraction
-        of the residual, which a model error could cause or hide: for example mirror images on a
-        symmetric structure.
+        Some of them are not in `alike`, for example mirror images on a nearly symmetric structure.
+        They explain less than the best one, but the difference is so small that a model error may
+        have caused it.
         """
         least = float(np.max(self.score)) - CLOSE
         return tuple(name for name in self.ranking[1:] if self[name] >= least)
 
     @property
     def table(self) -> str:
-        """Table of the leading candidates: value alone, explained fraction, BIC above the least."""
+        """Table of the leading candidates: value, explained fraction and BIC minus the least."""
         least, rows = float(np.min(self.bic)), []
         for name in self.leading:
             i = self.candidates.index(name)

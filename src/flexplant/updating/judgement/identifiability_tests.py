@@ -31,21 +31,22 @@ class IdentifiabilityReport(Value):
         Singular values of the sensitivities, with each column scaled to length one. They are
         between zero and sqrt(q).
     combinations : (q, q) array
-        Right singular vectors in columns: the combination of (scaled) parameters for each singular
-        value.
+        Right singular vectors in columns. Each is the combination of (scaled) parameters that
+        belongs to a singular value.
     std : (q,) array
-        Expected standard deviations with known noise (otherwise for unit noise of the weighted
-        residuals); infinite where a parameter cannot be determined.
+        Expected standard deviations of the parameters. They are infinite for parameters that cannot
+        be determined. If the noise is not known, the weighted residuals are assumed to have unit
+        noise.
     correlation : (q, q) array
-        Correlation of the expected errors; zero for parameters that cannot be determined.
+        Correlation of the expected errors. It is zero for parameters that cannot be determined.
     unseen : sequence of str
         Names of the parameters on which no residual depends.
     mixed : sequence of (str, ...)
         Groups of parameters. A combination of the parameters of a group cannot be determined.
     missing : mapping {str: (int, ...)}
-        For parameters that are unseen or mixed: unmeasured modes whose eigenvalues would determine
-        the lost combinations, those with the largest change first; empty where no eigenvalue helps,
-        as for mirror images on a symmetric structure.
+        Advice for each parameter that is unseen or mixed: unmeasured modes whose eigenvalues would
+        determine it. Modes whose eigenvalues change most come first. Empty: no eigenvalue helps, as
+        for mirror images on a symmetric structure.
     """
 
     parameters: tuple[str, ...]
@@ -98,15 +99,17 @@ def identifiability(
 ) -> IdentifiabilityReport:
     """Return which parameters the residuals determine at a start, before solving.
 
-    The report contains the singular values of the weighted sensitivities S, the correlation of the
-    estimate, which follows from ``(S^T S)^-1``, and the numbers of modes that should be measured in
-    addition. Priors are not used.
+    The report contains the singular values of the weighted sensitivities S. It also contains the
+    correlation of the estimate, from ``(S^T S)^-1``, and the numbers of modes that should be
+    measured in addition. Priors are not used.
 
     Parameters
     ----------
-    model, parameters, start : as for `update`
+    model, parameters, start
+        Model, parameters and start values, as for `update`.
     residuals : sequence of Residual
-        Data; only their noise and their dependence on parameters are used, not the values.
+        Data. Only their noise and their dependence on parameters are used. Their values do not
+        matter.
 
     Returns
     -------
@@ -115,7 +118,7 @@ def identifiability(
     Raises
     ------
     ModelError, LabelError, ShapeError
-        As `update`.
+        In the same cases as for `update`.
 
     Examples
     --------

@@ -32,7 +32,8 @@ from .goodness import chance, is_bad
 def mac(X: Any, Y: Any) -> FloatArray:
     """Return the modal assurance criterion (m, m') of each shape of X with each of Y.
 
-    ``|x^H y|^2 / (x^H x  y^H y)``, 1 for shapes that differ by a factor only.
+    For shapes x and y it is ``|x^H y|^2 / (x^H x  y^H y)``. It is 1 for shapes that differ only by
+    a factor, and 0 for orthogonal ones.
 
     Parameters
     ----------
@@ -63,7 +64,8 @@ def mac(X: Any, Y: Any) -> FloatArray:
 def frac(H: Any, G: Any) -> FloatArray:
     """Return the frequency response assurance criterion of each channel pair, from 0 to 1.
 
-    ``|sum_f H* G|^2 / (sum |H|^2  sum |G|^2)`` over the frequency lines.
+    For responses H and G of a channel pair it is ``|sum_f H* G|^2 / (sum_f |H|^2  sum_f |G|^2)``.
+    The sums run over the frequencies f, and H* is the complex conjugate of H.
 
     Parameters
     ----------
@@ -101,13 +103,13 @@ def fdac(H: Any, G: Any) -> FloatArray:
     """Return the frequency domain assurance criterion of all pairs of lines, from -1 to 1.
 
     The criterion is ``Re(h_f^H g_k) / (|h_f| |g_k|)``, where h_f contains all channels of H at
-    frequency line f, and g_k those of G at line k. A frequency shift appears as a ridge next to
-    the diagonal.
+    frequency line f, and g_k those of G at line k. If the frequencies of G are shifted, the largest
+    values lie next to the diagonal.
 
     Parameters
     ----------
     H, G : (..., n_freq), (..., n_freq') complex arrays
-        Measured and computed, of the same channels.
+        Measured and computed responses of the same channels.
 
     Raises
     ------
@@ -154,9 +156,9 @@ class Correlation(Value):
     fdac : (n_freq, n_freq) array
         Frequency domain assurance criterion of the responses; empty without responses.
     alike : sequence of groups of int
-        Numbers of the model's modes, in the measured range, whose shapes the sensors cannot
-        distinguish (a MAC above 0.9 with each other there): they are paired by frequency, and a
-        high MAC does not say which of a group was measured.
+        Groups of the model's modes in the measured range whose shapes the sensors cannot
+        distinguish. Their MAC with each other at the sensors is above 0.9. These modes are paired
+        by frequency, since a high MAC does not show which mode of a group was measured.
     """
 
     modes: tuple[int, ...]
@@ -184,12 +186,12 @@ class Correlation(Value):
 
 
 def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
-    """Compare a model with measurements: once before the update, once after.
+    """Compare a model with measurements, for example before and after an update.
 
     Parameters
     ----------
     model : ReducedModel or FEModel
-        Before or after an update (`UpdateResult.model`).
+        Model to compare, such as `UpdateResult.model`.
     residuals : sequence of Residual
         Measurements. Poles, shapes and responses are compared. If there are several of a kind, the
         last one is used.
@@ -268,7 +270,7 @@ HALF = 0.5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Value):
-    """An update, judged by data that were not fitted.
+    """Result of `validate`: an update and its errors for data that were not fitted.
 
     Parameters
     ----------
@@ -278,13 +280,13 @@ class Validation(Value):
         RMS of the whitened residuals before and after the update, for fitted and for unused data.
         Whitened residuals are divided by the standard deviation of their noise. If the noise is
         known, a value of 1 after the update is expected from noise and parameter uncertainty.
-        Residuals of unused data are whitened by their covariance ``I + J C J^T``, with the
-        sensitivities J and the covariance C of the parameters. For fitted data the sum of squares
-        is divided by the degrees of freedom.
+        For unused data, the noise includes the uncertainty of the parameters. Its covariance is
+        ``I + J C J^T``, with the sensitivities J and the covariance C of the parameters. For fitted
+        data the sum of squares is divided by the degrees of freedom.
     p_value : float or None
-        Probability of a larger residual of unused data by noise and parameter uncertainty alone;
-        None if the noise is not known. If it is below 1e-4, a change is missing or in the wrong
-        place.
+        Probability that noise and parameter uncertainty alone cause a larger residual of unused
+        data. None: the noise is not known. If the probability is below 1e-4, a change is missing or
+        in the wrong place.
     before, after : Correlation
         Correlation of the unused data with the model before and after the update.
     """
@@ -333,7 +335,8 @@ def validate(
 
     Parameters
     ----------
-    model, parameters, method, start, starts, rng, prior : as for `update`
+    model, parameters, method, start, starts, rng, prior
+        Arguments of the update, as for `update`.
     residuals, unused : sequences of Residual
         Data to be fitted, and data that are only predicted. `Eigenvalues.select`,
         `ModeShapes.select`, `FrfResidual.select` and `split` return parts of a measurement.
@@ -345,7 +348,7 @@ def validate(
     Raises
     ------
     FlexplantError
-        As `update`; ModelError when unused data were fitted.
+        In the same cases as for `update`. Also a ModelError when unused data are fitted too.
 
     Examples
     --------
@@ -388,7 +391,7 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     residual : Eigenvalues, ModeShapes or FrfResidual
         Residual to split.
     share : float
-        Fraction to fit, between 0 and 1.
+        Fraction of the modes or lines in the first residual, between 0 and 1.
     rng : int, SeedSequence or Generator
         Random generator of the choice, or its seed.
 

@@ -30,12 +30,13 @@ class FrfResidual(Residual):
     """Residuals of measured frequency responses, complex or of the logarithm of their magnitude.
 
     The residual is ``r = (H_exp - H(p)) / sigma`` with real and imaginary part as separate rows, or
-    ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)`` for magnitudes. ``sigma^2 = variance / 2`` is the
-    variance of one part. The model's response is
+    ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)`` for magnitudes. The variance of the real part and
+    that of the imaginary part are ``sigma^2 = variance / 2``. The model's response is
     ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B``, where d is 0 for displacement, 1 for
-    velocity and 2 for acceleration. For a sampled machine the exact equivalent after a zero-order
-    hold is used, ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``. T is the sampling time and n
-    the delay in whole samples; Gamma_1 and Gamma_0 also describe a fractional delay.
+    velocity and 2 for acceleration. A machine that is sampled with a zero-order hold has the exact
+    response ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``. Here A is the state matrix of the
+    model, T the sampling time and n the delay in whole samples. The input matrices Gamma_1 and
+    Gamma_0 describe the hold and a fractional delay.
 
     Parameters
     ----------
@@ -43,26 +44,26 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]. `measured.quantity` is displacement, velocity
         or acceleration; None means displacement.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        Variance ``E|noise|^2`` of each entry; by default the variance of the Frf. If that was
-        estimated with nu degrees of freedom (`freedom`), it is multiplied by ``nu / (nu - 1)``. The
+        Variance ``E|noise|^2`` of each entry. None: the variance of the Frf. If that was estimated
+        with nu degrees of freedom (`freedom`), it is multiplied by ``nu / (nu - 1)``. The
         correlation of neighbouring lines follows from the window of the Frf. If no variance is
         known, each entry is divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
-        Frequency lines to use. None: lines where the median over the channels of
-        ``|H|^2 / variance`` is above 9 (all lines without a variance), except 0 Hz.
+        Frequency lines to use. None: the lines at which the median of ``|H|^2 / variance`` over the
+        channels is above 9. Without a variance, these are all lines. The line 0 Hz is not used.
     places : mapping {channel: place}, optional
         Places of channels by name. The name of any other channel is taken as a DOF label.
     direction : str
         Direction of motion and force at points.
     magnitude : bool
-        Whether to compare ln |H| instead of H, which tolerates phase errors and converges from
-        farther away.
+        Whether to compare ln |H| instead of H. The fit is then not sensitive to phase errors, and
+        it converges from start values that are farther away.
     hold : float, optional [Hz]
         Rate of the zero-order hold between the inputs and the machine, if the response was measured
         on the sampled machine. Modes above half the rate then appear in the band as aliases.
     delay : float [samples]
-        Delay from the command to the held force, if the measurement contains it. It may be
-        fractional.
+        Delay from the command to the held force, if the measurement contains it. It may be a
+        fraction of a sample.
 
     Raises
     ------
@@ -130,7 +131,7 @@ class FrfResidual(Residual):
         return 2 * np.pi * max(highest, self.hold or 0.0)
 
     def select(self, lines: Sequence[int]) -> FrfResidual:
-        """Return the residual on some of the lines (numbers in the measured Frf)."""
+        """Return the residual at some of the lines, given by their positions in `measured`."""
         if lines is None:
             raise ModelError("select needs numbers of lines, got None. Pass for example [0, 4].")
         return self.replace(lines=lines)

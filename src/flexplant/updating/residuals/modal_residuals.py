@@ -87,12 +87,12 @@ class Eigenvalues(_ModalResidual):
     measured : MeasuredModes
         Poles with their mode numbers.
     weights : (m,) array [(s/rad)^2], optional
-        Diagonal of W. Default: one over the variance of each pole if `measured` has a covariance,
-        else ones.
+        Diagonal of W. None: one over the variance of each pole if `measured` has a covariance,
+        otherwise ones.
     clusters : float
-        Relative distance of poles (such as 0.02). Modes that are closer than this are compared by
-        the mean of their poles, which does not depend on how the modes mix. Zero: each mode is
-        compared separately.
+        Relative distance of poles, such as 0.02. Modes that are closer than this form a cluster,
+        and only the mean of their poles is compared. The mean does not depend on how the modes mix.
+        Zero: each mode is compared separately.
 
     Raises
     ------
@@ -129,7 +129,7 @@ class Eigenvalues(_ModalResidual):
 
     @property
     def W(self) -> FloatArray:
-        """The diagonal (m,) of W in (12)."""
+        """The diagonal (m,) of W in equation (12)."""
         m = len(self.measured)
         if self.weights is not None:
             return self.weights
@@ -139,7 +139,7 @@ class Eigenvalues(_ModalResidual):
         return np.asarray(1 / (variance[:m] + variance[m:]), dtype=np.float64)
 
     def select(self, modes: Sequence[int]) -> Eigenvalues:
-        """Return the residual of some of its modes, by number; they must have been measured."""
+        """Return the residual of some of the measured modes, given by their numbers."""
         chosen, columns = self._chosen(modes)
         weights = None if self.weights is None else self.weights[columns]
         return self.replace(measured=chosen, weights=weights)
@@ -223,12 +223,13 @@ class ModeShapes(_ModalResidual):
 
     The residual is ``r = (I - P) psi``, where P is the projector on the model's shape at these
     places. It is the part of the measured shape that no complex multiple of the model's shape
-    explains, and ``|r|^2 = (1 - MAC) |psi|^2`` with the modal assurance criterion MAC. The unknown
-    complex factor is thereby estimated by maximum likelihood. Modes whose measured poles are closer
-    than 2 % form a cluster. They are compared with the subspace of the model's shapes of the
-    cluster, which does not change when the modes mix. While fitting, the model's modes are assigned
-    to the measured ones by MAC and frequency f: the sum of ``1 - MAC + |ln(f_j / f_i)|`` over all
-    pairs is least. If shapes look similar at few places, the frequency thus decides.
+    explains. Its size is ``|r|^2 = (1 - MAC) |psi|^2`` with the modal assurance criterion MAC. This
+    is the maximum likelihood estimate of the unknown complex factor. Modes whose measured poles are
+    closer than 2 % form a cluster. They are compared with the subspace of the model's shapes of the
+    cluster, which does not change when the modes mix. In each step of the fit, the measured modes i
+    are paired with the model's modes j. The pairs minimise the sum of
+    ``1 - MAC + |ln(f_j / f_i)|`` with the frequencies f. If shapes look alike at the few measured
+    places, the frequencies decide.
 
     Parameters
     ----------
@@ -238,18 +239,19 @@ class ModeShapes(_ModalResidual):
         Shapes in the order of the poles, with any scale. None: those of `measured`.
     at : sequence of m places, optional
         Places of the rows of the shapes: DOF labels, points or mappings. None: the labels of the
-        rows in `measured`. If these labels are names of channels, a mapping {label: place}.
+        rows in `measured`. If these labels are names of channels, pass a mapping {label: place}.
     direction : str
         Direction of the motion at points.
     std : float or (m, modes) array, optional
         Standard deviation of the noise n of the entries, in the scale of each shape. For a complex
-        entry ``E|n|^2 = std^2``. None: equal for all entries, and unknown.
+        entry ``E|n|^2 = std^2``. None: it is not known, and assumed equal for all entries.
     covariance : (modes, m, m) array, optional
-        ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; its scale is not used, and
-        it may be singular. Default: that of `measured` (`shape_covariance`), with its shapes.
+        Covariance ``E[n n^H]`` of the noise of each shape, in place of `std`. It is real or
+        Hermitian and may be singular. Noise that only changes the scale of a shape has no effect.
+        None: the `shape_covariance` of `measured`, if its shapes are used.
     assign : bool
-        Whether modes are assigned by the MAC with the measured shapes. False: modes are followed
-        from one step of the search to the next, starting with their numbers.
+        Whether modes are paired with the measured ones as described above. False: the modes with
+        the measured numbers are followed from one step of the search to the next.
 
     Raises
     ------
@@ -304,7 +306,7 @@ class ModeShapes(_ModalResidual):
         )
 
     def select(self, modes: Sequence[int]) -> ModeShapes:
-        """Return the residual of some of its modes; see `Eigenvalues.select`."""
+        """Return the residual of some of the measured modes, given by their numbers."""
         chosen, columns = self._chosen(modes)
         std = None if self.std is None else self.std[:, columns]
         covariance = None if self.covariance is None else self.covariance[columns]
@@ -491,10 +493,11 @@ class ShapeCorrelation(ModeShapes):
 
     Parameters
     ----------
-    measured, shapes, at, direction, assign : as in `ModeShapes`
+    measured, shapes, at, direction, assign
+        Measured shapes, their places and their pairing, as in `ModeShapes`.
     std, covariance : optional
-        As in `ModeShapes`. They are used as weights of the entries in the MAC only. The noise of
-        the residuals is treated as unknown.
+        Noise of the shapes, as in `ModeShapes`. It gives only the weights of the entries in the
+        MAC. The noise of the residuals is treated as unknown.
 
     Examples
     --------

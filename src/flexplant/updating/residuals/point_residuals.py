@@ -50,9 +50,10 @@ class Antiresonances(_PointResidual):
     """Residuals of complex transmission zeros of one response, ``z_exp - z``.
 
     The zeros z of the response ``c P(s)^-1 b`` with ``P(s) = s^2 M + s D + K`` are the eigenvalues
-    of ``[P(s) b; c 0]``. Their derivatives are ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``, where
-    P_p is the derivative of P to p, and x and y are right and left eigenvectors. Each measured zero
-    is paired with the nearest zero of the model, one to one.
+    of ``[P(s) b; c 0]``. Their derivatives with respect to a parameter p are
+    ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``. Here P_p is the derivative of P, and x and y are
+    right and left eigenvectors. Each measured zero is paired with a different zero of the model,
+    the nearest if possible.
 
     Parameters
     ----------
@@ -66,9 +67,9 @@ class Antiresonances(_PointResidual):
     std : float or (m,) array [rad/s], optional
         Standard deviation of each zero, with ``E|noise|^2 = std^2``. None: not known.
     hold : float, optional [Hz]
-        Rate of the zero-order hold of a sampled measurement. The zeros are then ``ln(z) rate`` for
-        the zeros z of the sampled response, which differ from those of the continuous one. A delay
-        of whole samples does not change the zeros.
+        Rate of the zero-order hold of a sampled measurement. The zeros are then those of the
+        sampled response, converted by ``ln(z) hold`` from the unit disk. They differ from the zeros
+        of the continuous response. A delay of whole samples does not change them.
 
     Examples
     --------
@@ -189,10 +190,11 @@ class _BoundZeros(Bound):
 class StaticCompliance(_PointResidual):
     """Residuals of a static compliance, ``g_exp - c K^-1 b``.
 
-    c and b are the rows of the place of motion and of the place of force. For a free structure, the
-    compliance is that of the elastic modes (inertia relief): the displacements u solve the system
-    of the matrix ``[K, M R; R^T M, 0]`` with the rigid-body motions R. On a machine it is measured
-    at frequencies between the suspension modes and the first elastic mode.
+    The row c gives the motion at the output, and the column b is the load of a unit force at the
+    input. For a free structure, the compliance is that of the elastic modes (inertia relief). The
+    displacements then follow from a linear system with the matrix ``[K, M R; R^T M, 0]``, where R
+    are the rigid-body motions. On a machine the compliance is measured at frequencies between the
+    suspension modes and the first elastic mode.
 
     Parameters
     ----------
@@ -201,7 +203,8 @@ class StaticCompliance(_PointResidual):
     output, input, direction
         Places of motion and force, as for `Antiresonances`.
     std : float [m/N], optional
-        Standard deviation of `value`. None: not known; the residual is then divided by `value`.
+        Standard deviation of `value`. None: it is not known, and the residual is divided by
+        `value`.
 
     Examples
     --------

@@ -29,7 +29,7 @@ class Residual(Value):
 
     @property
     def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions whose compliance affects the residual (responses, not modes)."""
+        """Places and directions between which the residual compares responses, empty for modes."""
         return ()
 
     @property
@@ -78,7 +78,7 @@ class Bound(ABC):
 
     @property
     def has_noise(self) -> bool:
-        """Whether the covariance of the rows is known, whatever their weights."""
+        """Whether the covariance of the rows is known."""
         return self.noisy or self.noise is not None
 
     @abstractmethod
@@ -87,10 +87,10 @@ class Bound(ABC):
 
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
-        """Return the derivatives (m, q) of `values` to the parameters."""
+        """Return the derivatives (m, q) of `values` with respect to the parameters."""
 
     def kinds(self) -> list[Kind]:
-        """Return the kinds of model errors that affect the rows; empty if none is described.
+        """Return the kinds of model errors that affect the rows.
 
         By default each row has one independent error, relative to its measured value.
         """
@@ -101,7 +101,7 @@ class Bound(ABC):
         return self.name
 
     def assigned(self, point: Point) -> Point:
-        """Return the point with modes relabelled by the measurement, where it determines them."""
+        """Return the point with its modes paired with the measured ones, if shapes allow it."""
         return point
 
 

@@ -216,9 +216,9 @@ class GaussNewton(UpdateMethod):
     Parameters
     ----------
     truncate : float
-        Fraction of the largest singular value for a truncated SVD. Smaller singular values of the
-        (column-scaled) sensitivities S are left out of a step. With zero all are used, and a
-        singular S raises an error.
+        Relative limit of the singular values of the (column-scaled) sensitivities S. Singular
+        values below this fraction of the largest one are left out of a step (truncated SVD). Zero:
+        all are used, and a singular S raises an error.
 
     References
     ----------
