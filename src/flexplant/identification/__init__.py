@@ -1,11 +1,13 @@
 """Identification from measurements: frequency responses, poles and mode shapes.
 
-- `estimate_frf(inputs, outputs, rate)`: records become an `Frf` with coherence and variance.
-- `identify_modes(frf, band=)`: poles, shapes and covariance (pLSCF, then maximum likelihood).
-- `numbered(found, model, at=)`: identified modes paired with a model's, for `fx.Eigenvalues`.
-- `MeasuredModes.from_freq`: frequencies and damping ratios from another source.
-- `structural_modes`: measured modes as a structure, where no model exists;
-  `identify_output_only` where forces are unknown; `impact_frf` of hammer tests.
+- `estimate_frf(inputs, outputs, rate)`: computes an `Frf` with coherence and variance from records.
+- `impact_frf`: computes an `Frf` from hammer tests.
+- `identify_modes(frf, band=)`: finds poles and shapes with their covariance. A least-squares method
+  (pLSCF) finds them, and a maximum likelihood fit refines them.
+- `identify_output_only`: finds poles and shapes if the forces are unknown.
+- `numbered(found, model, at=)`: pairs identified modes with those of a model, for `fx.Eigenvalues`.
+- `MeasuredModes.from_freq`: takes frequencies and damping ratios from another source.
+- `structural_modes`: makes modes of a structure from measured modes, if no model exists.
 
 >>> import flexplant as fx
 >>> machine = fx.testbeds.wafer_stage()

@@ -37,15 +37,16 @@ NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoleSelection(Value):
-    """Poles picked from a stabilisation diagram, to start a fit from.
+    """Poles picked from a stabilisation diagram, with which `identify_modes` starts its fit.
 
     Parameters
     ----------
     poles : (m,) complex array [rad/s]
         Poles with positive imaginary parts.
     participation : (n_in, m) complex array
-        Participation factor of each input in each pole. If there are fewer outputs than inputs, the
-        rows are those of the outputs instead. Repeated poles have linearly independent columns.
+        Participation factors. The factor of an input in a pole states how strongly the input
+        excites the mode. If there are fewer outputs than inputs, the rows are those of the outputs
+        instead. Repeated poles have linearly independent columns.
 
     Examples
     --------
@@ -92,10 +93,11 @@ class StabilisationDiagram(Value):
     poles : (n,) complex array [rad/s]
         Poles with positive damping ratios inside the band.
     flags : (n,) int array
-        0: new pole, 1: same frequency as at the previous order, 2: same damping too, 3: same shape
-        too (stable).
+        Agreement of each pole with a pole of the previous order. 0: the pole is new. 1: it has the
+        same frequency. 2: it also has the same damping. 3: it also has the same shape and is called
+        stable.
     tracks : (n,) int array
-        Number of the track of a pole; a pole that continues over the orders keeps its number.
+        Number of the track to which each pole belongs.
     shapes, participation : (n_out, n), (n_in, n) complex array
         Shapes and participation vectors of unit length. With fewer outputs than inputs, `shapes`
         holds the participation vectors and `participation` the shapes.
@@ -139,10 +141,10 @@ class StabilisationDiagram(Value):
     def automatic(self, *, presence: float = 0.5) -> PoleSelection:
         """Return the poles that are stable over the orders.
 
-        A track is accepted when its pole is stable at no less than the fraction `presence` of the
-        orders, and at four orders or more. The orders are counted from the first one of the track
-        to the highest one. All poles are taken from the order with most
-        tracks, so that the participation vectors of repeated poles belong together.
+        A track is accepted if its pole is stable at four or more orders, and at least at the
+        fraction `presence` of the orders from the first one of the track to the highest one. All
+        poles are taken from one order, the one with most accepted tracks. The participation vectors
+        of repeated poles therefore belong together.
 
         Parameters
         ----------
@@ -175,7 +177,7 @@ class StabilisationDiagram(Value):
         Parameters
         ----------
         freq : (m,) array [Hz]
-            Frequencies of the poles; a frequency given twice picks two poles there.
+            Frequencies of the poles. A frequency that is given twice picks two poles.
 
         Raises
         ------

@@ -125,19 +125,19 @@ def estimate_frf(
     references r. Y and U are the Fourier transforms of the outputs and inputs.
 
     A levitated machine is measured under feedback. Noise then returns to the inputs through the
-    controller K, and H1 is biased towards ``-1/K``. A reference r is an excitation added to the
-    commands, or a set-point; one reference for each input is needed. References that are not
-    correlated with the noise give the process sensitivity PS = S_yr S_rr^-1 and the sensitivity S =
-    S_ur S_rr^-1. The plant is the quotient ``PS S^-1`` (the three-point method). Periodic signals
-    need as many experiments as inputs, whether a reference is given or not. Averaging over their
-    periods reduces the noise before the division. The inputs are the signals that act on the
-    machine: the commands plus the added excitation.
+    controller K, and H1 is biased towards ``-1/K``. A reference r avoids this bias. It is a
+    set-point, or an excitation that is added to the commands. There must be one reference for each
+    input, and it must not be correlated with the noise. The references give the process sensitivity
+    ``PS = S_yr S_rr^-1`` and the sensitivity ``S = S_ur S_rr^-1``. The plant is the quotient
+    ``PS S^-1`` (the three-point method). The inputs are the signals that act on the machine: the
+    commands plus the added excitation. Periodic signals need as many experiments as inputs, with
+    and without a reference. Averaging over their periods reduces the noise before the division.
 
     Parameters
     ----------
     inputs : (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping
-        Signals that act on the machine; the keys of a mapping {name: (n_time,) or (n_exp, n_time)
-        array} are their names.
+        Signals that act on the machine. A mapping {name: (n_time,) or (n_exp, n_time) array} also
+        gives their names.
     outputs : (n_out, n_time) or (n_exp, n_out, n_time) array, or mapping
         Measured signals, in the same form.
     rate : float [Hz]
@@ -147,27 +147,29 @@ def estimate_frf(
     method : H1Estimator, H2Estimator, HvEstimator or Periodic
         Method of averaging; ``H1Estimator()`` by default.
     quantity : {"displacement", "velocity", "acceleration"}, optional
-        Quantity of the outputs; `Frf.converted` changes it.
+        Quantity of the outputs. `Frf.converted` can convert the result to another quantity.
 
     Returns
     -------
     Frf
-        Responses with `coherence` (multiple, the same for all inputs), `variance` E|error|^2 of
-        every entry and `correlation` of the errors of different outputs; these three are None for a
-        single period, which has no information on noise. It also stores the `resolution`, and the
-        `window` and `overlap` of segments.
+        Responses with their `coherence`, the `variance` E|error|^2 of every entry and the
+        `correlation` of the errors of different outputs. The coherence of an output is the multiple
+        coherence with all inputs together. These three are None for a single period, which contains
+        no information on noise. The Frf also stores the `resolution`, and the `window` and
+        `overlap` of segments.
 
     Warns
     -----
     FlexplantWarning
-        When an output keeps one value for longer than quantisation explains (drop-out). Without a
-        reference: when the machine seems to respond before its inputs act, since noise returns
-        through a controller and biases the estimate. (When set-points are the only excitation, the
-        bias is not detected: always pass reference= in closed loop.) With a reference: at lines
-        where the inputs are mostly noise. When segments are averaged although inputs repeat (use
-        `Periodic`) or are pulses (use `impact_frf`). With `Periodic`: when the inputs do not repeat
-        after the stated period, or a transient has not decayed, with the number of periods to
-        discard.
+        When an output keeps one value for longer than quantisation explains (drop-out). When
+        segments are averaged although the inputs are periodic (use `Periodic`) or are pulses (use
+        `impact_frf`). When `Periodic` is used and the inputs do not repeat after the given period.
+        When a transient has not decayed. The warning then gives the number of periods to discard.
+
+        Without a reference, when the machine seems to respond before its inputs act. This shows
+        that noise returns through a controller and biases the estimate. The bias is not detected
+        when set-points are the only excitation. Always pass a reference in closed loop. With a
+        reference, the warning names lines at which the inputs are mostly noise.
 
     Raises
     ------
@@ -221,30 +223,30 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
 
     Here R is the number of repetitions, G^(r) is repetition r, and o and i number the outputs and
-    inputs. The noise of an output does not depend on which input is excited. The variance is
-    therefore a product of two factors, one for the output and one for the input. For this reason
-    the spread of a few repetitions is averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) /
-    mean(sigma^2)``. The correlation of the errors of two outputs is pooled over the inputs. The
-    degrees of freedom of the variance
-    (`freedom`) follow from R, the inputs and the number of outputs with independent errors.
+    inputs. The noise of an output does not depend on which input is excited. The true variance is
+    therefore a product of a factor of the output and a factor of the input. The variance from a few
+    repetitions is smoothed to such a product, which is ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) /
+    mean(sigma^2)``. The correlation of the errors of two outputs is a mean over the inputs. The
+    degrees of freedom of the variance (`freedom`) follow from R, the number of inputs, and the
+    number of outputs with independent errors.
 
     Use another `rng` of `multisine` for each run. With the same signal and no dither, the
     quantisation error is equal in every run. It is then not part of the spread, and the variance is
-    28 to 300 times too small.
-    If the machine drifts between runs, pass the runs separately to `identify_modes`: their mean has
-    broader resonances, with errors larger than its standard deviations.
+    28 to 300 times too small. If the machine drifts between runs, do not average them, but pass the
+    list of runs to `identify_modes`. Their mean would have resonances that are too broad, with
+    errors larger than its standard deviations.
 
     Parameters
     ----------
     repeated : iterable of at least two Frf
-        Measurements of the same channels, frequencies and quantity, with independent noise. At
-        least four are needed if the variances are to be useful as weights of a fit.
+        Measurements of the same channels, frequencies and quantity, with independent noise. Take at
+        least four, so that the variances are useful as weights of a fit.
 
     Raises
     ------
     ShapeError, ModelError
-        When there are fewer than two, they have different channels, frequencies or quantities, or
-        do not differ at all.
+        When there are fewer than two measurements, when their channels, frequencies or quantities
+        differ, or when all measurements are identical.
 
     References
     ----------

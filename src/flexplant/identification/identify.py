@@ -59,23 +59,24 @@ def stabilisation_diagram(
     Parameters
     ----------
     frf, band
-        As for `identify_modes`. Velocity and acceleration are integrated; an FRF without a quantity
-        counts as displacement.
+        Measured FRF and its frequency band, as for `identify_modes`. Velocity and acceleration are
+        integrated. An FRF without a quantity is taken as displacement.
     orders : iterable of int, optional
-        Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
-        of the lines, or to 100 poles. Only every second order is used where a wide band and many
-        inputs and outputs make each order costly.
+        Model orders. A model has order * min(n_in, n_out) poles. None: orders from 2 to 40, but at
+        most a quarter of the number of lines, and at most 100 poles. Only every second order is
+        used if a wide band and many inputs and outputs make each order costly.
     tolerances : (float, float, float)
-        Largest relative change of frequency and of damping from one order to the next, and the
-        smallest MAC (modal assurance criterion) of its shapes at both orders, for a stable pole.
+        Limits for a stable pole: the largest relative change of its frequency from one order to the
+        next, that of its damping, and the smallest MAC (modal assurance criterion) between its
+        shapes at both orders.
     max_zeta : float
         Largest damping ratio of a pole.
 
     Returns
     -------
     StabilisationDiagram
-        Diagram; `.automatic()` or `.select(freq=[...])` choose poles, `plot.stabilisation` draws
-        it.
+        Diagram, from which `.automatic()` or `.select(freq=[...])` chooses poles. It is drawn by
+        `plot.stabilisation`.
 
     Raises
     ------
@@ -133,24 +134,25 @@ def identify_modes(
 ) -> IdentifiedModes:
     """Return poles, mode shapes and their covariance from measured FRFs.
 
-    ``found = fx.identify_modes(frf, band=(50.0, 800.0), dofs={"y1": "41:z"})``: `found.freq` [Hz],
-    `found.zeta` and `found.shapes` are the result, `found.rejected` lists the poles that were left
-    out with the reason, and `fx.plot.identified` draws the result together with the measurement.
-    ``fx.Eigenvalues(fx.numbered(found, model))`` is the input of `update`. Poles come from a
-    stabilisation diagram and a maximum likelihood fit, without choices by the user; `start=`
-    accepts poles picked by eye. Modes outside the band are taken into account, and a warning names
+    A call such as ``found = fx.identify_modes(frf, band=(50.0, 800.0), dofs={"y1": "41:z"})`` gives
+    the frequencies `found.freq` [Hz], the damping ratios `found.zeta` and the shapes
+    `found.shapes`. `found.rejected` lists poles that were left out, with the reason, and
+    `fx.plot.identified` draws the result together with the measurement. For `update`, use
+    ``fx.Eigenvalues(fx.numbered(found, model))``. Poles are found by a stabilisation diagram and
+    refined by a maximum likelihood fit, without choices by the user. `start=` accepts poles that
+    you picked in the diagram. Modes outside the band are taken into account. A warning names
     frequencies that the fit does not explain. The method is described in `algorithms`.
 
     Parameters
     ----------
     frf : Frf, or list of Frf
-        Measured FRF, or several runs with the same channels between which the machine may have
-        drifted (a mean of the runs would have broader resonances). For several runs, each pole is
-        the mean over the runs, and its standard deviation follows from the differences between the
-        runs. If the FRF has a variance, it weights the errors and gives the covariance of the
-        poles. Correlations between outputs and between neighbouring lines (from the window) are
-        included if they are known. Without a variance, the weights and the covariance follow from
-        the residual of the fit, averaged over 41 lines.
+        Measured FRF, or a list of several runs with the same channels. Pass a list if the machine
+        may have drifted between the runs, since their mean would have broader resonances. Each pole
+        is then the mean over the runs, and its standard deviation follows from the differences
+        between the runs. If an FRF has a variance, it gives the weights of the fit and the
+        covariance of the poles. Correlations between outputs and between neighbouring lines (from
+        the window) are included if they are known. Without a variance, the weights and the
+        covariance follow from the residual of the fit, averaged over 41 lines.
     band : (low, high) [Hz], optional
         Frequency band of the fit and of the reported modes; all lines by default.
     orders : iterable of int, optional
@@ -158,53 +160,56 @@ def identify_modes(
     start : PoleSelection, optional
         Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
     lower : int
-        Number of residual terms of rigid-body modes and modes below the band.
+        Number of terms 1/s, 1/s^2, ... in the fit. They represent rigid-body modes and modes below
+        the band.
     upper : int, optional
-        Number of residual terms of modes above the band. None: 3, and up to 25 if the data require
-        more. Too few terms bias the poles. A bias of up to one standard deviation is not visible in
-        the misfit.
+        Number of terms 1, s, s^2, ... in the fit. They represent modes above the band. None: 3, and
+        up to 25 if the data require more. Too few terms bias the poles. A bias of up to one
+        standard deviation is not visible in the misfit.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
         sampled plant. Modes above half the rate then appear folded, as broad modes with several per
         cent of damping, unless a filter removes them.
     delay : float [samples]
-        Delay of the response in periods of the hold, fractions included, as for
-        `StandardPlant.discretized`.
+        Delay of the response in periods of the hold, as for `StandardPlant.discretized`. It may be
+        fractional.
     dofs : mapping {channel: DOF label}, optional
-        DOFs of outputs and inputs. They label the shapes, which are mass-normalised where an input
-        and an output share a DOF.
+        DOFs of outputs and inputs. They are the labels of the shapes. If an input and an output
+        have the same DOF, the shapes are mass-normalised.
     setups : lists of channels, optional
-        Groups of outputs (or inputs) that were measured together, when a sensor (or a hammer) was
-        moved: poles may differ between groups. None: every channel is a separate group.
+        Groups of outputs (or inputs) that were measured together. They are needed if a sensor (or
+        the hammer) was moved, because the poles may then differ between groups. None: every channel
+        is a separate group.
     refine : bool, optional
-        Whether to refine the poles by maximum likelihood. None: yes if this is useful and takes at
-        most one or two minutes. It is not useful if each output has its own poles. The cost of a
-        step is estimated as ``n (m r)^2`` with n values of the FRF, m poles and r references (the
-        inputs, or the outputs if there are fewer of them). The limits are 5e7 for each step and
-        5e10 in total. False: the result without refinement, in about a second.
+        Whether to refine the poles by maximum likelihood. False: the result without refinement, in
+        about a second. None: the poles are refined if this is useful and takes at most one or two
+        minutes. It is not useful if each output has its own poles. The cost of a step is estimated
+        as ``n (m r)^2`` with n values of the FRF, m poles and r references (the inputs, or the
+        outputs if there are fewer of them). The limits are 5e7 for each step and 5e10 in total.
     most : int
         Largest number of poles of the fit. The strongest poles of the diagram are used; `rejected`
         lists the others.
     max_iterations : int
         Largest number of iterations of the fit.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal for work of more than two seconds, and
-        always when a costly refinement is requested, with its cost.
+        Whether to show a progress bar. None: a bar is shown on a terminal for work of more than two
+        seconds. It is always shown, with the cost, when a costly refinement is requested.
 
     Returns
     -------
     IdentifiedModes
-        `MeasuredModes` sorted by frequency, without mode numbers (see `numbered`). If the misfit
-        (ratio of the residual to the noise) exceeds one, the covariance is multiplied by it.
+        Modes sorted by frequency. They have no mode numbers, which `numbered` adds. If the misfit
+        (ratio of the squared residual to that of the noise) exceeds 1, the covariance is multiplied
+        by it.
 
     Warns
     -----
     FlexplantWarning
         When the residual of a group of lines exceeds the noise, because a mode was missed or two
-        were merged. When a resonance is too narrow for the distance between lines: its width is
-        less than half of this distance if the fit includes the window (Hann-windowed segments),
-        otherwise less than about four times this distance. When the FRF uses the convention exp(-i
-        omega t), so that its conjugate is used.
+        were merged. When a resonance is too narrow for the distance between lines. The smallest
+        width is half of this distance if the fit includes the window (Hann-windowed segments), and
+        otherwise about four times this distance. When the FRF has the sign convention of
+        ``exp(-i omega t)``, so that its complex conjugate is used.
 
     Raises
     ------

@@ -62,17 +62,17 @@ class Blow(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImpactTest(Value):
-    """FRFs of an impact test by `impact_frf`, with the damping of the exponential window.
+    """Result of `impact_frf`: FRFs that include the damping of an exponential window.
 
     `impact_frf` multiplies force and responses by the window ``exp(-t/decay)``, which adds damping
-    to every pole; `corrected` subtracts it.
+    to every pole. The method `corrected` subtracts this damping.
 
     Parameters
     ----------
     frf : Frf
         FRF ``H(s + 1/decay)`` at ``s = i omega``, in which every pole has moved by ``-1/decay``.
-        The window correlates the errors of neighbouring lines, which fits do not model. The
-        variance is therefore enlarged by `dependence`, so that a mean over lines has the correct
+        The window correlates the errors of neighbouring lines. Fits assume independent errors. The
+        variance is therefore multiplied by `dependence`, so that a mean over lines has the correct
         variance.
     used, refused : sequences of Blow
         Averaged blows, and refused blows with the reason.
@@ -104,10 +104,10 @@ class ImpactTest(Value):
 
     @property
     def dependence(self) -> float:
-        r"""Sum of the correlations between the error of a line and the errors of all lines.
+        r"""Sum of the correlations between the error of one line and the errors of all lines.
 
         It is ``T/tau coth(T/tau)`` with the length T of the segment and the time constant tau of
-        the window.
+        the window, and 1 without a window.
         """
         return _dependence(self.segment / self.decay)
 
@@ -124,16 +124,17 @@ class ImpactTest(Value):
 
         Poles whose remaining damping is smaller than its standard deviation are moved to
         `rejected`. Force and responses that are multiplied by the window ``w = exp(-t/tau)`` have
-        the FRF ``H(s + 1/tau)``: poles move by exactly -1/tau, and residues do not change. The
+        the FRF ``H(s + 1/tau)``. Poles move by exactly -1/tau, and residues do not change. The
         covariance is corrected too, for white noise and segments of length T. For a pole with the
         real part -a on the machine, the derivative of the response with respect to the pole has the
-        envelope ``g = t exp(-(a + 1/tau) t)``. The variance of the pole is
+        envelope ``g = t exp(-(a + 1/tau) t)``. The variance of the pole for independent lines is
+        multiplied by
 
         .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
             \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
 
-        times the variance for independent lines with the variance before the enlargement in `frf`.
-        For residues the exponent is 1 in place of 3.
+        and divided by `dependence`, by which the variance of `frf` was multiplied. For residues the
+        exponent is 1 in place of 3.
 
         Parameters
         ----------
@@ -143,8 +144,8 @@ class ImpactTest(Value):
         Raises
         ------
         ModelError, SolverError
-            When the damping of the window was removed before, or no pole has more damping than the
-            window and its own standard deviation.
+            When the damping of the window was already removed, or no pole has a remaining damping
+            above its standard deviation.
         """
         instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):
@@ -206,18 +207,19 @@ def impact_frf(
     r"""Return the FRFs of an impact test, ``G = sum(Y F^*) / sum(F F^*)`` over its blows.
 
     Y and F are the Fourier transforms of a response and of the force after a blow, and F^* is the
-    complex conjugate of F. Blows are the pulses of the force in long records. Each blow has a
-    separate segment, in which the force outside of the pulse is set to zero (force window). Force
-    and responses are multiplied by the exponential window ``exp(-t/decay)``. This moves all poles
-    by -1/decay (`ImpactTest.corrected` reverses it). A vibration that has not died out at the end
-    of a segment falsifies the residues, but not the poles. Blows are left out if their segment
-    contains another blow, if they are clipped, or if the record ends too early. The machine is
-    assumed to be at rest before a record that begins with a blow.
+    complex conjugate of F. A record may contain many blows, which are found as pulses of the force.
+    Each blow has a separate segment, in which the force outside the pulse is set to zero (force
+    window). Force and responses are multiplied by the exponential window ``exp(-t/decay)``. This
+    moves all poles by -1/decay, and `ImpactTest.corrected` moves them back. A vibration that has
+    not died out at the end of a segment falsifies the residues, but not the poles. Blows are left
+    out if their segment contains another blow, if they are clipped, or if the record ends too
+    early. If a record begins with a blow, the machine is assumed to be at rest before it.
 
     Parameters
     ----------
     force : (n_time,), (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping by name
-        Force of the hammer, one channel for each struck point; zero for points that are not struck.
+        Force of the hammer, with one channel for each struck point. A channel is zero while other
+        points are struck.
     response : array or mapping
         Measured responses, as for `estimate_frf`.
     rate : float [Hz]
@@ -230,10 +232,11 @@ def impact_frf(
     level : float
         Fraction of the largest force of a record above which a pulse begins, between 0 and 1.
     limits : mapping {channel: value}, or float, optional
-        Full scale of each channel, or of all channels: a blow that reaches it is refused as
-        clipped. For a channel without a limit, clipping is detected automatically: the signal stays
-        at its extreme value after a steep rise, and this value is not its value at rest.
-        ``limits=1e9`` disables this test. A warning names each output that never changes its value.
+        Full scale of each channel, or one value for all channels. A blow is refused as clipped if a
+        signal reaches its full scale. Without a given full scale, clipping is detected by the
+        signal itself. It rises steeply to its largest or smallest value and keeps this value for
+        several samples. ``limits=1e9`` disables this test. A warning names each output that never
+        changes its value.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the responses.
 

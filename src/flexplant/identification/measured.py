@@ -30,22 +30,22 @@ from ..words import check_names, instance, several
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredModes(Value):
-    """Complex eigenvalues of a real structure, ``lambda = -zeta omega + i omega sqrt(1-zeta^2)``.
+    """Measured poles of a structure, ``lambda = -zeta omega + i omega sqrt(1 - zeta^2)``.
 
     Parameters
     ----------
     poles : (m,) complex array [rad/s]
-        One pole of each conjugate pair, with either sign of the imaginary part (the paper on which
-        flexplant is based prints the negative one); stored with the positive one.
+        One pole of each conjugate pair, with either sign of the imaginary part. It is stored with
+        the positive sign. (The paper on which flexplant is based prints the negative one.)
     modes : sequence of m int, optional
-        Number of each mode in the model, counted from 1; rigid-body modes are counted too. The
+        Number of each mode in the model. It counts from 1 and includes rigid-body modes. The
         numbers are needed to update a model.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
-        Either the variance E|d lambda|^2 of each pole, whose real and imaginary parts are then
-        equally uncertain and independent, or the covariance matrix of the vector [Re lambda; Im
-        lambda]. It is stored as this matrix.
+        Covariance matrix of the vector [Re lambda; Im lambda], or the variance E|d lambda|^2 of
+        each pole. A variance is divided equally between the real and the imaginary part, which are
+        assumed independent. The attribute is always the covariance matrix.
     shapes : (n, m) complex array, optional
-        Mode shapes at n measured DOFs; the shape of a conjugated pole is conjugated too.
+        Mode shapes at n measured DOFs. If a pole is stored as its conjugate, its shape is too.
     dofs : sequence of n str, optional
         Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
     xyz : (n, 3) array [m], optional
@@ -111,9 +111,10 @@ class MeasuredModes(Value):
         freq_std: npt.ArrayLike | None = None,
         zeta_std: npt.ArrayLike | None = None,
     ) -> MeasuredModes:
-        """Return modes from measured frequencies and damping: ``omega (-zeta + i zeta_d)``.
+        """Return modes from measured frequencies and damping ratios.
 
-        Here ``zeta_d = sqrt(1 - zeta^2)``; standard deviations are propagated to first order.
+        The poles are ``omega (-zeta + i sqrt(1 - zeta^2))``. Their covariance follows from the
+        standard deviations to first order.
 
         Parameters
         ----------
@@ -124,12 +125,13 @@ class MeasuredModes(Value):
         modes : sequence of m int, optional
             Mode numbers in the model.
         freq_std, zeta_std : float or (m,) arrays [Hz, 1], optional
-            Independent standard deviations; give both or neither.
+            Standard deviations of frequencies and damping ratios, which are assumed independent.
+            Give both or neither.
 
         Raises
         ------
         ModelError
-            When a damping ratio is not in 0 .. 1, or one kind of deviation is given alone.
+            When a damping ratio is not in 0 .. 1, or only one kind of standard deviation is given.
 
         Examples
         --------
@@ -186,7 +188,7 @@ class MeasuredModes(Value):
 
     @property
     def std(self) -> ComplexArray | None:
-        """Standard deviations of the poles [rad/s]: real part + i times imaginary part."""
+        """Standard deviations of the poles [rad/s], as std(Re lambda) + i std(Im lambda)."""
         if self.covariance is None:
             return None
         deviation = np.sqrt(np.diag(self.covariance))
@@ -346,20 +348,20 @@ def numbered(
     the model.
 
     Modes of the model within 0.5 % of each other count as repeated. Their MAC is that of the
-    closest combination of their shapes. It does not distinguish them, and the measured modes are
-    numbered by frequency. If fewer poles are measured than the model has repeated modes, the
-    measured ones get the lowest numbers.
+    combination of their shapes that is closest to the measured shape. This MAC does not distinguish
+    them. Measured modes that are paired with repeated modes are therefore numbered by frequency. If
+    there are fewer of them than repeated modes, they get the lowest numbers.
 
     Parameters
     ----------
     measured : MeasuredModes
-        Measured modes; without shapes they are paired by frequency only.
+        Measured modes. Without shapes they are paired by frequency only.
     model : Modes, or a model with `.modes()`
         Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
-        Places of the rows of the shapes on the model. Ports give the places of their sensors and
-        actuators. A mapping gives the place of each row: a sensor with its direction, or a point,
-        which means the direction z there. By default the labels are DOFs of the model.
+        Places on the model of the rows of the shapes. Ports give the places of their sensors and
+        actuators. A mapping gives the place of each row, as a sensor or a point. A sensor has a
+        direction, and a point has the direction z. None: the labels are those of DOFs of the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float
@@ -376,8 +378,8 @@ def numbered(
     Raises
     ------
     ModelError, LabelError
-        When a pole has no partner (with `partial`, when no pole has one), an argument is out of
-        range, or the model does not have the place of a row.
+        When a pole has no partner, an argument is out of range, or the model does not have the
+        place of a row. With `partial`, only when no pole has a partner.
 
     References
     ----------

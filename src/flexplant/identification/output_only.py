@@ -53,24 +53,30 @@ def identify_output_only(
 
     A and C are the state and output matrices of a discrete-time model of the machine, O is its
     observability matrix, and Z is the other factor. The leading singular vectors of H give O in
-    some basis of the states. A follows from O and O shifted by one block, and the poles are
-    :math:`\lambda = rate\,\ln \mu` with the eigenvalues :math:`\mu` of A. This is repeated for
+    some basis of the states. A is found from O and the same matrix shifted by one block. The poles
+    are :math:`\lambda = rate\,\ln \mu` with the eigenvalues :math:`\mu` of A. This is repeated for
     several model orders (numbers of states). Poles that hardly change from order to order count as
     stable. They are taken from the lowest model order at which the number of stable poles is
-    largest, since more states add noise. White sensor noise is in :math:`R_0` only, which is not
-    used. The covariance of each pole is found by leaving out each block of the record in turn (a
-    jackknife). With b blocks it is multiplied by (b - 1)/(b - 3), so that squared errors relative
-    to the variance (Student's distribution) have a mean of 1. Poles whose frequency varies by more
-    than 2 % or whose damping varies by more than 60 % count as noise and are left out. A rotating
-    part or mains hum appears as a mode with almost no damping. Peaks in the spectrum of an
-    excitation that is not white appear as additional modes.
+    largest, since more states add noise. White sensor noise contributes to :math:`R_0` only, which
+    is not used.
+
+    The covariance of each pole is found by a jackknife. The record is divided into b blocks, and
+    the poles are computed b times, each time without one block. Their scatter gives the variance.
+    Since b is small, this estimate is uncertain, and the error of a pole divided by it follows
+    Student's distribution. The estimate is therefore multiplied by (b - 1)/(b - 3), the variance of
+    that distribution. Poles whose frequency varies by more than 2 % or whose damping varies by more
+    than 60 % are taken as noise and left out. A rotating part or mains hum appears as a mode with
+    almost no damping. Peaks in the spectrum of an excitation that is not white appear as additional
+    modes.
 
     Parameters
     ----------
     outputs : (n_channel, n_time) array or mapping {name: (n_time,) array}
-        Displacements, velocities or accelerations; (n_exp, n_channel, n_time) for several records.
+        Displacements, velocities or accelerations. Several records have the shape
+        (n_exp, n_channel, n_time).
     rate : float [Hz]
-        Sampling rate; at most ten times the upper end of the band, otherwise decimate first.
+        Sampling rate. It should be at most ten times the upper end of the band. Otherwise, decimate
+        the record first.
     band : (low, high) [Hz]
         Frequency band of the modes.
     orders : iterable of int, optional
@@ -78,17 +84,18 @@ def identify_output_only(
     lags : int, optional
         Number of block rows and columns of H; two periods of the lowest frequency by default.
     blocks : int
-        Number of blocks of the record, at least 8; each should be longer than the slowest decay.
+        Number of blocks of the record, at least 8. Each block should be longer than the slowest
+        decay.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal or in a notebook, for work of more than
-        two seconds.
+        Whether to show a progress bar. None: a bar is shown on a terminal or in a notebook, for
+        work of more than two seconds.
 
     Returns
     -------
     MeasuredModes
-        Modes sorted by frequency, without mode numbers. The shapes are those at the channels, with
-        a largest entry of 1, since their scale is unknown without the excitation. The covariance is
-        given for each pole separately.
+        Modes sorted by frequency, without mode numbers. The shapes have a row for each channel.
+        Their scale is not known without the excitation, so that their largest entry is set to 1.
+        The covariance is known for each pole separately. Different poles are taken as independent.
 
     Raises
     ------

@@ -26,11 +26,11 @@ class Periodic(Value):
     Parameters
     ----------
     period : float [s]
-        Period, an integer number of samples; its inverse is the resolution.
+        Period of the signal, which is a whole number of samples. Its inverse is the resolution.
     discard : int
         Number of periods at the start that are not used, because transients still decay in them.
     band : (low, high) [Hz], optional
-        Band of the frequencies (lines) that are used; by default all excited lines.
+        Band of the frequencies (lines) that are used. None: all excited lines.
 
     References
     ----------
@@ -228,11 +228,12 @@ def multisine(
     rate : float [Hz]
         Sampling rate of the signals.
     period : float [s]
-        Duration of one period, a whole number of samples; its inverse is the distance of the lines.
+        Duration of one period, which is a whole number of samples. Its inverse is the distance
+        between the lines.
     periods : int
         Number of repetitions of the period in each experiment.
     band : (low, high) [Hz], optional
-        Band of excited lines; all below half the rate by default.
+        Band of the excited lines. None: all lines below half the rate.
     rms : float
         RMS value of each signal.
     rng : int or Generator, optional

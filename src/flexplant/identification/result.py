@@ -254,14 +254,14 @@ def of_segments(frf: Frf, error: SolverError) -> SolverError:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedModes(MeasuredModes):
-    r"""Measured modes with all results of the fit; made by `identify_modes`.
+    r"""Result of `identify_modes`: measured modes with all results of the fit.
 
     .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k}
         + \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k} + E(s)
 
-    The lambda_k are the poles, psi_k the shapes and l_k the participation vectors. E(s) contains
-    the residual terms, which represent the modes outside the band. M and D are the mass and damping
-    matrices of the structure.
+    The fit has the poles lambda_k, the shapes psi_k and the participation vectors l_k, which state
+    how strongly each input excites the mode. E(s) contains the residual terms, which represent the
+    modes outside the band. M and D are the mass and damping matrices of the structure.
 
     Parameters
     ----------
@@ -274,10 +274,10 @@ class IdentifiedModes(MeasuredModes):
     input_dofs : sequence of n_in str
         Labels of the inputs' DOFs, or their names where no DOF is known.
     terms : (n_out, n_in, number of terms) array
-        Coefficients of E(s), the effect of modes outside the band: `lower` terms in 1/s, 1/s^2,
-        ..., then the terms in 1, s, .... Here s is divided by ``2 pi top``.
+        Coefficients of the residual terms E(s). The first `lower` ones belong to 1/s, 1/s^2 and so
+        on, and the others to 1, s, s^2 and so on. In these powers, s is divided by ``2 pi top``.
     lower : int
-        Number of the terms in 1/s, 1/s^2, ....
+        Number of the terms with negative powers of s.
     top : float [Hz]
         Largest frequency of the measured lines, which scales s in E(s).
     hold : float [Hz], optional
@@ -287,31 +287,32 @@ class IdentifiedModes(MeasuredModes):
     segment : float [s], optional
         Length of the Hann-windowed segments of the measurement, whose effect the fit includes.
     unreported : complex array
-        Poles just outside the band that improve the fit, with their shapes and participation.
+        Poles just outside the band that improve the fit, with their shapes and participation
+        vectors.
     mass_normalised : bool
-        Whether the shapes are scaled as those of a model, ``phi^T (2 lambda M + D) phi = 2i
+        Whether the shapes are scaled as those of a model, with ``phi^T (2 lambda M + D) phi = 2i
         Im(lambda)``. This needs an input and an output at the same DOF. Otherwise the largest entry
         of each shape is 1.
     misfit : float
-        Weighted squared error of the fit per degree of freedom: 1 when the error is only noise with
-        the stated variance.
+        Weighted squared error of the fit per degree of freedom. It is 1 if the error is only noise
+        with the stated variance.
     diagram : StabilisationDiagram, optional
         Diagram from which the poles were chosen.
     channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
         Covariance E[n n^H] of the error n of the vector [shape; participation] of each mode,
         including the error of its scale. It follows from the variance of the FRF and from the
-        correlation between the errors of outputs, which are assumed independent where this
-        correlation is not known.
+        correlation between the errors of outputs. If this correlation is not known, the errors of
+        outputs are assumed independent.
     rejected : sequence of (frequency [Hz], damping ratio, reason)
         Poles and mains lines that are not reported.
     first_answer : str
-        Reason why the poles were not refined by maximum likelihood; empty if they were (`refined`).
+        Reason why the poles were not refined by maximum likelihood. Empty: they were refined.
     inconsistency : float, optional
-        Relative difference of the frequencies that separate outputs (or inputs) show, if they
-        disagree. The poles are then means over these channels, and their covariance follows from
-        the differences.
+        Relative difference between the frequencies that are found from separate outputs, inputs or
+        runs. The poles are then means over these, and their covariance follows from the
+        differences. None: the frequencies agree.
     inconsistent : str
-        Kind of the channels that disagree, "outputs", "inputs" or "runs"; empty if they agree.
+        Kind of the data that disagree: "outputs", "inputs" or "runs". Empty: they agree.
     undamped : float [rad/s]
         Damping of an exponential window, already subtracted from the poles.
     """
@@ -377,10 +378,10 @@ class IdentifiedModes(MeasuredModes):
         Parameters
         ----------
         freq : (n_freq,) array [Hz]
-            Positive frequencies; outside the identified band the residual terms are not valid.
+            Positive frequencies. Outside the identified band the residual terms are not valid.
         as_measured : bool
-            Whether to include the effect of windowed segments, if the fit did: resonances are then
-            lower and wider than those of the machine.
+            Whether to include the effect of windowed segments, if the fit included it. Resonances
+            are then lower and wider than those of the machine.
         """
         freq = checked_freq(freq)
         if freq.size and freq.min() <= 0:

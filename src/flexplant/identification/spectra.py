@@ -36,11 +36,11 @@ class H1Estimator(SpectralMethod):
     Parameters
     ----------
     segment : float, optional
-        Length of a segment [s]; its inverse is the resolution. An eighth of the record by default.
+        Length of a segment [s]. Its inverse is the resolution. None: an eighth of the record.
     overlap : float
         Fraction of a segment that overlaps with the next one, from 0 to below 1.
     window : str or tuple
-        Window as for `scipy.signal.get_window`; "boxcar" where all signals are periodic in a
+        Window as for `scipy.signal.get_window`. Use "boxcar" if all signals are periodic in a
         segment.
 
     References
@@ -62,8 +62,8 @@ class H1Estimator(SpectralMethod):
 class H2Estimator(SpectralMethod):
     """The estimator H2, ``G = S_yy S_uy^-1``, for noise on the inputs.
 
-    It needs as many outputs as inputs; with one input, each output is estimated separately. The
-    spectra are named as in `H1Estimator`.
+    It needs as many outputs as inputs. With one input, each output is estimated separately, so that
+    any number of outputs is possible. The spectra are named as in `H1Estimator`.
 
     Parameters
     ----------
@@ -81,14 +81,13 @@ class HvEstimator(SpectralMethod):
     """The estimator Hv, for noise on inputs and outputs: total least squares.
 
     At each frequency every output is fitted together with all inputs. Before the fit, each of these
-    signals is scaled to unit power.
-    For one input the magnitude is the geometric mean of those of H1 and H2.
+    signals is scaled to unit power. For one input, the magnitude of the estimate is the geometric
+    mean of the magnitudes of H1 and H2.
 
     Parameters
     ----------
     segment, overlap, window : optional
-        Length of the segments, their overlap and their window, as for `H1Estimator`. The
-        reference is the same too.
+        Length of the segments, their overlap and their window, as for `H1Estimator`.
 
     Examples
     --------

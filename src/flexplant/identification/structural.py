@@ -35,56 +35,58 @@ def structural_modes(
 ) -> Modes:
     r"""Return identified modes as modes of a structure for `assemble_plant`.
 
-    The fit is :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`, see
-    `IdentifiedModes`. Its shapes are mass-normalised at a place where the machine was both driven
-    and measured. The modes of the structure are:
+    `IdentifiedModes` describes the fit
+    :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`. Its shapes are mass-normalised
+    at a place where the machine was both driven and measured. The modes of the structure have three
+    parts:
 
-    - shapes :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
-      :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, and the mean of both
-      at places that are output and input;
-    - the remainder E(s), approximated in the band by
-      :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)`. A gives the rigid-body modes,
-      :math:`\Phi_r \Phi_r^T = A`, as combinations of the rigid-body motions of the geometry. G
-      gives residual vectors v, :math:`v v^T/\omega_v^2 = G`, with a
-      frequency :math:`\omega_v` above the band. The index c denotes the places that were both
-      driven and measured, and o the other places. Between two places of the kind o, the value is
-      :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`;
-    - modes just outside the band. They become residual vectors too, with their frequency and
-      damping, if they are modes of a structure: their shapes are real, and the shapes at inputs
-      and outputs agree.
+    - Elastic modes with the identified poles. Their shapes are
+      :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
+      :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs. At a place that is both
+      output and input, the mean of the two is used.
+    - Rigid-body modes and residual vectors, which represent the remainder E(s). In the band, E(s)
+      is approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)`. The rigid-body modes
+      satisfy :math:`\Phi_r \Phi_r^T = A` and are combinations of the rigid-body motions of the
+      geometry. The residual vectors v satisfy :math:`\sum v v^T/\omega_v^2 = G`. Their frequency
+      :math:`\omega_v` lies above the band. Some entries of G are not measured, since c denotes the
+      places that were both driven and measured, and o the other places. Between two places o,
+      :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}` is assumed.
+    - Modes just outside the band. They become residual vectors with their own frequency and damping
+      if they can be modes of a structure. For this, their shapes must be real, and the shapes at
+      inputs and outputs must agree.
 
     Parameters
     ----------
     measured : IdentifiedModes
         Result of `identify_modes(frf, dofs={channel: label})`.
     dofs : DofSet
-        DOFs of the labels. POIs at other places need shapes between these:
-        ``interpolated(DofSet(...))``.
+        DOFs of the labels. Points of interest at other places need an interpolation between them,
+        for example ``interpolated(DofSet(...))``.
     over : Modes, optional
         Modes of a model of the same structure, at most as many as measured places. The measured
-        shapes psi are expanded to all DOFs of the model, ``phi = Phi Phi_a^+ psi``. Phi holds the
+        shapes psi are expanded to all DOFs of the model by ``phi = Phi Phi_a^+ psi``. Phi holds the
         shapes of the model at all its DOFs, Phi_a those at the measured DOFs, and ^+ denotes the
-        pseudo-inverse (SEREP, the system equivalent reduction expansion process). POIs may then be
-        anywhere on the model.
+        pseudo-inverse. This is SEREP, the system equivalent reduction expansion process. Points of
+        interest may then be anywhere on the model.
     rigid : bool
-        Whether the term in 1/s^2 is rigid-body motion. False for a held structure.
+        Whether the term in 1/s^2 represents rigid-body modes. False: the structure is held.
 
     Returns
     -------
     Modes
-        Modes of the structure, rigid-body modes first. `certificate` contains the size of the
-        neglected imaginary parts ("imaginary") and, with `over`, the relative error of the
-        expansion of measured shapes in modes of the model ("expansion"); above 0.1 a warning is
-        given. ``plant.uncertain(numbered(measured, modes))`` passes the covariance of the poles to
-        the plant. The covariance of the shapes is passed by a further argument,
-        ``Shapes(shape_deviations(measured, dofs), measured.modes)``.
+        Modes of the structure, rigid-body modes first. The entry "imaginary" of `certificate` is
+        the size of the neglected imaginary parts. With `over`, its entry "expansion" is the
+        relative error of the measured shapes as combinations of the model's shapes. A warning is
+        given if this error is above 0.1. ``plant.uncertain(numbered(measured, modes))`` passes the
+        covariance of the poles to the plant. A further argument passes the covariance of the
+        shapes, ``Shapes(shape_deviations(measured, dofs), measured.modes)``.
 
     Raises
     ------
     ModelError, LabelError
-        When the scale of shapes is not known, the term in 1/s^2 is not that of a body with positive
-        inertia, `over` has more modes than there are measured places, or a channel is not in
-        `dofs`.
+        When the scale of shapes is not known, `over` has more modes than there are measured places,
+        or a channel is not in `dofs`. Also when the term in 1/s^2 does not belong to a body with
+        positive inertia.
 
     References
     ----------
@@ -328,31 +330,33 @@ def shape_deviations(
 ) -> FloatArray:
     r"""Return the principal standard deviations of shapes from `structural_modes`.
 
-    The error n of a mode's identified shape and participation causes the error :math:`A n` of the
-    mode shape. The matrix A takes the mean at places that were both driven and measured, and
-    expands over the modes of a model if they are given. The noise is assumed circular: real and
-    imaginary parts have the same variance and are not correlated. The real part of the error then
-    has the covariance :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The vectors
-    v_j are the eigenvectors of C, scaled by the square roots of their eigenvalues. The largest v_j
-    are kept and scaled so that the sum of all variances is preserved.
+    The identified shape and participation vector of a mode have the error n. The mode shape then
+    has the error :math:`A n`. The matrix A takes the mean at places that were both driven and
+    measured. If the modes of a model are given, A also expands the shape to all its DOFs. The noise
+    is assumed circular: real and imaginary parts have the same variance and are not correlated. The
+    real part of the error then has the covariance
+    :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The vectors v_j are the
+    eigenvectors of C, scaled by the square roots of their eigenvalues. The largest v_j are kept and
+    scaled so that the sum of all variances is preserved.
 
     Parameters
     ----------
     measured, dofs, over
         As for `structural_modes`.
     count : int
-        Number of directions kept for each mode; independent sensor noise needs one for each place
-        to be represented exactly.
+        Number of vectors v_j that are kept for each mode. If the noise of the sensors is
+        independent, the covariance is exact only with one vector for each place.
 
     Returns
     -------
     (m, n, count) array
-        v_j over the DOFs of the modes: ``plant.uncertain(measured, Shapes(...))``.
+        Vectors v_j of m modes at n DOFs, for ``plant.uncertain(measured, Shapes(...))``.
 
     Raises
     ------
     ModelError, LabelError
-        As for `structural_modes`; or when the covariance of the shapes is not known.
+        In the same cases as for `structural_modes`. Also when the covariance of the shapes is not
+        known.
 
     Examples
     --------
