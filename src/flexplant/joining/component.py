@@ -162,6 +162,8 @@ class PlacedShape(Interpolation):
 
     Examples
     --------
+    The second beam is shifted to the end of the first one. Its own shape functions stay the same:
+
     >>> import flexplant as fx
     >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
@@ -225,11 +227,13 @@ class JoinedShape(Interpolation):
         Matrix that computes the DOFs of all components from the n DOFs of the machine. None: the
         joints removed no DOF.
     motions : (n_all, k) array, optional
-        All motions that a reduced machine can make, one in each column. They show whether the
-        places of two components at one point move together.
+        All motions that a reduced machine can make, one in each column. They show whether two
+        components that share a point move together there.
 
     Examples
     --------
+    The free end of the second beam is found by its coordinates in the machine:
+
     >>> import flexplant as fx
     >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
@@ -326,6 +330,8 @@ class Pose(Value):
 
     Examples
     --------
+    A component is rotated by 90 degrees about z and shifted along x:
+
     >>> pose = Pose(shift=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, np.pi / 2))
     >>> pose.points([[0.5, 0.0, 0.0]])
     array([[1. , 0.5, 0. ]])
@@ -360,11 +366,11 @@ class Pose(Value):
         return f"<Pose at ({place}) m, turned by {angle:.4g} degrees>"
 
     def points(self, xyz: Any) -> FloatArray:
-        """Return the coordinates in the machine of points (n, 3) [m] of the component."""
+        """Return machine coordinates of points (n, 3) [m] that are given in the component's."""
         return np.asarray(real_array(xyz, "xyz", (None, 3)) @ self.rotation.T + self.shift)
 
     def own_points(self, xyz: FloatArray) -> FloatArray:
-        """Return the coordinates in the component of points (n, 3) [m] of the machine."""
+        """Return component coordinates of points (n, 3) [m] that are given in the machine's."""
         return np.asarray((xyz - self.shift) @ self.rotation)
 
     def own_ground(self) -> FloatArray:

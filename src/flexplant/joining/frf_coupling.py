@@ -161,9 +161,9 @@ def uncoupled(
         output and an input. This is the channel of the component. If the joint is rigid, it may
         also be the channel at the other end.
     known : mapping {str: Frf}
-        Components to remove, at the same frequencies.
+        Responses of the components to remove, by name, at the same frequencies.
     joints : Joint or sequence of Joint
-        Joints between these components and the rest.
+        Joints between these components and the remainder.
     dofs : mapping {str: DofSet}, optional
         Positions of the channels of components. They are needed for patches and for joints with
         lever arms.
@@ -196,6 +196,8 @@ def uncoupled(
 
     Examples
     --------
+    Two free masses are joined. Without the frame, the stage responds as before:
+
     >>> f = np.array([10.0, 20.0])
     >>> free = lambda m: Frf(f, -1 / (m * (2 * np.pi * f) ** 2)[None, None], ["1:x"], ["1:x"])
     >>> both = {"stage": free(2.0), "frame": free(3.0)}

@@ -79,10 +79,10 @@ def joined(
         Joints between the components. If a rigid joint makes two DOFs equal, the machine usually
         keeps the DOF of the component that is listed first.
     placed : mapping {str: Pose}, optional
-        Poses of components in the machine. None: no component is moved. The result has the labels
-        and the coordinates of the machine.
+        Poses of components in the machine. None: no component is moved. The coordinates and
+        directions of the result are those of the machine.
     name : str, optional
-        Name of an FEModel, for display.
+        Name of the result, if it is an FEModel, as it is printed.
     dofs : mapping {str: DofSet}, optional
         Positions of the nodes of measured components, in the coordinates of the machine. Patches
         and joints with lever arms need them. The mean motion of a `Patch` is computed from the
@@ -125,6 +125,8 @@ def joined(
 
     Examples
     --------
+    A rigid joint makes the first masses of two chains one mass:
+
     >>> from flexplant.structure import chain
     >>> stage, frame = chain(masses=[1, 2], stiffnesses=[5]), chain(masses=[3, 4], stiffnesses=[6])
     >>> machine = joined({"stage": stage, "frame": frame}, Joint("stage/1:x", "frame/1:x"))
@@ -497,7 +499,7 @@ class JoiningReport(Value):
         Largest relative difference between the inertia of the machine in the six rigid-body motions
         and the sum over its components.
     constraints, rank : int
-        Number of axes of all rigid joints, and number of those that are independent of each other.
+        Number of axes of all rigid joints, and number of these axes that are independent.
     rigid : mapping {str: int}
         Number of rigid-body motions of each component before joining.
     pieces : mapping {str: int}
@@ -516,6 +518,8 @@ class JoiningReport(Value):
 
     Examples
     --------
+    Two chains that are joined rigidly have one rigid-body motion:
+
     >>> import flexplant as fx
     >>> parts = {n: fx.chain(masses=[1.0, 2.0], stiffnesses=[5e5]) for n in ("stage", "frame")}
     >>> found = fx.joined(parts, fx.joining.Joint("stage/1:x", "frame/1:x")).joining

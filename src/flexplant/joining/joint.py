@@ -36,8 +36,9 @@ class Joint(Value):
         point ``("stage", (x, y, z))`` in the coordinates of the machine, or a patch of nodes.
         Without `second`, a spring or damper acts against the ground.
     axes : sequence of str, optional
-        Joined axes among x, y, z, rx, ry, rz, in the directions of the machine. None: the axis of a
-        DOF, or the axes of both ends where these are the same.
+        Axes along which the ends are joined, among x, y, z, rx, ry, rz, in the directions of the
+        machine. None: the axis of the DOF if an end is a DOF, otherwise the axes of both ends,
+        which must be the same.
     stiffness : float or one for each axis [N/m, N m/rad], optional
         Stiffness of the spring. It is negative where the ends attract each other, as magnets do.
     rate : float or one for each axis [N s/m, N m s/rad], optional
@@ -51,6 +52,8 @@ class Joint(Value):
 
     Examples
     --------
+    A rigid joint between two components, and a spring with a damper to the ground:
+
     >>> Joint("stage/41:z", "frame/7:z")
     <Joint stage/41:z - frame/7:z, rigid>
     >>> Joint("stage/41:z", stiffness=1e5, rate=20.0)
@@ -107,7 +110,7 @@ class Joint(Value):
         return self.stiffness is None and self.rate is None
 
     def values(self, axes: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return the stiffness and the rate along each of some axes (k,)."""
+        """Return the stiffness (k,) and the rate (k,) of the joint along k given axes."""
         axes = name_list(axes, "axes")
         found = []
         for value, name in ((self.stiffness, "stiffness"), (self.rate, "rate")):
@@ -180,6 +183,8 @@ class Patch(Value):
 
     Examples
     --------
+    A spring connects the mean motion of the lower plate with a node of the upper one:
+
     >>> import flexplant as fx
     >>> size, mesh = {"size": (0.2, 0.2), "thickness": 0.01}, {"elements": (2, 2)}
     >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}

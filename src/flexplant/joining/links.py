@@ -191,6 +191,8 @@ def coincident_joints(
 
     Examples
     --------
+    The first nodes of both chains are at the origin and are joined:
+
     >>> from flexplant.structure import chain
     >>> stage, frame = chain(masses=[1, 2], stiffnesses=[5]), chain(masses=[3, 4], stiffnesses=[6])
     >>> coincident_joints({"stage": stage, "frame": frame}, box=[(0, 0, 0), (0, 0, 0)])

@@ -430,7 +430,7 @@ class Modes(Placed, Value):
         return np.concatenate([self.zeta, self.vector_zeta])
 
     def select(self, columns: Sequence[int] | IntArray) -> Modes:
-        """Return some of the modes, without the attachment vectors; `columns` count from 0.
+        """Return the modes at the positions `columns` (from 0), without the attachment vectors.
 
         Raises
         ------
@@ -448,10 +448,10 @@ class Modes(Placed, Value):
         )
 
     def calibrated(self, measured: Any) -> Modes:
-        """Return the modes with measured frequencies and damping ratios; the shapes stay.
+        """Return the modes with measured frequencies and damping ratios and the same shapes.
 
-        The relative error of a measured frequency is typically 1e-5 to 1e-4. That of a frequency of
-        a finite-element model is 1e-3 to 1e-2, while its shapes are much more accurate.
+        Measured frequencies have relative errors of 1e-5 to 1e-4, and those of a finite-element
+        model typically 1e-3 to 1e-2. The shapes of the model are much less affected by its errors.
 
         Parameters
         ----------
@@ -481,17 +481,17 @@ class Modes(Placed, Value):
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
         """Return the frequency errors of the mesh by Richardson extrapolation.
 
-        Errors are proportional to the element size to the power `order`. This mesh has elements r
-        times as large as the finer mesh. If a mode has the frequency f here and f_fine there, it is
-        ``f_fine + (f_fine - f) / (r^order - 1)`` for an infinitely fine mesh. Errors that both
-        meshes share (missing shear or mass, wrong material) are not found.
+        Errors are proportional to the element size to the power `order`. The elements of this mesh
+        are r times as large as those of the finer mesh. A mode with the frequencies f here and
+        f_fine there has ``f_fine + (f_fine - f) / (r^order - 1)`` in an infinitely fine mesh.
+        Errors that both meshes share (missing shear or mass, wrong material) are not found.
 
         Parameters
         ----------
         finer : Modes
             Modes of the same structure with smaller elements, for example half as large.
         order : float
-            Order of convergence; 2 for plates and for bricks of eight nodes.
+            Order of convergence. It is 2 for plates and for bricks of eight nodes.
 
         Raises
         ------
@@ -516,7 +516,7 @@ class Modes(Placed, Value):
             Modes of the same structure with larger elements, for example 1.5 or 2 times as large.
             Solve a few more of them than of this mesh, so that each mode here finds a partner.
         order : float
-            Order of convergence; 2 for plates and for bricks of eight nodes.
+            Order of convergence. It is 2 for plates and for bricks of eight nodes.
 
         Raises
         ------
@@ -546,9 +546,9 @@ class Modes(Placed, Value):
     def orthonormal_basis(self) -> FloatArray:
         """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
-        For complex modes, B is found without M. ``B B'`` is the initial acceleration per force, a
-        sum over the modes. An elastic mode adds ``Re(phi phi' lambda / (i Im lambda))``, a rigid
-        one ``phi phi'`` and an unstable one ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` (`NormalForm`).
+        For complex modes, B is found without M: ``B B'`` is the initial acceleration under a unit
+        force, a sum over the modes. Elastic modes add ``Re(phi phi' lambda / (i Im lambda))``,
+        rigid ones ``phi phi'``, unstable ones ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)

@@ -51,6 +51,8 @@ class NormalForm(Value):
 
     Examples
     --------
+    Damping that is proportional to the stiffness gives real shapes:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], dampings=[8.0])
     >>> M, D, K = (part.toarray() for part in (model.M, model.D, model.K))
@@ -128,7 +130,7 @@ def normal_form(
         Symmetric matrices of mass, damping and stiffness. M is positive definite. D may be None,
         for no damping.
     rigid : (n, r) array
-        Independent vectors with ``K rigid = 0`` (up to rounding); (n, 0) for a held structure.
+        Independent vectors with ``K rigid = 0`` (up to rounding). A held structure has (n, 0).
     motions : function, optional
         Function without arguments that returns the M-orthonormal rigid-body motions (n, m) of the
         geometry, including those that springs hold. K may have negative eigenvalues only for these
@@ -158,6 +160,8 @@ def normal_form(
 
     Examples
     --------
+    Two masses with a spring and a damper have a rigid-body mode and a damped elastic mode:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], dampings=[8.0])
     >>> M, D, K = (part.toarray() for part in (model.M, model.D, model.K))

@@ -106,8 +106,8 @@ def solve_modes(
     Raises
     ------
     ModelError
-        When the request does not fit the model, when K is negative for a motion that deforms the
-        structure, or when a motion without elastic energy is not a rigid-body motion.
+        When an argument does not fit the model, when a deformation of the structure has negative
+        elastic energy, or when a motion without elastic energy is not a rigid-body motion.
     SolverError
         When a check of the modes fails.
 
@@ -123,6 +123,8 @@ def solve_modes(
 
     Examples
     --------
+    Modes of a free plate, with an attachment vector at a corner:
+
     >>> from flexplant.structure import kirchhoff_plate
     >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8), density=2702,
     ...                         youngs_modulus=70e9, poisson_ratio=0.35)

@@ -311,6 +311,8 @@ def static_response(model: Any, loads: FloatArray) -> FloatArray:
 
     Examples
     --------
+    Two opposite forces compress the spring between two free masses:
+
     >>> import numpy as np
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])

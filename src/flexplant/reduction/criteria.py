@@ -33,6 +33,8 @@ class SelectionCriterion(Value):
 
     Examples
     --------
+    The library's criteria are instances of this class:
+
     >>> import flexplant as fx
     >>> isinstance(fx.reduction.Greedy(), fx.reduction.SelectionCriterion)
     True
@@ -63,6 +65,8 @@ class PivotedQr(SelectionCriterion):
 
     Examples
     --------
+    The two ends of a chain distinguish its first two modes best:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> fx.select_dofs(modes, 2, criterion=fx.reduction.PivotedQr()).labels
@@ -80,7 +84,7 @@ class PivotedQr(SelectionCriterion):
         return [int(i) for i in la.qr(pool.T, mode="r", pivoting=True)[1][:count]]
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return the length of each row beyond the span of those before it."""
+        """Return the length of the part of each row that is orthogonal to all rows before it."""
         return np.abs(np.diag(la.qr(rows.T, mode="r")[0]))
 
 
@@ -100,6 +104,8 @@ class EffectiveIndependence(SelectionCriterion):
 
     Examples
     --------
+    The two ends of a chain distinguish its first two modes best:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> fx.select_dofs(modes, 2, criterion=fx.reduction.EffectiveIndependence()).labels
@@ -152,13 +158,15 @@ def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Greedy(SelectionCriterion):
-    """Choice of one DOF after the other, each to make the smallest singular value largest.
+    """Choice of one DOF after the other, each for the largest value of the criterion.
 
-    The singular values are those of phi_kk, which holds the rows of the modes at the chosen DOFs.
-    The value of a DOF is the smallest singular value directly after this DOF was chosen.
+    The criterion is the smallest singular value of phi_kk, which holds the rows of the modes at the
+    chosen DOFs. The value of a DOF is the criterion directly after this DOF was chosen.
 
     Examples
     --------
+    The two ends of a chain distinguish its first two modes best:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> fx.select_dofs(modes, 2, criterion=fx.reduction.Greedy()).labels
@@ -219,6 +227,8 @@ class DofSelection(Value):
 
     Examples
     --------
+    Two DOFs are chosen for two modes:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> fx.select_dofs(modes, 2).labels
@@ -264,11 +274,11 @@ def select_dofs(
         Number of DOFs, at most the number of modes plus the number of attachment vectors. With
         exactly this sum, `DesiredDofs` keeps all modes. With fewer DOFs, it keeps fewer modes.
     candidates : iterable of str, optional
-        Labels to choose from; None: all displacements (no rotations).
+        Labels to choose from. None: all displacements, but no rotations.
     required : iterable of str
         DOFs that are kept in any case.
     criterion : PivotedQr, EffectiveIndependence or Greedy, optional
-        Criterion of the choice; None: `PivotedQr`.
+        Criterion of the choice. None: `PivotedQr`.
     limit : float
         Largest accepted condition number of phi_kk.
 
@@ -279,6 +289,8 @@ def select_dofs(
 
     Examples
     --------
+    Two corners are required, and the third DOF is chosen among three candidates:
+
     >>> from flexplant.structure import kirchhoff_plate
     >>> from flexplant.modes import solve_modes
     >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,

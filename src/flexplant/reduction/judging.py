@@ -346,10 +346,10 @@ class ReductionQuality(Value):
     modes : (m,) array of int
         Numbers of the full model's modes that are compared.
     full_freq, freq : (m,) arrays [Hz]
-        Frequencies of these modes, and of the reduced modes that are paired with them one to one,
-        by shape and frequency. NaN where no reduced mode has a MAC of at least 0.5.
+        Frequencies of these modes in the full model, and in the reduced model. Modes are paired one
+        to one, by shape and frequency. NaN: no reduced mode has a MAC of at least 0.5 with it.
     freq_error : (m,) array
-        Relative error of each frequency; 0 for rigid-body modes, NaN without a partner.
+        Relative error of each frequency. It is 0 for rigid-body modes and NaN without a partner.
     mac : (m,) array
         Modal assurance criterion (MAC) of each full mode and its reduced mode, with the mass matrix
         as weight for an FEModel: 1 for equal shapes, 0 for orthogonal ones. The shapes of repeated
@@ -382,10 +382,10 @@ class ReductionQuality(Value):
         ``sqrt(G_ii G_jj)``. If this root is only rounding, the error is relative to the responses
         of both places at the upper end of the band.
     true_error : float [m/N]
-        Largest singular value of the error of the response at the check frequencies.
+        Largest singular value of the error of the response, over the check frequencies.
     orthogonality : float
-        Departure of the expanded reduced modes from M-orthonormality. NaN where the full structure
-        is given by Modes.
+        Deviation of the expanded reduced modes from M-orthonormality. NaN: the full structure was
+        given by Modes.
     condition : float
         Condition number of the matrix that the method inverted.
     inputs, outputs : sequence of str
@@ -394,16 +394,18 @@ class ReductionQuality(Value):
         Method by which the full responses were computed.
     full_error : float
         Difference between these responses and direct solutions with the full matrices, relative to
-        the peak. NaN where the full structure is given by Modes.
+        the peak. NaN: the full structure was given by Modes.
     bound : ErrorBound, optional
         Bound of the error, computed by the reduction method without responses. None if the method
         has no bound for these channels.
     bounded : bool
-        Whether the bound covers all compared modes. The bound of a reduction of some modes does not
-        hold for the other modes of the model.
+        Whether the bound covers all compared modes. If a reduction started from some modes of the
+        structure, its bound does not include the other modes.
 
     Examples
     --------
+    Three of four modes are kept. They are exact, and mode 4 has no partner:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
     >>> small = fx.reduce(model, fx.reduction.ModalTruncation(3))

@@ -29,10 +29,11 @@ from .reduced import ReducedModel
 class Krylov(ReductionMethod):
     """Second-order rational Krylov reduction, which matches the response at given frequencies.
 
-    The response to the inputs is X(s) = (s^2 M + s D + K)^-1 B with s = 2 pi i f. At each given
-    frequency f, X and its first `moments` - 1 derivatives with respect to s are computed. Their
-    real and imaginary parts, together with the rigid-body motions, span the basis T. T is
-    orthonormal in M, so that M* is the unit matrix. The coordinates are "krylov 1", ...
+    The response to the inputs is ``X(s) = (s^2 M + s D + K)^-1 B`` with ``s = 2 pi i f``. At each
+    given frequency f, X and its first `moments` - 1 derivatives with respect to s are computed.
+    Their real and imaginary parts, together with the rigid-body motions, span the columns of T.
+    These are M-orthonormal, so that the reduced mass matrix is the unit matrix. The coordinates are
+    named "krylov 1", "krylov 2" and so on.
 
     A moment is a coefficient of the Taylor series of the response at s. From the inputs to any
     place, the first `moments` coefficients agree with those of the full model. If the output is at
@@ -60,6 +61,8 @@ class Krylov(ReductionMethod):
 
     Examples
     --------
+    The response is matched at two frequencies, with the rigid-body motion in addition:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> fx.reduce(model, fx.reduction.Krylov(["1:x"], freq=[50.0, 150.0])).n_dof

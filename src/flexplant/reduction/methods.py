@@ -153,6 +153,8 @@ def projected_model(
 
     Examples
     --------
+    With T = I, the reduced model is the full model:
+
     >>> import numpy as np
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
@@ -218,6 +220,8 @@ class ReductionMethod(Value):
 
     Examples
     --------
+    The library's methods are instances of this class:
+
     >>> import flexplant as fx
     >>> isinstance(fx.reduction.Guyan(["1:x"]), fx.reduction.ReductionMethod)
     True
@@ -234,15 +238,15 @@ class ReductionMethod(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DesiredDofs(ReductionMethod):
-    """Modal reduction in desired physical DOFs (paper, eq. (6) to (8)).
+    """Modal reduction in desired physical DOFs (equations (6) to (8) of [paper]_).
 
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
-        Labels of the kept DOFs. Their number is that of the modes plus that of the attachment
-        vectors. Without attachment vectors it may be smaller. The same number of lowest modes is
-        then kept, and the model stores the other modes as `truncated`. For an FEModel, the number
-        of modes that are solved is that of the labels minus that of the places in `static_at`.
+        Labels of the kept DOFs. There must be one for each mode and each attachment vector. Without
+        attachment vectors there may be fewer. The same number of lowest modes is then kept, and the
+        model stores the other modes as `truncated`. For an FEModel, the method solves for as many
+        modes as there are labels, minus the number of places in `static_at`.
     static_at : place or sequence of places
         Places where attachment vectors keep the static compliance of truncated modes. Only for an
         FEModel, since `Modes` already contain their attachment vectors.
@@ -255,6 +259,8 @@ class DesiredDofs(ReductionMethod):
 
     Examples
     --------
+    Two modes are kept in a model of two DOFs:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> fx.reduce(modes, fx.DesiredDofs(["1:x", "3:x"])).dofs.labels
@@ -369,8 +375,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     Parameters
     ----------
     model : FEModel or Modes
-        The structure. Every method accepts an `FEModel`. `DesiredDofs`, `ModalTruncation` and
-        `ModalBalanced` need no matrices and accept the `Modes` of `solve_modes` too.
+        Structure to reduce. Every method accepts an `FEModel`. `DesiredDofs`, `ModalTruncation` and
+        `ModalBalanced` need no matrices, and also accept the `Modes` of `solve_modes`.
     method : ReductionMethod
         Reduction method: `DesiredDofs` (the paper), `ModalTruncation`, `ModalBalanced`, `Guyan`,
         `Irs`, `Serep`, `CraigBampton`, `Rubin`, `MacNeal` or `Krylov`.
@@ -395,6 +401,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
 
     Examples
     --------
+    A plate is reduced to five of its DOFs by static condensation:
+
     >>> from flexplant.structure import kirchhoff_plate
     >>> from flexplant.reduction import Guyan
     >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,

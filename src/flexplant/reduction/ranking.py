@@ -42,8 +42,8 @@ class ModeRanking(Value):
     freq : (m,) array [Hz]
         Frequencies of the modes.
     values : (m, p, q) array [m/N]
-        Modal Hankel values of each mode from each of q inputs to each of p outputs,
-        ``|c b| / (4 zeta omega^2)``.
+        Modal Hankel values ``|c b| / (4 zeta omega^2)`` of m modes from q inputs to p outputs. They
+        are approximate Hankel singular values of a single mode.
     total : (m,) array [m/N]
         Modal Hankel values of all channels together, ``||c|| ||b|| / (4 zeta omega^2)``.
     peak : (m,) array [m/N]
@@ -57,6 +57,8 @@ class ModeRanking(Value):
 
     Examples
     --------
+    In mode 2, the middle mass is at rest, so that mode 3 is more important:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
@@ -112,7 +114,7 @@ def rank_modes(
     Parameters
     ----------
     modes : Modes
-        Real and damped modes; attachment vectors are ignored.
+        Real and damped modes. Attachment vectors are ignored.
     inputs, outputs : place or sequence of places
         Places of forces and displacements: DOF labels, points (z) or mappings. Without `outputs`,
         the displacements are taken at the inputs.
@@ -128,6 +130,8 @@ def rank_modes(
 
     Examples
     --------
+    From one end of a chain to the other, mode 2 is more important than mode 3:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
@@ -217,6 +221,8 @@ class ErrorBound(Value):
 
     Examples
     --------
+    Bound of the error when the third mode of a chain is truncated:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> light = fx.ModalDamping(0.01)

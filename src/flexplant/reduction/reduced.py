@@ -83,7 +83,7 @@ class ReducedModel(Value):
     joint_motions : (k, m) array, optional
         Rigid motions of the components of a joined machine, as far as its joints allow them.
     joining : Value, optional
-        Record of how a machine was joined, with its checks; None after an update.
+        Record of how a machine was joined, with its checks. None after an update.
     calibration : MeasuredModes, optional
         Measured poles that `calibrated` used, if it was called.
     machines : Machines, optional
@@ -95,6 +95,8 @@ class ReducedModel(Value):
 
     Examples
     --------
+    The two ends of a chain move in opposite directions, and the middle mass stays at rest:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
     >>> small = fx.reduce(modes, fx.DesiredDofs(["1:x", "3:x"]))
@@ -271,10 +273,10 @@ class ReducedModel(Value):
         return model, follow, flexibility
 
     def calibrated(self, measured: Any) -> ReducedModel:
-        """Return the model with the measured poles of some modes; the shapes stay.
+        """Return the model with the measured poles of some modes and the same shapes.
 
         The new stiffness is ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, with the measured
-        frequencies omega_m; D* changes in the same way. Truncated modes do not change, and
+        frequencies omega_m. D* changes in the same way. Truncated modes do not change, and
         rigid-body modes stay at 0.
 
         Parameters
@@ -288,7 +290,8 @@ class ReducedModel(Value):
             When `measured` has no numbers, a number is not that of an elastic mode, or the model
             has massless coordinates or unstable modes (magnets).
         SolverError
-            When damping couples the modes too much.
+            When the damping couples the modes so strongly that changes of the single modes do not
+            lead to the measured poles.
         """
         if self.massless.size or self.n_unstable:
             raise ModelError(

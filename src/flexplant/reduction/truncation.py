@@ -59,15 +59,18 @@ class ModalTruncation(ReductionMethod):
 
     With an FEModel and one damping ratio for all modes, the bound covers all modes of the
     structure, including modes that were not solved. By the Cauchy-Schwarz inequality the sum is at
-    most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``. B and C hold the places of
-    inputs and outputs, and G is the residual flexibility, from one static solution. With
-    `static_at`, the peaks of the attachment vectors are added.
+    most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``. The columns of B are unit
+    forces at the inputs, the rows of C give the displacements at the outputs, and G is the residual
+    flexibility of the truncated modes from a static solution. With `static_at`, the peaks of the
+    attachment vectors are added.
 
     `ErrorBound.below` gives a bound for the frequencies up to a limit. Modes above the limit are
     far from their peaks there, so that this bound is often smaller by orders of magnitude.
 
     Examples
     --------
+    The first two modes of a chain of three masses are kept:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> fx.reduce(model, fx.reduction.ModalTruncation(2)).modes().freq.round(2)
@@ -186,6 +189,8 @@ class ModalBalanced(ReductionMethod):
 
     Examples
     --------
+    The rigid-body mode and the most important elastic mode are kept:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> method = fx.ModalBalanced(2, inputs=["1:x"], damping=fx.ModalDamping(0.01))
