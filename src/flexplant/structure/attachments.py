@@ -48,6 +48,8 @@ class PointMass(Value):
 
     Examples
     --------
+    A mass of 3 kg is added to the second mass of a chain:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
     >>> model.with_parts(fx.PointMass("2:x", 3.0)).M.toarray()
@@ -103,12 +105,14 @@ class Spring(Value):
         motions unstable. `solve_modes` and `assemble_plant` accept such a model. They refuse a
         model in which a deformation of the structure is unstable.
     direction : str
-        Direction of the motion at a point: x, y, z, rx, ry, rz. Not used for a DOF label.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. A DOF label has its own direction.
     to : place, optional
-        The other end; by default the ground.
+        Place of the other end. None: the ground.
 
     Examples
     --------
+    A spring to the ground is added to the first mass of a chain:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
     >>> model.with_parts(fx.Spring("1:x", 50.0)).K.toarray()
@@ -137,16 +141,18 @@ class Damper(Value):
     at : str, (3,) array [m] or mapping
         One end: a DOF label, a point, or a mapping of DOF labels to weights.
     rate : float [N s/m or N m s/rad]
-        Force per velocity, not negative.
+        Damping, which is the force per velocity. It must not be negative.
     direction : str
-        Direction of the motion at a point: x, y, z, rx, ry, rz. Not used for a DOF label.
+        Direction of the motion at a point: x, y, z, rx, ry, rz. A DOF label has its own direction.
     to : place, optional
-        The other end; by default the ground. A damper to the ground also damps rigid-body motions.
-        `solve_modes` refuses a model with damped rigid-body motions, so hold such a structure by
-        springs as well. `assemble_plant` accepts it, with dense matrices.
+        Place of the other end. None: the ground. A damper to the ground also damps rigid-body
+        motions, which `solve_modes` refuses unless springs to the ground hold these motions too.
+        `assemble_plant` accepts such a model, with dense matrices.
 
     Examples
     --------
+    A damper connects the two masses of a chain:
+
     >>> import flexplant as fx
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
     >>> model.with_parts(fx.Damper("1:x", 2.0, to="2:x")).D.toarray()
@@ -182,6 +188,8 @@ class HeldShape(Interpolation):
 
     Examples
     --------
+    The first node of a beam is clamped, so that four of six DOFs remain:
+
     >>> import flexplant as fx
     >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)

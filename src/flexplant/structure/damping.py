@@ -33,6 +33,8 @@ class Damping(Value):
 
     Examples
     --------
+    The library's damping laws are instances of this class:
+
     >>> import flexplant as fx
     >>> isinstance(fx.ModalDamping(0.01), fx.structure.Damping)
     True
@@ -75,6 +77,8 @@ class ModalDamping(Damping):
 
     Examples
     --------
+    The same ratio for all elastic modes, and given ratios for the first two modes:
+
     >>> ModalDamping(0.01).zeta([0.0, 1500.0])
     array([0.  , 0.01])
     >>> ModalDamping([0.0, 0.02], others=0.01).zeta([0.0, 1500.0, 2000.0])
@@ -109,7 +113,7 @@ class ModalDamping(Damping):
         Parameters
         ----------
         poles : (k,) complex array [rad/s], or MeasuredModes
-            Measured poles, of either sign of the imaginary part.
+            Measured poles, with either sign of the imaginary part.
         modes : (k,) sequence of int
             Mode number of each pole in the model, counted from 1 with rigid-body modes.
             MeasuredModes contain the numbers.
@@ -187,9 +191,9 @@ class Rayleigh(Damping):
     beta : float [s]
         Factor of the stiffness-proportional damping.
     rigid : bool
-        Whether alpha damps rigid-body motions too in ``FEModel.with_damping``; D is then exactly
-        ``alpha M + beta K``. `assemble_plant` accepts such a model, with dense matrices.
-        `solve_modes` refuses it, since it computes undamped rigid-body modes only.
+        Whether alpha also damps rigid-body motions. D is then exactly ``alpha M + beta K``. Only
+        ``FEModel.with_damping`` uses it. `assemble_plant` accepts the resulting model, with dense
+        matrices. `solve_modes` refuses it, since it computes undamped rigid-body modes only.
 
     References
     ----------
@@ -197,6 +201,8 @@ class Rayleigh(Damping):
 
     Examples
     --------
+    Damping ratios of a rigid-body mode and of a mode at 100 rad/s:
+
     >>> Rayleigh(alpha=2.0, beta=0.0).zeta([0.0, 100.0])
     array([0.  , 0.01])
     """

@@ -46,12 +46,12 @@ class ModelCheck(Value):
     grounded : tuple of str
         Directions in which the structure is held.
     n_rigid : int
-        Number of independent rigid-body motions in which the structure is free, combinations of
-        directions included.
+        Number of independent rigid-body motions in which the structure is free. These may be
+        combinations of directions.
     n_zero : int
         Number of independent motions q without elastic energy, ``K q = 0``.
     mechanisms : tuple of tuple of str
-        For each zero-energy motion that is not a rigid-body motion, the DOFs that move most.
+        DOFs that move most in each zero-energy motion that is not a rigid-body motion.
     massless, stiffless : tuple of str
         DOFs without mass, and DOFs without stiffness.
     n_pieces : int
@@ -63,6 +63,8 @@ class ModelCheck(Value):
 
     Examples
     --------
+    A free chain of two masses has one rigid-body motion:
+
     >>> import flexplant as fx
     >>> report = fx.check(fx.chain(masses=[1.0, 2.0], stiffnesses=[100.0]))
     >>> report.ok, report.n_rigid, float(report.mass[0])
@@ -127,7 +129,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     Parameters
     ----------
     model : FEModel or FEMatrices
-        Model or matrices to check; FEMatrices may contain any error.
+        Model or matrices to check. FEMatrices may contain any error.
 
     Raises
     ------
@@ -136,6 +138,8 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
 
     Examples
     --------
+    Two masses with a spring move freely along x:
+
     >>> from flexplant import DofSet
     >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])
     >>> report = check(FEModel([[1, 0], [0, 2]], [[5, -5], [-5, 5]], dofs=dofs))

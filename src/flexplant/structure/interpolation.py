@@ -33,7 +33,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     Parameters
     ----------
     item : FEModel, Modes or DofSet
-        Model whose nodes are not all in one place.
+        Model, modes or DOFs to interpolate. The nodes must not all be at one point.
     margin : float [m]
         Largest distance by which a point may lie outside the convex hull of the nodes. For example,
         the surface of a plate lies outside its middle plane.
@@ -60,6 +60,8 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
 
     Examples
     --------
+    The motion at a point between the nodes of a block:
+
     >>> import flexplant as fx
     >>> size, mesh = {"size": (1.0, 1.0, 1.0)}, {"elements": (2, 2, 2)}
     >>> block = fx.solid_block(**size, **mesh, density=1.0, youngs_modulus=1.0, poisson_ratio=0.3)
@@ -98,6 +100,8 @@ class ScatteredShape(Interpolation):
 
     Examples
     --------
+    In a translation along x, the weights of five nodes add up to one:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> xyz = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [1.0, 1.0, 1.0]])

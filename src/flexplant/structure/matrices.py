@@ -42,7 +42,7 @@ class FEMatrices(Value):
         and `model` warns. The two kinds of damping give the same response at resonance, and differ
         by at most a fraction eta elsewhere.
     M, D : (n, n) array or sparse matrix, optional
-        Mass and viscous damping; M may be singular.
+        Mass and viscous damping. M may be singular.
     dofs : DofSet, optional
         DOFs of the rows. None: the DOFs are not known yet, and `with_dofs` can add them.
     digits : int, optional
@@ -70,6 +70,8 @@ class FEMatrices(Value):
 
     Examples
     --------
+    Matrices of two masses become an FEModel with a total mass of 3 kg:
+
     >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])
     >>> found = FEMatrices([[5, -5], [-5, 5]], [[1, 0], [0, 2]], dofs=dofs)
     >>> found
@@ -185,7 +187,7 @@ class FEMatrices(Value):
         Parameters
         ----------
         nodes : sequence of m int
-            Node numbers in any order; they must include all nodes of the DOFs.
+            Node numbers in any order. They must include all nodes of the DOFs.
         xyz : (m, 3) array [m]
             Coordinates of the nodes.
         """
@@ -309,7 +311,7 @@ class FEMatrices(Value):
         Parameters
         ----------
         count : int
-            Number of frequencies, including those at zero; at most 60. Small matrices have fewer.
+            Number of frequencies, at most 60. It includes those at zero. Small matrices have fewer.
 
         Raises
         ------
@@ -336,7 +338,7 @@ class FEMatrices(Value):
     def model(
         self, *, massless: str = "refuse", free: bool = False, name: str | None = None
     ) -> FEModel:
-        """Return the FEModel.
+        """Return an FEModel of these matrices.
 
         Parameters
         ----------

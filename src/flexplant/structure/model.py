@@ -38,20 +38,21 @@ from .zero_energy_motions import endangered, held_by_rounding
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FEModel(Placed, Value):
-    """A linear structure ``M q'' + D q' + K q = f`` (paper, eq. (1)).
+    """A linear structure ``M q'' + D q' + K q = f`` (equation (1) of [paper]_).
 
     Parameters
     ----------
     M : (n, n) array or sparse matrix [kg, kg m, kg m^2]
-        Mass: symmetric, positive definite.
+        Mass matrix, symmetric and positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
-        Stiffness: symmetric and positive semi-definite. It is singular for a free structure.
+        Stiffness matrix, symmetric and positive semi-definite. It is singular if motions are free.
         Negative eigenvalues are allowed only for rigid-body motions (springs of negative stiffness,
         such as magnets). K needs double precision. The rounding of a K in single precision may act
         as springs on the rigid-body motions, which leads to an error or a warning.
         ``FEMatrices(K, M, dofs=dofs).model(free=True)`` removes these springs.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
-        Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
+        Damping matrix, symmetric and positive semi-definite. None: the damping is given later, for
+        example by ``solve_modes(model, damping=)``.
     dofs : DofSet, optional
         DOFs of the n rows, with coordinates. By default row i is the displacement of node i along
         x, "1:x" to "n:x", with unknown coordinates.
@@ -66,7 +67,7 @@ class FEModel(Placed, Value):
         rigid bodies, as far as the joints (a slide, a hinge) allow. They replace the rigid-body
         motions that follow from the coordinates.
     joining : Value, optional
-        Record of how a machine was joined, with its checks; None after M or K is changed.
+        Record of how a machine was joined, with its checks. None after M or K was changed.
 
     Raises
     ------
@@ -89,6 +90,8 @@ class FEModel(Placed, Value):
 
     Examples
     --------
+    Two masses with a spring, with given DOFs and with default DOFs:
+
     >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])
     >>> FEModel([[1, 0], [0, 2]], [[5, -5], [-5, 5]], dofs=dofs, name="two masses")
     <FEModel 'two masses': 2 DOFs, dense, 1 rigid-body motion, D not given>
@@ -225,8 +228,8 @@ class FEModel(Placed, Value):
 
         Springs to ground do not count, since the DOFs can still make the motion. For a motion r the
         result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
-        square root of K_ii. It is 0 for a free motion, since the terms of K r cancel everywhere
-        except next to held DOFs.
+        square root of K_ii. The terms of K r cancel everywhere except next to held DOFs. The result
+        is therefore 0 if no DOF is held.
         """
         if self.held_inertia is None:
             return np.zeros(6)
@@ -316,8 +319,8 @@ class FEModel(Placed, Value):
         Parameters
         ----------
         labels : sequence of str, or DofSet
-            The DOFs that do not move; ``model.dofs.where(directions="z", box=...)`` finds those of
-            an edge.
+            DOFs that do not move. For example, ``model.dofs.where(directions="z", box=...)``
+            returns the DOFs of an edge.
 
         Examples
         --------
@@ -354,7 +357,7 @@ class FEModel(Placed, Value):
     ) -> FEModel:
         """Return the model in SI units, from numbers in the given units.
 
-        Coordinates are scaled as well; rotations are in radians before and after.
+        Coordinates are scaled as well. Rotations are in radians before and after.
 
         Parameters
         ----------
@@ -395,7 +398,7 @@ class FEModel(Placed, Value):
         return model
 
     def with_unchecked_damping(self, D: Matrix) -> Self:
-        """Return the model with a D that is known to be symmetric and stable; it is not checked."""
+        """Return the model with a D that is not checked, since it is known to be valid."""
         return self._with(D=frozen(D))
 
     def _with(self, **changes: Any) -> Self:

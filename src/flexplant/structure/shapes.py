@@ -90,6 +90,8 @@ class PlateShape(GridShape):
 
     Examples
     --------
+    In a translation in z, the weights of the deflections add up to one:
+
     >>> import flexplant as fx
     >>> shape = fx.structure.PlateShape((1.0, 1.0), 0.01, (2, 2))
     >>> round(float(shape.row((0.3, 0.2, 0.0), "z")[::3].sum()), 9)
@@ -182,6 +184,8 @@ class BeamShape(GridShape):
 
     Examples
     --------
+    A beam of 2 m with four elements:
+
     >>> import flexplant as fx
     >>> fx.structure.BeamShape(2.0, 4)
     BeamShape(length=2, elements=4)
@@ -232,12 +236,14 @@ class BlockShape(GridShape):
     elements : (int, int, int)
         Number of elements in x, y and z.
     present : (nz, ny, nx) array of bool, optional
-        True for each element that exists; by default all exist.
+        True for each element that exists. None: all elements exist.
     poisson_ratio : float
-        Poisson's ratio. A bent element also curves in the transverse direction in proportion to it.
+        Poisson's ratio. The transverse curvature of a bent element is proportional to it.
 
     Examples
     --------
+    In a translation along x, the weights add up to one:
+
     >>> import flexplant as fx
     >>> shape = fx.structure.BlockShape((1.0, 1.0, 1.0), (2, 2, 2))
     >>> round(float(shape.row((0.3, 0.2, 0.1), "x").sum()), 9)

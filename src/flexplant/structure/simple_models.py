@@ -73,6 +73,8 @@ def chain(
 
     Examples
     --------
+    Three masses and two springs, free along x:
+
     >>> chain(masses=[1, 2, 3], stiffnesses=[5, 7])
     <FEModel 'chain': 3 DOFs, sparse, 1 rigid-body motion, D not given>
     """
@@ -132,11 +134,11 @@ def beam(
 ) -> FEModel:
     """Return a straight beam in bending along x from the origin, by Euler-Bernoulli or Timoshenko.
 
-    Without `poisson_ratio` this is the beam of Euler and Bernoulli, ``rho A z'' + (E I z_xx)_xx =
-    f``, where the index x is a derivative. Its elements have two nodes, cubic shape functions and
-    consistent mass. Nodes are numbered from 1. Each node has the DOFs z [m] and ry = -dz/dx [rad],
-    except those that are held at an end. The model is accurate for wave lengths well above ten
-    times the height.
+    Without `poisson_ratio` this is the beam of Euler and Bernoulli. Its equation is
+    ``rho A z'' + (E I z_xx)_xx = f``, where the index x means a derivative with respect to x. Its
+    elements have two nodes, cubic shape functions and consistent mass. Nodes are numbered from 1.
+    Each node has the DOFs z [m] and ry = -dz/dx [rad], except those that are held at an end. The
+    model is accurate for wave lengths well above ten times the height.
 
     With `poisson_ratio` the beam has shear deformation and rotary inertia (Timoshenko). Its
     equations are ``rho A z'' = (k G A (z_x - t))_x`` and
@@ -156,9 +158,10 @@ def beam(
     poisson_ratio : float, (elements,) array or function of x, optional [-]
         Poisson's ratio nu, for the shear modulus G = E / (2 (1 + nu)). None: Euler-Bernoulli.
     shear_factor : float
-        Factor k of the shear stiffness k G A; 5/6 for a rectangular section.
+        Factor k of the shear stiffness k G A. It is 5/6 for a rectangular section.
     ends : (str, str)
-        Support of each end: "free", "pinned" (z is held), "clamped" (z and ry) or "guided" (ry).
+        Support of each end: "free", "pinned" (z is held), "clamped" (z and ry are held) or "guided"
+        (ry is held).
     name : str, optional
         Name of the model, as it is printed.
 
@@ -175,6 +178,8 @@ def beam(
 
     Examples
     --------
+    A steel cantilever of ten elements, clamped at its left end:
+
     >>> steel = {"density": 7850, "youngs_modulus": 210e9}
     >>> beam(length=1.0, elements=10, area=1e-4, inertia=8.3e-10, **steel, ends=("clamped", "free"))
     <FEModel 'beam': 20 DOFs, sparse, no rigid-body motions, D not given>
@@ -242,9 +247,9 @@ def kirchhoff_plate(
 ) -> FEModel:
     """Return a free thin rectangular plate in bending, without shear and rotary inertia.
 
-    The elements are those of Adini, Clough and Melosh: four nodes, non-conforming, with the
-    complete cubic polynomial and the terms x^3 y and x y^3. Stiffness and consistent mass are
-    integrated exactly. The plate lies in the x-y plane with one corner at the origin and its middle
+    The elements are those of Adini, Clough and Melosh. They have four nodes and are non-conforming.
+    The deflection is a complete cubic polynomial with the additional terms x^3 y and x y^3.
+    Stiffness and consistent mass are integrated exactly. The plate lies in the x-y plane with one corner at the origin and its middle
     plane at z = 0. Nodes are numbered from 1 along x, row by row. Each has the DOFs z [m],
     rx = dz/dy and ry = -dz/dx [rad].
 
@@ -281,6 +286,8 @@ def kirchhoff_plate(
 
     Examples
     --------
+    A square aluminium plate of 8 x 8 elements:
+
     >>> kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8), density=2702,
     ...                 youngs_modulus=70e9, poisson_ratio=0.35)
     <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
@@ -359,6 +366,8 @@ def solid_block(
 
     Examples
     --------
+    An aluminium block of 4 x 3 x 1 elements:
+
     >>> solid_block(size=(0.4, 0.3, 0.1), elements=(4, 3, 1), density=2700, youngs_modulus=70e9,
     ...             poisson_ratio=0.33)
     <FEModel 'block': 120 DOFs, sparse, 6 rigid-body motions, D not given>

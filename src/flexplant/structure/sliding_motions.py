@@ -42,6 +42,8 @@ def slides(model: FEModel) -> dict[str, FloatArray]:
 
     Examples
     --------
+    A free mass without a slide:
+
     >>> import flexplant as fx
     >>> dofs = fx.DofSet([1, 1], ["x", "y"], [[0, 0, 0], [0, 0, 0]])
     >>> model = fx.FEModel([[1, 0], [0, 1]], [[0, 0], [0, 5]], dofs=dofs)
@@ -86,6 +88,8 @@ def sliding(model: FEModel, names: Sequence[str] | None = None) -> FEModel:
 
     Examples
     --------
+    The third mass is held by a spring, and the first two move freely together as a slide:
+
     >>> import flexplant as fx
     >>> dofs = fx.DofSet([1, 2, 3], ["x", "x", "x"], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     >>> K = [[9e3, -9e3, 0], [-9e3, 9e3, 0], [0, 0, 1e4]]
