@@ -229,7 +229,7 @@ class FEModel(Placed, Value):
         Springs to ground do not count, since the DOFs can still make the motion. For a motion r the
         result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
         square root of K_ii. The terms of K r cancel everywhere except next to held DOFs. The result
-        is therefore 0 if no DOF is held.
+        is therefore 0 for a motion that no held DOF prevents.
         """
         if self.held_inertia is None:
             return np.zeros(6)

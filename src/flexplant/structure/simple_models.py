@@ -249,9 +249,9 @@ def kirchhoff_plate(
 
     The elements are those of Adini, Clough and Melosh. They have four nodes and are non-conforming.
     The deflection is a complete cubic polynomial with the additional terms x^3 y and x y^3.
-    Stiffness and consistent mass are integrated exactly. The plate lies in the x-y plane with one corner at the origin and its middle
-    plane at z = 0. Nodes are numbered from 1 along x, row by row. Each has the DOFs z [m],
-    rx = dz/dy and ry = -dz/dx [rad].
+    Stiffness and consistent mass are integrated exactly. The plate lies in the x-y plane with one
+    corner at the origin and its middle plane at z = 0. Nodes are numbered from 1 along x, row by
+    row. Each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad].
 
     Thickness, density and the constants of the material may each be one number, an array (nx, ny)
     with a number for each element, or a function of the centre (x, y) of an element.
