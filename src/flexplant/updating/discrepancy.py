@@ -47,6 +47,8 @@ class Discrepancy(Value):
 
     Examples
     --------
+    The frequencies of a model have errors of 0.4 % in addition to noise:
+
     >>> Discrepancy("frequency", 0.004, 5.2).deviation
     0.004
     """
@@ -223,6 +225,8 @@ class ModalUncertainty(Value):
 
     Examples
     --------
+    Only mode 2 was measured. The result also contains the uncertainty of mode 3:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])

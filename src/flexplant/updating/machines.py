@@ -80,6 +80,8 @@ class Machines(Value):
 
     Examples
     --------
+    By default, 40 machines are drawn:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0] * 5, stiffnesses=[4e5] * 4)
     >>> poles = [-3.9 + 390j, -7.4 + 743j, -10 + 1023j, -12 + 1202j]

@@ -98,6 +98,8 @@ class MatrixParameter(_GivenParameter):
 
     Examples
     --------
+    The stiffness of a joint between two DOFs:
+
     >>> MatrixParameter("joint", dK=[[2.0, -2.0], [-2.0, 2.0]])
     <MatrixParameter: joint of K>
     """
@@ -140,7 +142,7 @@ class MatrixParameter(_GivenParameter):
         Raises
         ------
         ModelError, ShapeError
-            When the step is not positive, the matrices do not change, or the DOFs do.
+            When the step is not positive, the matrices do not change, or the DOFs change.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
@@ -191,6 +193,8 @@ class MatrixParameter(_GivenParameter):
 
         Examples
         --------
+        Young's modulus of one half of a plate:
+
         >>> from flexplant import kirchhoff_plate
         >>> def build(E):
         ...     return kirchhoff_plate(size=(0.6, 0.6), thickness=0.02, elements=(2, 2),
@@ -245,6 +249,8 @@ class ModeDamping(Parameter):
 
     Examples
     --------
+    The damping ratio of mode 6:
+
     >>> ModeDamping(6)
     <ModeDamping: damping ratio of mode 6>
     """
@@ -364,6 +370,8 @@ class PolynomialParameter(_GivenParameter):
 
     Examples
     --------
+    The thickness of a plate:
+
     >>> from flexplant import kirchhoff_plate
     >>> def build(h):
     ...     return kirchhoff_plate(size=(0.6, 0.6), thickness=h, elements=(2, 2),
@@ -426,8 +434,8 @@ class PolynomialParameter(_GivenParameter):
         Raises
         ------
         ModelError, ShapeError
-            When the polynomials have a relative error above 1e-6 of the change of the matrices,
-            when the matrices do not change, or when the DOFs change.
+            When the error of the polynomials exceeds 1e-6 of the change of the matrices, when the
+            matrices do not change, or when the DOFs change.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))

@@ -33,6 +33,8 @@ class Parameter(Value):
 
     Examples
     --------
+    The library's parameters are instances of this class:
+
     >>> import flexplant as fx
     >>> isinstance(fx.AddedMass("1:x"), fx.updating.Parameter)
     True
@@ -174,6 +176,8 @@ class AddedMass(PointParameter):
 
     Examples
     --------
+    A mass that moves along z, and a mass that moves in all directions:
+
     >>> AddedMass("14:z")
     <AddedMass: mass at 14:z [kg]>
     >>> AddedMass((0.3, 0.2, 0.05), direction="xyz", name="chuck")
@@ -196,6 +200,8 @@ class AddedDamping(PointParameter):
 
     Examples
     --------
+    A damper between a point of a plate and the ground:
+
     >>> AddedDamping((0.3, 0.15, 0.0))
     <AddedDamping: damping at (0.3, 0.15, 0) z [N s/m]>
     """
@@ -219,6 +225,8 @@ class AddedStiffness(PointParameter):
 
     Examples
     --------
+    A spring between two displacements, and a spring between two rotations:
+
     >>> AddedStiffness({"14:z": 1.0, "15:z": -1.0}, name="crack")
     <AddedStiffness: crack [N/m]>
     >>> AddedStiffness({"1:rz": 1.0, "2:rz": -1.0}, name="gear")

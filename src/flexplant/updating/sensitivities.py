@@ -98,6 +98,7 @@ def eigenvalue_sensitivities(
     Returns
     -------
     Sensitivities
+        Matrix S of the derivatives, with the poles and their mode numbers.
 
     Raises
     ------
@@ -112,6 +113,8 @@ def eigenvalue_sensitivities(
 
     Examples
     --------
+    Change of the second pole of a chain with a mass at its end:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> found = fx.updating.eigenvalue_sensitivities(drawing, [fx.AddedMass("3:x")], modes=[2])

@@ -29,13 +29,14 @@ class Trend(Value):
     """Residual of measured frequencies, regressed on the parameters and on frequency.
 
     For m measured modes the regression is ``log(f_measured / f_model) = S dp + b g + s e``. S
-    contains the derivatives of the logarithms of the model's frequencies to the q parameters that
-    change them, and dp are changes of these parameters. g is the measured frequency divided by the
-    largest one, and b is the slope. e is standard normal, and s is the standard deviation of the
-    scatter. If the model has no errors except those of its parameters and the scatter, b is zero.
-    Its estimate divided by its standard deviation then follows Student's distribution with
-    ``m - q - 1`` degrees of freedom. A significant slope means that the model neglects an effect
-    that grows with frequency: shear, rotary inertia, or elements that should be smaller.
+    contains the derivatives of the logarithms of the model's frequencies with respect to the q
+    parameters that change them, and dp are changes of these parameters. g is the measured frequency
+    divided by the largest one, and b is the slope. The scatter is ``s e``, with standard normal
+    numbers e and the standard deviation s. If the model has no errors except those of its
+    parameters and the scatter, b is zero. The estimate of b divided by its standard deviation then
+    follows Student's distribution with ``m - q - 1`` degrees of freedom. A significant slope means
+    that the model neglects an effect that grows with frequency: shear, rotary inertia, or elements
+    that should be smaller.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ class Trend(Value):
     model_freq : (m,) array [Hz]
         Frequencies of the updated model.
     S : (m, q) array [1/unit]
-        Derivatives of the logarithms of the model's frequencies to its parameters.
+        Derivatives of the logarithms of the model's frequencies with respect to q parameters.
     moves : sequence of int
         Positions of the q parameters that change frequencies among all parameters of the fit.
     shaped : bool
@@ -60,6 +61,8 @@ class Trend(Value):
 
     Examples
     --------
+    Four measured modes and one parameter leave two degrees of freedom:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0] * 5, stiffnesses=[4e5] * 4)
     >>> measured = fx.MeasuredModes(poles=[390j, 743j, 1023j, 1202j], modes=[2, 3, 4, 5])

@@ -45,10 +45,13 @@ class History(Value):
         residuals it is the sum of squares of the whitened residuals (divided by the standard
         deviation of their noise), without priors.
     fraction : (i + 1,) array
-        Fraction of the Gauss-Newton step; 1 unless it was halved, 0 for the start.
+        Fraction of the Gauss-Newton step that was taken. It is 1 unless the step was halved, and 0
+        for the start.
 
     Examples
     --------
+    One full step lowers the error from 4 to 0.1:
+
     >>> import numpy as np
     >>> steps, poles = np.array([[0.0], [0.2]]), np.array([[600j], [580j]])
     >>> History(steps, poles, error=np.array([4.0, 0.1]), fraction=np.array([0.0, 1.0]))
@@ -82,7 +85,7 @@ class Starts(Value):
     cost : (s,) array
         Half the sum of squares at the end, infinite where a search failed.
     reason : sequence of s str
-        Reason why each search ended or failed; it names all methods that were tried.
+        Reason why each search ended or failed. It names all methods that were tried.
     minima : (r, q) array
         Parameters at the minima other than the best one, in the order of increasing cost.
     above : (r,) array
@@ -93,6 +96,8 @@ class Starts(Value):
 
     Examples
     --------
+    One of two searches failed:
+
     >>> import numpy as np
     >>> Starts(np.zeros((2, 1)), np.array([[0.1], [np.nan]]), cost=np.array([1.0, np.inf]))
     <Starts: 1 of 2 at the least cost 1, 1 failed>
@@ -155,6 +160,7 @@ class UpdateResult(Value):
     model : ReducedModel or FEModel
         Updated model of the same type, with changed M, D and K.
     history : History
+        Parameters, eigenvalues and error in each iteration.
     converged : bool
         Whether a tolerance was met and the data determine all parameters.
     reason : str
@@ -343,9 +349,10 @@ class UpdateResult(Value):
         """Return confidence (credible) intervals (q, 2) of the parameters for a level in 0 .. 1.
 
         The intervals follow the normal distribution. If the discrepancy was estimated, they follow
-        Student's distribution. Its degrees of freedom are those of the data, the smallest number
-        over the kinds of residuals, minus one. One is subtracted because the data cannot show an
-        error that is common to all modes. A ModelError is raised if the covariance is not known.
+        Student's distribution. The data of each kind of residual give a number of degrees of
+        freedom, and the smallest number is used, minus one. One is subtracted because the data
+        cannot show an error that is common to all modes. A ModelError is raised if the covariance
+        is not known.
         """
         from scipy.special import ndtri
 
@@ -487,7 +494,7 @@ class UpdateResult(Value):
         Parameters
         ----------
         measured : MeasuredModes, optional
-            Measured modes with numbers; by default the fitted poles.
+            Measured modes with numbers. None: the fitted poles.
         """
         poles = self.fitted_poles if measured is None else measured
         if poles is None:

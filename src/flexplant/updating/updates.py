@@ -143,6 +143,8 @@ def update(
 
     Examples
     --------
+    The third mass of the machine is 0.2 kg heavier than in the drawing:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])

@@ -72,6 +72,7 @@ def localise(
     Returns
     -------
     Localisation
+        Chosen candidates, and the ranking of all candidates.
 
     Warns
     -----
@@ -99,6 +100,9 @@ def localise(
 
     Examples
     --------
+    The third mass is heavier than in the drawing. Among three added masses, the search finds this
+    place:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e5, 3e5])
     >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
@@ -218,7 +222,7 @@ class Localisation(Value):
         Extended Bayesian information criterion (BIC) of each candidate alone. It is chi-square plus
         a penalty that grows with the number of parameters. A smaller value is better.
     chosen : sequence of str
-        Set of candidates with the smallest BIC; empty if the model without a change has the
+        Set of candidates with the smallest BIC. It is empty if the model without a change has the
         smallest one.
     chosen_values : array
         Values of the chosen candidates.
@@ -238,7 +242,7 @@ class Localisation(Value):
         The best of the fitted sets that do not contain all chosen candidates. It is empty if this
         is the model without a change.
     next_bic : float
-        BIC of `next_best`; infinite if no other set was fitted.
+        BIC of `next_best`. It is infinite if no other set was fitted.
     alike_sets : sequence of tuples of str
         Sets of the same size as the chosen one that explain the data equally well, the best first.
         Their BIC is at most 2 above the least one. On a symmetric structure these are all

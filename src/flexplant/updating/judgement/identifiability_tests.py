@@ -114,6 +114,7 @@ def identifiability(
     Returns
     -------
     IdentifiabilityReport
+        Parameters and combinations of parameters that can be determined.
 
     Raises
     ------
@@ -122,6 +123,8 @@ def identifiability(
 
     Examples
     --------
+    One pole cannot distinguish added masses at the two ends of a symmetric chain:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j], modes=[2]))

@@ -51,6 +51,8 @@ def mac(X: Any, Y: Any) -> FloatArray:
 
     Examples
     --------
+    A shape is compared with itself and with another shape:
+
     >>> import flexplant as fx
     >>> fx.updating.mac([[1.0], [0.0]], [[1.0, 1.0], [0.0, 1.0]]).round(6)
     array([[1. , 0.5]])
@@ -83,6 +85,8 @@ def frac(H: Any, G: Any) -> FloatArray:
 
     Examples
     --------
+    Responses that differ only by a factor have the value 1:
+
     >>> import flexplant as fx
     >>> fx.updating.frac([[[1.0, 2.0j]]], [[[2.0, 4.0j]]]).round(6)  # scale does not count
     array([[1.]])
@@ -122,6 +126,8 @@ def fdac(H: Any, G: Any) -> FloatArray:
 
     Examples
     --------
+    One channel at two lines. At the second line, the computed response has the opposite sign:
+
     >>> import flexplant as fx
     >>> fx.updating.fdac([[[1.0, 2.0]]], [[[1.0, -1.0]]]).round(6)
     array([[ 1., -1.],
@@ -199,6 +205,7 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
     Returns
     -------
     Correlation
+        Errors of frequencies and damping ratios, and criteria for shapes and responses.
 
     Raises
     ------
@@ -207,6 +214,8 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
 
     Examples
     --------
+    The second frequency of the model is 2 % above the measured one:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[620.0j], modes=[2]))
@@ -344,6 +353,7 @@ def validate(
     Returns
     -------
     Validation
+        The update, and its errors for fitted and for unused data.
 
     Raises
     ------
@@ -352,6 +362,8 @@ def validate(
 
     Examples
     --------
+    An added mass is fitted to the pole of mode 2. It predicts the pole of mode 3:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])
@@ -402,6 +414,8 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
 
     Examples
     --------
+    One of two measured poles is fitted, and the other one is left for the validation:
+
     >>> import flexplant as fx
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j, 1095.0j], modes=[2, 3]))
     >>> fitted, unused = fx.updating.split(poles, rng=0)

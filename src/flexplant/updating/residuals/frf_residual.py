@@ -74,6 +74,8 @@ class FrfResidual(Residual):
 
     Examples
     --------
+    A response with known noise, and the response of a sampled machine:
+
     >>> frf = Frf([1.0, 2.0], [[[1.0, 0.5j]]], inputs=["1:z"], outputs=["2:z"])
     >>> FrfResidual(frf, variance=1e-4)
     <FrfResidual: 1 x 1 channel, 2 of 2 lines, complex, noise known>

@@ -105,6 +105,8 @@ class Eigenvalues(_ModalResidual):
 
     Examples
     --------
+    Two measured poles with equal weights:
+
     >>> Eigenvalues(MeasuredModes([-28.5 + 2870j, -39.3 + 3970j], modes=[6, 7]))
     <Eigenvalues: modes 6, 7, weights equal>
     """
@@ -145,7 +147,7 @@ class Eigenvalues(_ModalResidual):
         return self.replace(measured=chosen, weights=weights)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return BoundEigenvalues(self)
 
 
@@ -223,13 +225,14 @@ class ModeShapes(_ModalResidual):
 
     The residual is ``r = (I - P) psi``, where P is the projector on the model's shape at these
     places. It is the part of the measured shape that no complex multiple of the model's shape
-    explains. Its size is ``|r|^2 = (1 - MAC) |psi|^2`` with the modal assurance criterion MAC. This
-    is the maximum likelihood estimate of the unknown complex factor. Modes whose measured poles are
-    closer than 2 % form a cluster. They are compared with the subspace of the model's shapes of the
-    cluster, which does not change when the modes mix. In each step of the fit, the measured modes i
-    are paired with the model's modes j. The pairs minimise the sum of
-    ``1 - MAC + |ln(f_j / f_i)|`` with the frequencies f. If shapes look alike at the few measured
-    places, the frequencies decide.
+    explains. Its size is ``|r|^2 = (1 - MAC) |psi|^2`` with the modal assurance criterion MAC. The
+    unknown complex factor is thereby estimated by maximum likelihood.
+
+    Modes whose measured poles are closer than 2 % form a cluster. They are compared with the
+    subspace of the model's shapes of the cluster, which does not change when the modes mix. In each
+    step of the fit, the measured modes i are paired with the model's modes j. The pairs minimise
+    the sum of ``1 - MAC + |ln(f_j / f_i)|`` with the frequencies f. If shapes look alike at the few
+    measured places, the frequencies decide.
 
     Parameters
     ----------
@@ -260,6 +263,8 @@ class ModeShapes(_ModalResidual):
 
     Examples
     --------
+    Two measured shapes at two DOFs:
+
     >>> measured = MeasuredModes([-1 + 20j, -2 + 60j], modes=[1, 2])
     >>> ModeShapes(measured, [[1.0, 1.0], [1.4, -0.7]], ["1:z", "2:z"])
     <ModeShapes: modes 1, 2 at 2 places, noise not known>
@@ -314,7 +319,7 @@ class ModeShapes(_ModalResidual):
         return self.replace(measured=chosen, shapes=shapes, std=std, covariance=covariance)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return BoundShapes(self, family)
 
 
@@ -501,6 +506,8 @@ class ShapeCorrelation(ModeShapes):
 
     Examples
     --------
+    A measured shape at three DOFs:
+
     >>> import flexplant as fx
     >>> shape = {"shapes": [[1.0], [0.0], [-1.0]], "dofs": ["1:x", "2:x", "3:x"]}
     >>> measured = fx.MeasuredModes(poles=[630.0j], modes=[2], **shape)
@@ -509,7 +516,7 @@ class ShapeCorrelation(ModeShapes):
     """
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return _BoundMac(self, family)
 
 

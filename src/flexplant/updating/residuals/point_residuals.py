@@ -58,7 +58,7 @@ class Antiresonances(_PointResidual):
     Parameters
     ----------
     zeros : (m,) complex array [rad/s]
-        Measured zeros, one of each conjugate pair. They are stored with Im > 0; the real part may
+        Measured zeros, one of each conjugate pair. They are stored with Im > 0. The real part may
         have any sign.
     output, input : place
         Places between which the response was measured.
@@ -73,6 +73,8 @@ class Antiresonances(_PointResidual):
 
     Examples
     --------
+    An antiresonance that was measured at one end determines a mass at the other end:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> zeros = fx.updating.Antiresonances([390.0j], "1:x", "1:x", direction="x")
@@ -112,7 +114,7 @@ class Antiresonances(_PointResidual):
         return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return _BoundZeros(self, family)
 
 
@@ -208,6 +210,8 @@ class StaticCompliance(_PointResidual):
 
     Examples
     --------
+    The machine is softer than the model, so that the added stiffness is negative:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=1e5)
     >>> soft = fx.updating.StaticCompliance(6e-6, "1:x", "1:x", direction="x")
@@ -232,7 +236,7 @@ class StaticCompliance(_PointResidual):
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
+        """Return the residual for one family of models, as a `Bound`."""
         return _BoundStatic(self, family)
 
 

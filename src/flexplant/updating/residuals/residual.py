@@ -21,6 +21,8 @@ class Residual(Value):
 
     Examples
     --------
+    The library's residuals are instances of this class:
+
     >>> import flexplant as fx
     >>> poles = fx.MeasuredModes(poles=[630.0j], modes=[2])
     >>> isinstance(fx.Eigenvalues(poles), fx.updating.Residual)
@@ -83,7 +85,7 @@ class Bound(ABC):
 
     @abstractmethod
     def values(self, point: Point) -> FloatArray:
-        """Return the real residuals (m,) at a point, measured minus model, whitened."""
+        """Return the whitened residuals (m,) as real numbers, for given parameter values."""
 
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:

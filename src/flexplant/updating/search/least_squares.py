@@ -61,6 +61,8 @@ class TrustRegion(UpdateMethod):
 
     Examples
     --------
+    The estimate ends at the upper bound:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
@@ -226,6 +228,8 @@ class GaussNewton(UpdateMethod):
 
     Examples
     --------
+    An added mass is fitted to one pole:
+
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))

@@ -300,6 +300,8 @@ class UpdateMethod(Value):
 
     Examples
     --------
+    The library's methods are instances of this class:
+
     >>> import flexplant as fx
     >>> isinstance(fx.updating.GaussNewton(), fx.updating.UpdateMethod)
     True
