@@ -50,6 +50,8 @@ class PoleSelection(Value):
 
     Examples
     --------
+    The pole of an FRF with one resonance is selected automatically:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> freq = np.arange(10.0, 40.0, 0.1)

@@ -143,9 +143,9 @@ def estimate_frf(
     rate : float [Hz]
         Sampling rate of the records.
     reference : array or mapping, optional
-        Excitation added inside the loop, one signal per input.
+        References r of a measurement under feedback, one signal for each input.
     method : H1Estimator, H2Estimator, HvEstimator or Periodic
-        Method of averaging; ``H1Estimator()`` by default.
+        Method of averaging. None: ``H1Estimator()``.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the outputs. `Frf.converted` can convert the result to another quantity.
 
@@ -174,7 +174,7 @@ def estimate_frf(
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When records do not match, are too short, or inputs are dependent.
+        When records do not match or are too short, or when the inputs are linearly dependent.
 
     References
     ----------
@@ -183,6 +183,8 @@ def estimate_frf(
 
     Examples
     --------
+    A system of gain 2 is measured with a multisine:
+
     >>> from flexplant.identification import Periodic, estimate_frf, multisine
     >>> u = multisine(1, rate=100.0, period=1.0, periods=3, rng=1)
     >>> y = 2.0 * u
@@ -254,6 +256,8 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
     Examples
     --------
+    Two repetitions of a measurement at two frequencies:
+
     >>> import flexplant as fx
     >>> runs = [fx.Frf([10.0, 20.0], [[[1.0 - e, 2.0 + e]]]) for e in (-0.1, 0.1)]
     >>> mean = fx.identification.average_frfs(runs)

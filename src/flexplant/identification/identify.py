@@ -51,10 +51,10 @@ def stabilisation_diagram(
 ) -> StabilisationDiagram:
     """Return the poles of matrix-fraction models of rising order, by pLSCF.
 
-    pLSCF is the poly-reference least-squares complex frequency-domain method. The model is ``H(z) =
-    B(z) A(z)^-1``, where B and A are matrix polynomials in z with complex coefficients, and z moves
-    along the unit circle as the frequency moves through the band. The poles follow from A. See
-    `flexplant.identification.diagram`.
+    pLSCF is the poly-reference least-squares complex frequency-domain method. The model is
+    ``H(z) = B(z) A(z)^-1``, where B and A are matrix polynomials in z with complex coefficients.
+    When the frequency moves through the band, z moves along the unit circle. The poles follow from
+    A. See `flexplant.identification.diagram`.
 
     Parameters
     ----------
@@ -89,6 +89,8 @@ def stabilisation_diagram(
 
     Examples
     --------
+    The pole of an FRF with a resonance at 20 Hz:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> freq = np.arange(10.0, 40.0, 0.1)
@@ -154,11 +156,11 @@ def identify_modes(
         the window) are included if they are known. Without a variance, the weights and the
         covariance follow from the residual of the fit, averaged over 41 lines.
     band : (low, high) [Hz], optional
-        Frequency band of the fit and of the reported modes; all lines by default.
+        Frequency band of the fit and of the reported modes. None: all lines.
     orders : iterable of int, optional
-        Model orders of the stabilisation diagram; by default those of `stabilisation_diagram`.
+        Model orders of the stabilisation diagram. None: those of `stabilisation_diagram`.
     start : PoleSelection, optional
-        Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
+        Poles chosen by hand, for example by `stabilisation_diagram(frf).select(freq=[...])`.
     lower : int
         Number of terms 1/s, 1/s^2, ... in the fit. They represent rigid-body modes and modes below
         the band.
@@ -187,8 +189,8 @@ def identify_modes(
         as ``n (m r)^2`` with n values of the FRF, m poles and r references (the inputs, or the
         outputs if there are fewer of them). The limits are 5e7 for each step and 5e10 in total.
     most : int
-        Largest number of poles of the fit. The strongest poles of the diagram are used; `rejected`
-        lists the others.
+        Largest number of poles of the fit. The strongest poles of the diagram are used, and
+        `rejected` lists the others.
     max_iterations : int
         Largest number of iterations of the fit.
     progress : bool, optional
@@ -206,9 +208,9 @@ def identify_modes(
     -----
     FlexplantWarning
         When the residual of a group of lines exceeds the noise, because a mode was missed or two
-        were merged. When a resonance is too narrow for the distance between lines. The smallest
-        width is half of this distance if the fit includes the window (Hann-windowed segments), and
-        otherwise about four times this distance. When the FRF has the sign convention of
+        were merged. When a resonance is too narrow for the distance between lines. Its width must
+        be at least half of this distance if the fit includes the window (Hann-windowed segments),
+        and otherwise about four times this distance. When the FRF has the sign convention of
         ``exp(-i omega t)``, so that its complex conjugate is used.
 
     Raises
@@ -224,6 +226,8 @@ def identify_modes(
 
     Examples
     --------
+    The modes of a chain are identified from its frequency responses:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=[1e5, 0.0])

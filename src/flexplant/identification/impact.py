@@ -45,10 +45,12 @@ class Blow(Value):
     experiment : int
         Number of the record, from 0.
     reason : str
-        Reason why the blow is refused and not averaged; empty if it is used.
+        Reason why the blow is refused and not averaged. Empty: the blow is used.
 
     Examples
     --------
+    A blow that is not used, because another one follows:
+
     >>> Blow("1:z", 2.0, 180.0, reason="another blow follows after 0.04 s")
     Blow(input='1:z', time=2, peak=180, experiment=0, reason='another blow follows after 0.04 s')
     """
@@ -83,6 +85,8 @@ class ImpactTest(Value):
 
     Examples
     --------
+    The resonance decays with 2 1/s. The window adds 2 1/s, and `corrected` subtracts them:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> time = np.arange(6000) / 1e3
@@ -225,18 +229,18 @@ def impact_frf(
     rate : float [Hz]
         Sampling rate of the records.
     segment : float [s]
-        Length of record for each blow; its inverse is the resolution.
+        Length of record for each blow. Its inverse is the resolution.
     decay : float [s], optional
-        Time constant of the exponential window: a quarter of the segment by default, infinite for
+        Time constant of the exponential window. None: a quarter of the segment. Infinity: there is
         no window.
     level : float
         Fraction of the largest force of a record above which a pulse begins, between 0 and 1.
     limits : mapping {channel: value}, or float, optional
         Full scale of each channel, or one value for all channels. A blow is refused as clipped if a
-        signal reaches its full scale. Without a given full scale, clipping is detected by the
-        signal itself. It rises steeply to its largest or smallest value and keeps this value for
-        several samples. ``limits=1e9`` disables this test. A warning names each output that never
-        changes its value.
+        signal reaches its full scale. If no full scale is given, clipping is found in the signal
+        itself. A clipped signal rises steeply to its largest or smallest value and keeps this value
+        for several samples. ``limits=1e9`` disables this test. A warning names each output that
+        never changes its value.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the responses.
 
@@ -256,6 +260,8 @@ def impact_frf(
 
     Examples
     --------
+    Two of four blows are used, and two are too close to each other:
+
     >>> import numpy as np
     >>> force = np.zeros(3000)
     >>> force[[100, 1000, 2000, 2040]] = 1.0  # the last one rebounds

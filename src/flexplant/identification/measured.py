@@ -63,6 +63,8 @@ class MeasuredModes(Value):
 
     Examples
     --------
+    Two measured poles and their mode numbers:
+
     >>> MeasuredModes([-28.5 - 2870j, -39.3 - 3970j], modes=[6, 7])
     <MeasuredModes: 2 poles, modes 6, 7 at 456.8, 631.9 Hz>
     """
@@ -378,8 +380,8 @@ def numbered(
     Raises
     ------
     ModelError, LabelError
-        When a pole has no partner, an argument is out of range, or the model does not have the
-        place of a row. With `partial`, only when no pole has a partner.
+        When a pole has no partner, or with `partial` when no pole has one. Also when an argument is
+        out of range, or the model does not have the place of a row.
 
     References
     ----------
@@ -387,6 +389,8 @@ def numbered(
 
     Examples
     --------
+    A measured mode has the frequency and the shape of mode 2 of the model:
+
     >>> import flexplant as fx
     >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
     >>> model = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))

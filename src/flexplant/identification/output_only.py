@@ -62,12 +62,12 @@ def identify_output_only(
 
     The covariance of each pole is found by a jackknife. The record is divided into b blocks, and
     the poles are computed b times, each time without one block. Their scatter gives the variance.
-    Since b is small, this estimate is uncertain, and the error of a pole divided by it follows
-    Student's distribution. The estimate is therefore multiplied by (b - 1)/(b - 3), the variance of
-    that distribution. Poles whose frequency varies by more than 2 % or whose damping varies by more
-    than 60 % are taken as noise and left out. A rotating part or mains hum appears as a mode with
-    almost no damping. Peaks in the spectrum of an excitation that is not white appear as additional
-    modes.
+    The error of a pole, divided by this standard deviation, follows Student's distribution with
+    b - 1 degrees of freedom. The variance of this distribution is (b - 1)/(b - 3), and the variance
+    of the pole is multiplied by this factor. Poles whose frequency varies by more than 2 % or whose
+    damping varies by more than 60 % are taken as noise and left out. A rotating part or mains hum
+    appears as a mode with almost no damping. Peaks in the spectrum of an excitation that is not
+    white appear as additional modes.
 
     Parameters
     ----------
@@ -80,9 +80,9 @@ def identify_output_only(
     band : (low, high) [Hz]
         Frequency band of the modes.
     orders : iterable of int, optional
-        Model orders (numbers of states); 4, 6, ..., 40 by default.
+        Model orders (numbers of states). None: 4, 6, ..., 40.
     lags : int, optional
-        Number of block rows and columns of H; two periods of the lowest frequency by default.
+        Number of block rows and columns of H. None: two periods of the lowest frequency.
     blocks : int
         Number of blocks of the record, at least 8. Each block should be longer than the slowest
         decay.
@@ -109,6 +109,8 @@ def identify_output_only(
 
     Examples
     --------
+    The record is noise that passed through a resonance at 10 Hz:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> from scipy.signal import lfilter

@@ -38,6 +38,8 @@ class Periodic(Value):
 
     Examples
     --------
+    A system of gain 2 is measured with a multisine:
+
     >>> import flexplant as fx
     >>> u = fx.identification.multisine(1, rate=1e3, period=0.1, periods=4, rng=1)[0]
     >>> frf = fx.estimate_frf(u, 2 * u, rate=1e3, method=fx.identification.Periodic(period=0.1))
@@ -251,6 +253,8 @@ def multisine(
 
     Examples
     --------
+    Two experiments with two inputs, each with one period of 500 samples:
+
     >>> import flexplant as fx
     >>> signals = fx.identification.multisine(2, rate=1e3, period=0.5, rng=1)
     >>> signals.shape  # experiments, inputs, samples

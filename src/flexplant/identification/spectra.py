@@ -49,6 +49,8 @@ class H1Estimator(SpectralMethod):
 
     Examples
     --------
+    A system of gain 2 is measured with random noise:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> u = np.random.default_rng(0).normal(size=(1, 4000))
@@ -72,6 +74,8 @@ class H2Estimator(SpectralMethod):
 
     Examples
     --------
+    Segments of 0.1 s that overlap by one half:
+
     >>> H2Estimator(segment=0.1)
     H2Estimator(segment=0.1 s, overlap=0.5)
     """
@@ -91,6 +95,8 @@ class HvEstimator(SpectralMethod):
 
     Examples
     --------
+    Segments of 0.1 s that overlap by one half:
+
     >>> HvEstimator(segment=0.1)
     HvEstimator(segment=0.1 s, overlap=0.5)
     """

@@ -48,9 +48,9 @@ def structural_modes(
       is approximated by :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)`. The rigid-body modes
       satisfy :math:`\Phi_r \Phi_r^T = A` and are combinations of the rigid-body motions of the
       geometry. The residual vectors v satisfy :math:`\sum v v^T/\omega_v^2 = G`. Their frequency
-      :math:`\omega_v` lies above the band. Some entries of G are not measured, since c denotes the
-      places that were both driven and measured, and o the other places. Between two places o,
-      :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}` is assumed.
+      :math:`\omega_v` lies above the band. The index c denotes the places that were both driven and
+      measured, and o the other places. The vectors are found from the entries with c. Between two
+      places o, they give :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`.
     - Modes just outside the band. They become residual vectors with their own frequency and damping
       if they can be modes of a structure. For this, their shapes must be real, and the shapes at
       inputs and outputs must agree.
@@ -94,6 +94,8 @@ def structural_modes(
 
     Examples
     --------
+    The frequency responses of a chain give its modes:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=[1e5, 0.0])
@@ -342,7 +344,7 @@ def shape_deviations(
     Parameters
     ----------
     measured, dofs, over
-        As for `structural_modes`.
+        Measured modes, DOFs, and modes of a model, as for `structural_modes`.
     count : int
         Number of vectors v_j that are kept for each mode. If the noise of the sensors is
         independent, the covariance is exact only with one vector for each place.
@@ -360,6 +362,8 @@ def shape_deviations(
 
     Examples
     --------
+    A mass on a spring has one mode and one DOF:
+
     >>> import flexplant as fx
     >>> import numpy as np
     >>> freq = np.linspace(10.0, 250.0, 400)
