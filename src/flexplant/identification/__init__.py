@@ -9,6 +9,8 @@
 - `MeasuredModes.from_freq`: takes frequencies and damping ratios from another source.
 - `structural_modes`: makes modes of a structure from measured modes, if no model exists.
 
+Three modes of a wafer stage are identified from a simulated frequency response:
+
 >>> import flexplant as fx
 >>> machine = fx.testbeds.wafer_stage()
 >>> ports = fx.Ports(

@@ -2,11 +2,13 @@
 
 - `joined(components, joints)`: makes one machine of components and checks it. Its labels begin with
   the name of the component, such as ``"stage/41:z"``.
-- `Joint`: rigid, or springs and dampers, between places of two components.
+- `Joint`: connects places of two components, rigidly or by springs and dampers.
 - `Patch`: joins surfaces whose meshes do not match.
 - `coincident_joints`: joins surfaces whose meshes match, node by node.
 - `Pose`: position and orientation of a component.
 - `uncoupled`: removes a component from the measured responses of a machine.
+
+A stage and a frame, each a chain of two masses, are joined by a spring:
 
 >>> import flexplant as fx
 >>> stage = fx.chain(masses=[2.0, 1.0], stiffnesses=[1e5])

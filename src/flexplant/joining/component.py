@@ -179,7 +179,7 @@ class PlacedShape(Interpolation):
     C: sp.csc_array
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion at a point."""
+        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m]."""
         return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
@@ -250,7 +250,7 @@ class JoinedShape(Interpolation):
     motions: FloatArray | None = None
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion at a point.
+        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m].
 
         The point must lie on a component that can move in the given direction. If it also lies on
         another component, both must move together there. Otherwise a LabelError is raised.

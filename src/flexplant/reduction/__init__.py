@@ -11,6 +11,8 @@ structure. With many methods its coordinates are DOFs of the structure.
   responses, compared with the error bound of the method.
 - `rank_modes`: sorts modes by their contribution to the response from inputs to outputs.
 
+Twelve modes of a plate are kept in a model of twelve of its DOFs:
+
 >>> import flexplant as fx
 >>> plate = fx.kirchhoff_plate(
 ...     size=(0.6, 0.4), thickness=0.02, elements=(6, 4),
@@ -26,7 +28,7 @@ True
 
 Names elsewhere: superelements and CMS (Ansys), EXTSEOUT and ASET (Nastran), ``pymor``'s
 reductors, MATLAB's ``modalfit`` and ``reducespec``. ``examples/reduction_methods.py`` compares
-twelve ways.
+twelve methods.
 """
 
 from ..rooms import public_names as _public_names

@@ -89,7 +89,7 @@ class ModeRanking(Value):
         return f"<ModeRanking: {found}, {channels}; by Hankel value: {first}{more}>"
 
     def table(self, most: int = 12) -> str:
-        """Return a table of the most important modes, each with its most important channel."""
+        """Return a table of the `most` most important modes, each with its main channel."""
         rows = []
         top = float(self.total.max(initial=0.0)) or 1.0
         for i in np.argsort(-self.total, kind="stable")[: whole(most, "most")]:

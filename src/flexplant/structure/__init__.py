@@ -5,13 +5,15 @@ node 41 in z. `fx.read_model` reads a model from files. The functions here make 
 
 - `plate` (with shear and rotary inertia), `kirchhoff_plate` (thin), `beam`, `solid_block` and
   `chain` make meshes. Thickness and modulus may vary over a plate.
-- `FEModel.with_parts` adds `PointMass`, `Spring` and `Damper` to any model; `FEModel.fixed` holds
+- `FEModel.with_parts` adds `PointMass`, `Spring` and `Damper` to any model. `FEModel.fixed` holds
   DOFs.
 - `ModalDamping` (one ratio, one for each mode, or measured ones) and `Rayleigh` give damping. The
   imaginary part of a complex K becomes modal damping.
 - `check`: reports on symmetry, definiteness, rigid-body motions, mechanisms and mass of a model.
 - `interpolated`: adds an interpolation between nodes to a model without known elements. A point of
   interest (POI) may then be anywhere between the nodes.
+
+A mass and a spring are added to a plate:
 
 >>> import flexplant as fx
 >>> plate = fx.plate(

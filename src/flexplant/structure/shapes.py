@@ -259,7 +259,7 @@ class BlockShape(GridShape):
         return self.elements, self.present, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion at a point.
+        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m].
 
         The internal bending modes of an element are computed from the displacements of its corners.
         Rotations rx, ry, rz are half the curl of the displacements. They jump slightly between two

@@ -1,6 +1,4 @@
-"""Model updating: parameters, residuals, sensitivities, searches and their judgement.
-
-Errors of a model are found from measurements, together with their uncertainty.
+"""Model updating: errors of a model are found from measurements, with their uncertainty.
 
 - `update(model, parameters, residuals)`: finds the parameters that fit the measurements. Parameters
   are `AddedMass`, `AddedDamping`, `AddedStiffness`, `MatrixParameter` and others. Residuals are
@@ -13,6 +11,8 @@ Errors of a model are found from measurements, together with their uncertainty.
 - `UpdateResult.applied_to(full)`: updates the full model.
 - `UpdateResult.uncertainty()`: remaining uncertainty of each mode, for robust controllers.
 
+A mass of 0.05 kg is missing in the model and is found from two poles:
+
 >>> import flexplant as fx
 >>> nominal = fx.chain(masses=[1.0, 0.3, 0.2], stiffnesses=[2e4, 3e4])
 >>> true = nominal.with_parts(fx.PointMass("3:x", 0.05))
@@ -24,8 +24,8 @@ Errors of a model are found from measurements, together with their uncertainty.
 >>> fit.converged
 True
 
-Names elsewhere: FEMtools, Nastran SOL 200, Simcenter Correlation. ``examples/measured_frf.py`` goes
-from noisy responses to a model, ``examples/paper_plate.py`` has the paper's numbers.
+Names elsewhere: FEMtools, Nastran SOL 200, Simcenter Correlation. ``examples/measured_frf.py``
+updates a model with noisy responses. ``examples/paper_plate.py`` computes the numbers of the paper.
 """
 
 from ..rooms import public_names as _public_names

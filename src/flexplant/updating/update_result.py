@@ -401,7 +401,7 @@ class UpdateResult(Value):
         return list((self._wider_std(INTERVAL) if rejected else std).tolist())
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
-        """Return random draws (count, q) of the parameters.
+        """Return random draws (count, q) of the parameters, from a generator or seed `rng`.
 
         They are normally distributed with the mean `values` and the `covariance` (Laplace's
         approximation of the posterior). A ModelError is raised if the covariance is not known.
