@@ -143,10 +143,10 @@ class StabilisationDiagram(Value):
     def automatic(self, *, presence: float = 0.5) -> PoleSelection:
         """Return the poles that are stable over the orders.
 
-        A track is accepted if its pole is stable at four or more orders, and at least at the
-        fraction `presence` of the orders from the first one of the track to the highest one. All
-        poles are taken from one order, the one with most accepted tracks. The participation vectors
-        of repeated poles therefore belong together.
+        A track is accepted if its pole is stable at four or more orders. It must also be stable at
+        the fraction `presence` of the orders, counted from the first one of the track to the
+        highest one. All poles are taken from one order, the one with most accepted tracks. The
+        participation vectors of repeated poles therefore belong together.
 
         Parameters
         ----------

@@ -66,9 +66,8 @@ def stabilisation_diagram(
         most a quarter of the number of lines, and at most 100 poles. Only every second order is
         used if a wide band and many inputs and outputs make each order costly.
     tolerances : (float, float, float)
-        Limits for a stable pole: the largest relative change of its frequency from one order to the
-        next, that of its damping, and the smallest MAC (modal assurance criterion) between its
-        shapes at both orders.
+        Three limits for a stable pole, from one order to the next: the largest relative change of
+        frequency, that of damping, and the smallest MAC (modal assurance criterion) of its shapes.
     max_zeta : float
         Largest damping ratio of a pole.
 

@@ -81,7 +81,7 @@ class ImpactTest(Value):
     segment : float [s]
         Length of record after each blow.
     decay : float [s]
-        Time constant of the window; infinite without a window.
+        Time constant of the window. It is infinite without a window.
 
     Examples
     --------

@@ -494,7 +494,7 @@ class JoiningReport(Value):
         rigid-body motion of the whole machine stretches the joint. `joined` warns of springs with a
         resultant, and refuses such rigid joints.
     mass : float [kg]
-        Mass of the machine; NaN if the machine has no displacement DOFs.
+        Mass of the machine. NaN: the machine has no displacement DOFs.
     inertia_error : float
         Largest relative difference between the inertia of the machine in the six rigid-body motions
         and the sum over its components.

@@ -32,8 +32,8 @@ class Joint(Value):
     Parameters
     ----------
     first, second : str, (str, (3,) array [m]) or Patch
-        Ends of the joint: a DOF ``"stage/41:z"``, a node ``"stage/41"`` with its directions, a
-        point ``("stage", (x, y, z))`` in the coordinates of the machine, or a patch of nodes.
+        Ends of the joint. An end is a DOF such as ``"stage/41:z"``, a node such as ``"stage/41"``,
+        a point ``("stage", (x, y, z))`` in the coordinates of the machine, or a patch of nodes.
         Without `second`, a spring or damper acts against the ground.
     axes : sequence of str, optional
         Axes along which the ends are joined, among x, y, z, rx, ry, rz, in the directions of the

@@ -264,9 +264,9 @@ class Modes(Placed, Value):
         Error ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, computed by `solve_modes`. It
         is 0 for rigid-body modes. Empty: not known.
     rounding : (k,) array
-        Relative error of each frequency, with any solver, when the entries of K are rounded to
-        double precision: ``eps |phi|^T |K| |phi| / (2 omega^2)`` with the machine precision eps. It
-        is 0 for rigid-body modes. Empty: not known.
+        Relative error of each frequency because the entries of K are rounded to double precision.
+        It is ``eps |phi|^T |K| |phi| / (2 omega^2)`` with the machine precision eps, for any
+        solver, and 0 for rigid-body modes. Empty: not known.
     certificate : Certificate
         Checks made by `solve_modes`. `orthonormality` is the largest entry of phi^T M phi - I.
         `rigid_residual` is ||K R|| / || |K| |R| || with the rigid-body motions R. `rigid_rounding`
@@ -504,9 +504,9 @@ class Modes(Placed, Value):
     def extrapolated(self, coarser: Modes, *, order: float = 2.0) -> Modes:
         """Return the modes with frequencies extrapolated from this mesh and a coarser one.
 
-        By Richardson's rule, a mode with the frequencies f here and f_coarse in the coarser mesh
-        gets ``f + (f - f_coarse) / (r^order - 1)``, where r is the ratio of the element sizes. A
-        mode may have no partner in the coarser mesh, for example when several modes have the same
+        The coarser mesh has elements r times as large. By Richardson's rule, a mode with the
+        frequencies f here and f_coarse there gets ``f + (f - f_coarse) / (r^order - 1)``. A mode
+        may have no partner in the coarser mesh, for example when several modes have the same
         frequency. Its relative correction is then interpolated between neighbouring frequencies.
         Mode shapes, damping ratios and rigid-body modes do not change.
 

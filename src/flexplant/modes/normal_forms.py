@@ -29,15 +29,15 @@ class NormalForm(Value):
     Parameters
     ----------
     poles : (k,) complex array [rad/s]
-        Poles in the upper half plane, sorted by magnitude in each of three groups: first the
-        rigid-body poles (exactly 0), then the positive real poles of unstable modes, then the
-        others. An unstable mode, caused by a spring of negative stiffness, has two real poles. The
-        growing pole s1 > 0 is listed here, and the decaying pole s2 < 0 in `decaying`.
+        Poles in the upper half plane, in three groups. The rigid-body poles (exactly 0) come first,
+        then the positive real poles of unstable modes, then the others. Each group is sorted by
+        magnitude. An unstable mode, caused by a spring of negative stiffness, has two real poles.
+        The growing pole s1 > 0 is listed here, and the decaying pole s2 < 0 in `decaying`.
     phi : (n, k) array
         Mode shapes with ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``, where lambda is the pole.
         They are real and mass-normalised when D is proportional, and complex otherwise. Rigid-body
         shapes are real and M-orthonormal. The poles s1 and s2 of an unstable mode have the shapes
-        ``v1 = Re phi + Im phi`` and ``v2 = Re phi - Im phi``, with
+        ``v1 = Re phi + Im phi`` and ``v2 = Re phi - Im phi``. They are scaled so that
         ``v1^T (2 s1 M + D) v1 = s1 - s2 = -v2^T (2 s2 M + D) v2``.
     n_rigid : int
         Number of rigid-body modes.

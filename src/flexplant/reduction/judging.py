@@ -351,10 +351,10 @@ class ReductionQuality(Value):
     freq_error : (m,) array
         Relative error of each frequency. It is 0 for rigid-body modes and NaN without a partner.
     mac : (m,) array
-        Modal assurance criterion (MAC) of each full mode and its reduced mode, with the mass matrix
-        as weight for an FEModel: 1 for equal shapes, 0 for orthogonal ones. The shapes of repeated
-        modes are an arbitrary basis of a subspace. The values of repeated modes are therefore the
-        squared cosines of the angles between the subspaces of the two models.
+        Modal assurance criterion (MAC) of each full mode and its reduced mode. It is 1 for equal
+        shapes and 0 for orthogonal ones. For an FEModel, the mass matrix is the weight. The shapes
+        of repeated modes are an arbitrary basis of a subspace. The values of repeated modes are
+        therefore the squared cosines of the angles between the subspaces of the two models.
     group : (m,) array of int
         Number of the group of each mode, which is the number of the first mode in the group. Shapes
         of modes in a group cannot be distinguished. If one mode of a group has no partner in the

@@ -60,8 +60,8 @@ class ModalTruncation(ReductionMethod):
     With an FEModel and one damping ratio for all modes, the bound covers all modes of the
     structure, including modes that were not solved. By the Cauchy-Schwarz inequality the sum is at
     most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``. The columns of B are unit
-    forces at the inputs, the rows of C give the displacements at the outputs, and G is the residual
-    flexibility of the truncated modes from a static solution. With `static_at`, the peaks of the
+    forces at the inputs, and the rows of C give the displacements at the outputs. G is the residual
+    flexibility of the truncated modes, from a static solution. With `static_at`, the peaks of the
     attachment vectors are added.
 
     `ErrorBound.below` gives a bound for the frequencies up to a limit. Modes above the limit are

@@ -42,7 +42,7 @@ class Damping(Value):
 
     @abstractmethod
     def zeta(self, omega: FloatArray) -> FloatArray:
-        """Return the damping ratios of modes; rigid-body modes (omega = 0) are undamped.
+        """Return the damping ratios of modes. Those of rigid-body modes (omega = 0) are 0.
 
         Parameters
         ----------

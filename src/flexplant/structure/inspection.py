@@ -35,9 +35,9 @@ class ModelCheck(Value):
         Lines of the table. The verdict is "ok", "note" (the finding deserves attention) or "fail"
         (data are missing or wrong).
     mass : (3,) array [kg]
-        Mass in translation along x, y, z; NaN for a direction without a DOF.
+        Mass in translation along x, y, z. NaN: the direction has no DOF.
     center : (3,) array [m]
-        Centre of gravity; NaN where the DOFs do not determine it.
+        Centre of gravity. NaN: the DOFs do not determine it.
     inertia : (3, 3) array [kg m^2]
         Inertia about the centre of gravity.
     rigid : tuple of str
@@ -57,7 +57,7 @@ class ModelCheck(Value):
     n_pieces : int
         Number of parts of the structure that are not joined.
     first_freq : float [Hz]
-        Frequency of the first elastic mode; NaN when it is not known.
+        Frequency of the first elastic mode. NaN: it is not known.
     source : str or None
         Name of the model that was checked.
 
@@ -122,9 +122,9 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     The report covers symmetry and definiteness (by factorisation), and the rigid-body motions of K,
     which are compared with those of the geometry. It names mechanisms (motions without elastic
     energy that are not rigid-body motions) and the DOFs that move in them. It gives total mass,
-    centre of gravity and inertia. It also covers DOFs without mass or stiffness, parts that are not
-    joined, penalties (very stiff springs that hold DOFs), unusual units, damping to ground, and
-    digits that K lost in a text file or in single precision. Nothing is changed or repaired.
+    centre of gravity and inertia. It also lists DOFs without mass or stiffness, parts that are not
+    joined, and penalties (very stiff springs that hold DOFs). It shows unusual units, damping to
+    ground, and digits that K lost in a text file or in single precision. The model is not changed.
 
     Parameters
     ----------

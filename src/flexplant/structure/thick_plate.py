@@ -233,8 +233,8 @@ def plate(
 
     See Also
     --------
-    kirchhoff_plate : the thin plate; its frequencies are 3 to 5 % too high at a wave length of
-    fifteen times the thickness.
+    kirchhoff_plate : the thin plate, with frequencies that are 3 to 5 % too high at a wave length
+    of fifteen times the thickness.
 
     Examples
     --------

@@ -49,22 +49,22 @@ class Machines(Value):
     and is passed to a plant by ``plant.uncertain(machines)``. A plant of
     ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal coordinates
     of the plant's evaluation model. There, the mass matrix is the unit matrix I, and Omega is the
-    diagonal matrix of the frequencies:
+    diagonal matrix of the frequencies. Each draw has four steps:
 
-    - the deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
-      from their posterior distribution (`Trend`);
-    - the trend is ``t = sign(b) log(1 + 2 |b| g) / 2``, where g is the frequency of a mode divided
-      by the largest measured frequency. A fraction r of the trend, uniformly distributed between
-      0 and 1, changes the mass, and the rest changes the stiffness;
-    - the matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
+    - The deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
+      from their posterior distribution (`Trend`).
+    - The trend is ``t = sign(b) log(1 + 2 |b| g) / 2``, where g is the frequency of a mode divided
+      by the largest measured frequency. A fraction r of the trend changes the mass, and the rest
+      changes the stiffness. The fraction is uniformly distributed between 0 and 1.
+    - The matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
       ``K' = Omega exp(E) Omega + sum dp dK``. The matrix E is symmetric. Its diagonal elements are
       ``2 (s e + (1 - r) t)`` with standard normal numbers e, and its other elements have the
       standard deviation ``sqrt(2) s``. Frequencies and shapes therefore change together. The
       element of E between a mode below the measured band and a mode in or above it is smaller, by
       the ratio of the two frequencies. Such a low mode is a motion on isolators, which strains
       other springs than the measured modes. The masses of rigid-body modes have the relative
-      deviation 2 s, because they are not measured;
-    - the poles of measured modes are drawn from their covariance. The damping ratios of other modes
+      deviation 2 s, because they are not measured.
+    - The poles of measured modes are drawn from their covariance. The damping ratios of other modes
       follow the predictive distribution (Student's) of the measured ratios.
 
     Parameters

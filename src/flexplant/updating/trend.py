@@ -161,7 +161,7 @@ class Trend(Value):
 
     @cached_property
     def outlier(self) -> tuple[int, float] | None:
-        """The mode that is an outlier, and its relative error; None if there is no outlier.
+        """The mode that is an outlier, with its relative error. None if there is no outlier.
 
         The test divides the residual of each mode by the deviation that is estimated from the other
         modes (externally studentised residual). It follows Student's distribution with one degree
@@ -187,7 +187,7 @@ class Trend(Value):
 
     @property
     def missing(self) -> str:
-        """Reason why the uncertainty of machines cannot be computed; empty if it can."""
+        """Reason why the uncertainty of machines cannot be computed, or an empty text if it can."""
         q = self.S.shape[1]
         if self.dof < 1:
             return (

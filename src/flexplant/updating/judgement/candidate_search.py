@@ -87,12 +87,12 @@ def localise(
 
     Notes
     -----
-    The probability that a superfluous candidate is chosen is known. If k of c candidates are
-    chosen, another one is added if it lowers chi-square by more than the price
-    ``ln n + 2 ln((c - k) / (k + 1))``, where n is the number of data. Noise lowers chi-square by
-    more than this with the probability ``(c - k) P(chi2_1 > price)``, where chi2_1 follows the
-    chi-square distribution with one degree of freedom. For 12 to 25 candidates, 20 to 24 data and
-    one true change, this happens in 10 to 13 of 100 measurements. The `margin` is then small.
+    The probability that a superfluous candidate is chosen is known. Let n be the number of data,
+    and let k of c candidates be chosen already. Another one is added if it lowers chi-square by
+    more than the price ``ln n + 2 ln((c - k) / (k + 1))``. By noise alone this happens with the
+    probability ``(c - k) P(chi2_1 > price)``, where chi2_1 follows the chi-square distribution with
+    one degree of freedom. For 12 to 25 candidates, 20 to 24 data and one true change, this happens
+    in 10 to 13 of 100 measurements. The `margin` is then small.
 
     References
     ----------

@@ -156,11 +156,11 @@ class Correlation(Value):
     zeta_error : (m,) array [-]
         Damping ratios of the model minus the measured ones.
     mac : (m, m) array
-        MAC of measured shapes (rows) with those of the model; empty without shapes.
+        MAC of measured shapes (rows) with those of the model. Empty: no shapes were given.
     frac : (n_out, n_in) array
-        Frequency response assurance criterion of the responses; empty without responses.
+        Frequency response assurance criterion of the responses. Empty: no responses were given.
     fdac : (n_freq, n_freq) array
-        Frequency domain assurance criterion of the responses; empty without responses.
+        Frequency domain assurance criterion of the responses. Empty: no responses were given.
     alike : sequence of groups of int
         Groups of the model's modes in the measured range whose shapes the sensors cannot
         distinguish. Their MAC with each other at the sensors is above 0.9. These modes are paired

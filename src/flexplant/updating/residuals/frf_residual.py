@@ -42,7 +42,7 @@ class FrfResidual(Residual):
     ----------
     measured : Frf
         Responses of outputs to inputs [quantity / N]. `measured.quantity` is displacement, velocity
-        or acceleration; None means displacement.
+        or acceleration. None: displacement.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
         Variance ``E|noise|^2`` of each entry. None: the variance of the Frf. If that was estimated
         with nu degrees of freedom (`freedom`), it is multiplied by ``nu / (nu - 1)``. The
@@ -68,9 +68,9 @@ class FrfResidual(Residual):
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When no line remains, the variance is not positive, channels are unknown, lines lie above
-        half the rate of the hold, a delay is given without a hold, or accelerations are given with
-        a hold (accelerations jump at the sampling instants).
+        When no line remains, the variance is not positive, or channels are unknown. When lines lie
+        above half the rate of the hold, or a delay is given without a hold. When accelerations are
+        given with a hold, since they jump at the sampling instants.
 
     Examples
     --------

@@ -79,8 +79,8 @@ class _ModalResidual(Residual):
 class Eigenvalues(_ModalResidual):
     """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
 
-    The error is ``e = d lambda^H W d lambda``, where d lambda are the residuals and W is a real,
-    positive and diagonal matrix of weights (equations (10) and (12) of the paper).
+    The error is ``e = d lambda^H W d lambda`` with the residuals d lambda. W is a real, positive
+    and diagonal matrix of weights (equations (10) and (12) of the paper).
 
     Parameters
     ----------
