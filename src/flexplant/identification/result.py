@@ -274,10 +274,10 @@ class IdentifiedModes(MeasuredModes):
     input_dofs : sequence of n_in str
         Labels of the inputs' DOFs, or their names where no DOF is known.
     terms : (n_out, n_in, number of terms) array
-        Coefficients of the residual terms E(s). First come the `lower` terms in 1/s, 1/s^2,
-        ..., then the terms in 1, s, .... Here s is divided by ``2 pi top``.
+        Coefficients of the residual terms E(s). The first `lower` ones belong to 1/s, 1/s^2 and so
+        on, and the others to 1, s, s^2 and so on. In these powers, s is divided by ``2 pi top``.
     lower : int
-        Number of the terms in 1/s, 1/s^2, ....
+        Number of the terms with negative powers of s.
     top : float [Hz]
         Largest frequency of the measured lines, which scales s in E(s).
     hold : float [Hz], optional
@@ -287,31 +287,32 @@ class IdentifiedModes(MeasuredModes):
     segment : float [s], optional
         Length of the Hann-windowed segments of the measurement, whose effect the fit includes.
     unreported : complex array
-        Poles just outside the band that improve the fit, with their shapes and participation.
+        Poles just outside the band that improve the fit, with their shapes and participation
+        vectors.
     mass_normalised : bool
-        Whether the shapes are scaled as those of a model, ``phi^T (2 lambda M + D) phi = 2i
+        Whether the shapes are scaled as those of a model, with ``phi^T (2 lambda M + D) phi = 2i
         Im(lambda)``. This needs an input and an output at the same DOF. Otherwise the largest entry
         of each shape is 1.
     misfit : float
-        Weighted squared error of the fit per degree of freedom: 1 when the error is only noise with
-        the stated variance.
+        Weighted squared error of the fit per degree of freedom. It is 1 if the error is only noise
+        with the stated variance.
     diagram : StabilisationDiagram, optional
         Diagram from which the poles were chosen.
     channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
         Covariance E[n n^H] of the error n of the vector [shape; participation] of each mode,
         including the error of its scale. It follows from the variance of the FRF and from the
-        correlation between the errors of outputs, which are assumed independent where this
-        correlation is not known.
+        correlation between the errors of outputs. If this correlation is not known, the errors of
+        outputs are assumed independent.
     rejected : sequence of (frequency [Hz], damping ratio, reason)
         Poles and mains lines that are not reported.
     first_answer : str
-        Reason why the poles were not refined by maximum likelihood; empty if they were (`refined`).
+        Reason why the poles were not refined by maximum likelihood. Empty: they were refined.
     inconsistency : float, optional
-        Relative difference of the frequencies that separate outputs (or inputs) show, if they
-        disagree. The poles are then means over these channels, and their covariance follows from
-        the differences.
+        Relative difference between the frequencies that are found from separate outputs, inputs or
+        runs. The poles are then means over these, and their covariance follows from the
+        differences. None: the frequencies agree.
     inconsistent : str
-        Kind of the channels that disagree, "outputs", "inputs" or "runs"; empty if they agree.
+        Kind of the data that disagree: "outputs", "inputs" or "runs". Empty: they agree.
     undamped : float [rad/s]
         Damping of an exponential window, already subtracted from the poles.
     """
