@@ -3,16 +3,17 @@
 `Ports` define the places of disturbances w, actuators u, points of interest z and sensors y, once
 for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K y``.
 
-- `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
+- `assemble_plant(model, ports)`: returns a `StandardPlant`. `standard_plant` makes one from a
+  system that you built in another way.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
 - `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes some.
 - `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: the plant with its
-  uncertainty, as Deltas for analysis and as machines drawn at random; your own kind of uncertainty
-  derives from `Uncertainty`. Dynamics that the model lacks: `Neglected` modes,
-  `UnmodelledDynamics(weight, at="u1")`.
-- Your own kind of sensor derives from `SensorPort`, a force from `ForcePort`.
-- `decouple`: the axes that the actuators move (`gravity_axes`: those of a free body, with its
-  mass); `frequency_response` of structures between their ports.
+  uncertainty, as Deltas for analysis and as machines drawn at random. Your own kind of uncertainty
+  derives from `Uncertainty`. Two kinds describe dynamics that the model lacks: `Neglected` modes,
+  and `UnmodelledDynamics(weight, at="u1")`.
+- Your own kind of sensor derives from `SensorPort`, your own kind of force from `ForcePort`.
+- `decouple` finds the axes that the actuators move, and `gravity_axes` those of a free body, with
+  its mass. `frequency_response` computes the response of a structure between its ports.
 
 >>> import flexplant as fx
 >>> chain = fx.chain(masses=[1.0, 0.3], stiffnesses=[2e4])
@@ -37,18 +38,21 @@ for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u =
 | `die:error`, `die:hat` | reference minus POI, and its estimate |
 | `y1:noise`, `u1:effort` | noise of a sensor, force of an actuator |
 
-White noise has the intensity asd^2 / 2, a sensor's sample the variance asd^2 rate / 2. Within a
-sample: measure, update, control, hold.
+White noise of the one-sided density asd has the intensity asd^2 / 2. The noise of one sample of a
+sensor has the variance asd^2 rate / 2. In each sample the sensors are read, the estimate is
+updated, the controller computes u, and u is held until the next sample.
 
 **Weights of a stage.** ``plant.weighted(...)`` takes those of `stage_weights`, or your own
 weights: numbers, `fx.lti.low_pass_filter`, `fx.lti.inverse_sensitivity`, any system with one input
 and one output.
 
-The effect of its arguments is shown for the plate of ``examples/wafer_stage.py`` at 0.1 % damping,
-10 kHz, with a delay of 1.3 samples. The design uses a reduced model with measured poles, with
-``uncertainty`` for the other modes; the results are those of a machine that is computed with
-another theory. "to" is the frequency at which |S| from reference to error reaches 1; the other
-columns are the peak of |S|, the modulus margin at u, and |S| at 5 Hz::
+The table shows the effect of the arguments of `stage_weights` for the plate of
+``examples/wafer_stage.py`` at 0.1 % damping, 10 kHz, with a delay of 1.3 samples. The design uses a
+reduced model with measured poles, with ``uncertainty`` for the other modes. The results are those
+of a machine that is computed with another plate theory. "changed" is the argument that differs from
+its default, and "gamma" is the H-infinity norm of the weighted closed loop. "to" is the frequency
+at which |S| from reference to error reaches 1. The other columns are the peak of |S|, the modulus
+margin at u, and |S| at 5 Hz::
 
     bandwidth  changed          gamma   to [Hz]  |S| [dB]  margin at u  |S| at 5 Hz
            60                    1.00      44       5.1        0.53        0.0032
@@ -65,16 +69,17 @@ columns are the peak of |S|, the modulus margin at u, and |S| at 5 Hz::
 A larger effort makes the loop slower and its margin larger. Disturbance and noise have
 little influence here. With peak 6 the loop is unstable, because one mode of the machine has another
 frequency than in the model. The defaults of disturbance and effort are 20 and 10 with
-``uncertainty``, 3 and 3 without. The larger they are, the more |T| at u determines gamma. Noise
-below 0.02 gives the controller more gain at the modes that the model lacks.
+``uncertainty``, and 3 and 3 without it. The larger they are, the more the complementary sensitivity
+|T| at u determines gamma. Noise below 0.02 gives the controller more gain at the modes that the
+model lacks.
 
 Without ``uncertainty``, a design for 80 Hz on the same model is unstable on that machine. At 1 %
-damping that design has a margin of 0.44 on the machine (0.34 on the drawing). With
+damping that design has a margin of 0.44 on the machine (0.34 on the model of the drawing). With
 ``uncertainty`` the margin is 0.50, but |S| reaches 1 at 62 Hz already. `fx.design_stage` finds the
 largest bandwidth with a margin of 0.4.
 
-Names elsewhere: ``augw``, ``mixsyn``: `mixed_sensitivity`, then `fx.design_hinf`; ``connect``,
-``sumblk``: not needed, channels are found by name.
+For MATLAB's ``augw`` and ``mixsyn`` use `mixed_sensitivity`, then `fx.design_hinf`. ``connect`` and
+``sumblk`` are not needed, because channels are found by name.
 """
 
 from ..rooms import public_names as _public_names

@@ -368,10 +368,10 @@ class Assumption(Value):
     Parameters
     ----------
     key : str
-        Name of the assumption. For every mode that does not decay: w reaches it (`excited`), y sees
-        it (`detectable`), z sees it (`performance`), u reaches it (`stabilisable`). `D12` and `D21`
-        have full rank. `P12` (u -> z) and `P21` (w -> y) have no invariant zeros on the stability
-        limit.
+        Name of the assumption. Four of them concern the modes that do not decay: w reaches each of
+        them (`excited`), y sees it (`detectable`), z sees it (`performance`), and u reaches it
+        (`stabilisable`). `D12` and `D21` have full rank. `P12` (u -> z) and `P21` (w -> y) have no
+        invariant zeros on the stability limit.
     holds : bool
         Whether the assumption holds.
     finding : str
@@ -435,7 +435,7 @@ class AssumptionReport(Value):
 
     @property
     def ok(self) -> bool:
-        """Whether all hold."""
+        """Whether all assumptions hold."""
         return all(item.holds for item in self.assumptions)
 
     def __getitem__(self, key: str) -> Assumption:

@@ -42,12 +42,11 @@ class DrivenAxes(Value):
     actuators : sequence of m str
         Actuators of the plant.
     freq : (r,) array [Hz]
-        Frequencies of sigma = 2 pi freq at which each axis is decoupled.
-    T : (m, r) array
-        Commands of the axes to actuators: ``G(sigma) T = I / sigma^2`` with ``G(sigma)`` the
-        response of the channels to the actuators at z = exp(sigma dt), apart from the factor
-        ``exp(-sigma dt (delay + 1/2))`` of hold and delay. Where an axis moves as a mass, its
-        command is its acceleration, and T contains the mass.
+        Frequency at which each axis is decoupled; sigma = 2 pi freq. T : (m, r) array
+        Matrix from commands of the axes to actuators. It satisfies ``G(sigma) T = I / sigma^2``.
+        ``G(sigma)`` is the response of the channels to the actuators at z = exp(sigma dt), without
+        the factor ``exp(-sigma dt (delay + 1/2))`` of hold and delay. Where an axis moves as a
+        mass, its command is its acceleration, and T contains the mass.
 
     Examples
     --------
@@ -106,9 +105,9 @@ def driven_axes(
     Raises
     ------
     AssumptionError
-        When the actuators do not move the axes apart at rest, whatever the frequencies asked; when
-        neither axes nor POI are given and sensors or actuators do not suffice to hold a free motion
-        that the axes do not show.
+        When the actuators cannot move the axes independently at rest; this does not depend on
+        `freq`. Also when neither axes nor POI are given, and the sensors or actuators do not
+        suffice to hold a free motion that the axes do not show.
     LabelError
         When a channel is not one of the plant's, or the plant has no POI.
 

@@ -27,9 +27,9 @@ _UNITS = (
 class GravityAxes(Value):
     """Static transformations between the channels of a plant and its rigid body.
 
-    With G the rigid-body part of the plant u -> y, ``to_motions G to_actuators = mass^-1 / s^2``
-    and ``to_motions G accelerations = I / s^2``. On ground springs the same transformations are
-    valid above the suspension frequencies, where the inertia dominates.
+    Let G be the rigid-body part of the plant from u to y. Then ``to_motions G to_actuators =
+    mass^-1 / s^2`` and ``to_motions G accelerations = I / s^2``. On ground springs the same
+    transformations are valid above the suspension frequencies, where the inertia dominates.
 
     Parameters
     ----------
@@ -89,14 +89,15 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     Returns
     -------
     GravityAxes
-        Filters of the ports count with their static gains. Only displacement sensors are used.
+        The static transformations. The filters of the ports enter by their static gains. Only
+        displacement sensors are used.
 
     Raises
     ------
     AssumptionError
-        When the actuators do not reach, or the sensors do not see, an axis independently of the
-        others; when no axes are given and actuators or sensors act along an axis that the model's
-        shapes do not contain.
+        When the actuators cannot move the axes independently, or the sensors cannot distinguish
+        them. Also when no axes are given, and actuators or sensors act along an axis that the mode
+        shapes of the model do not contain.
     LabelError, ModelError
         When an axis is not one of the structure's; when the plant was not assembled from a
         structure, or it is held.

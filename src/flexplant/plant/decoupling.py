@@ -33,8 +33,8 @@ class Decoupling(Value):
         T: commands `die:z:command` of the axes [m/s^2, rad/s^2] to actuators.
     to_motions : StateSpace
         T_y: from the sensors to the motions of the axes `die:z` [m, rad]. It is a least-squares
-        estimate, weighted by the noise of the sensors. An axis that is itself a sensor is that
-        sensor.
+        estimate, weighted by the noise of the sensors. If an axis is a channel of y, its motion is
+        the signal of this sensor.
 
     Examples
     --------
@@ -95,20 +95,20 @@ def decouple(
     axes : sequence of str, optional
         Channels of z or y, as for `flexplant.plant.driven_axes`.
     bandwidth : float or mapping {axis: float} [Hz], optional
-        Frequency at which the axes are decoupled, about the crossover of their loops; a hundredth
-        of the rate when not given.
+        Frequency at which the axes are decoupled, about the crossover of their loops. By default it
+        is chosen as in `flexplant.plant.driven_axes`.
 
     Returns
     -------
     Decoupling
-        Sensors of displacements are used, where there are some; else those of velocities, or of
-        accelerations.
+        It uses the displacement sensors. If there are none, it uses the velocity sensors, otherwise
+        the accelerometers.
 
     Raises
     ------
     AssumptionError
-        When the actuators do not move the axes apart, or the sensors do not tell them apart.
-    LabelError, ModelError
+        When the actuators cannot move the axes independently, or the sensors cannot distinguish the
+    axes. LabelError, ModelError
         When an axis is unknown; when the plant was not assembled from a structure.
 
     References

@@ -210,7 +210,7 @@ class Actuator(_PlacedForce):
         of the plant.
     latency : float [s]
         Delay of the command by cable or bus, in seconds, in addition to the `delay` in samples of
-        `discretized`. It acts exactly, also between samples, once the plant is sampled; a
+        `discretized`. A sampled plant contains it exactly, also if it is a fraction of a sample. A
         continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
@@ -246,7 +246,7 @@ class Actuator(_PlacedForce):
 
     @property
     def filter(self) -> StateSpace | None:
-        """Amplifier and motor."""
+        """The system of amplifier and motor, from command to force."""
         return self.dynamics
 
 
@@ -284,9 +284,7 @@ class FirstOrder(_Spectrum):
     Parameters
     ----------
     rms : float [N]
-        Its root mean square.
-    corner : float [Hz]
-        omega / (2 pi).
+        Root mean square of the force. corner : float [Hz] Corner frequency, omega / (2 pi).
 
     Examples
     --------
@@ -306,7 +304,7 @@ class FirstOrder(_Spectrum):
 
     @property
     def shape(self) -> StateSpace:
-        """The low-pass."""
+        """The low-pass filter."""
         omega = 2 * np.pi * self.corner
         return StateSpace([[-omega]], [[omega]], [[1.0]], [[0.0]], states=["force"])
 
@@ -323,10 +321,8 @@ class NarrowBand(_Spectrum):
     Parameters
     ----------
     rms : float [N]
-        Its root mean square.
-    freq : float [Hz]
-        omega / (2 pi).
-    zeta : float
+        Root mean square of the force. freq : float [Hz] Centre frequency, omega / (2 pi). zeta :
+    float
         Half the relative bandwidth, below 1.
 
     Examples
@@ -351,7 +347,7 @@ class NarrowBand(_Spectrum):
 
     @property
     def shape(self) -> StateSpace:
-        """The band-pass."""
+        """The band-pass filter."""
         omega = 2 * np.pi * self.freq
         width = 2 * self.zeta * omega
         return StateSpace(
@@ -364,8 +360,8 @@ class NarrowBand(_Spectrum):
 class RandomWalk(_Spectrum):
     """A slowly drifting force (bias). Its change over a time t has the rms ``drift t^(1/2)``.
 
-    First-order noise with a corner far below all other frequencies, so that it is stationary and
-    all variances are finite. Above the corner it cannot be distinguished from a random walk.
+    It is first-order noise with a corner far below all other frequencies, so that it is stationary
+    and all variances are finite. Above the corner it cannot be distinguished from a random walk.
 
     Parameters
     ----------
@@ -397,9 +393,9 @@ class RandomWalk(_Spectrum):
 class RigidForce(ForcePort):
     """A force (or moment) spread over the mass so that a free machine moves and does not bend.
 
-    The load is ``M r / (r' M r)``, with r the rigid-body motion of its axis; rotations are about
-    the centre of mass. It does the work of a unit force along r, and no work on elastic modes of a
-    free structure.
+    The load is ``M r / (r' M r)``. Here M is the mass matrix and r the rigid-body motion along the
+    direction; rotations are about the centre of mass. It does the work of a unit force along r, and
+    no work on elastic modes of a free structure.
 
     Parameters
     ----------

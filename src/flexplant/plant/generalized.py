@@ -119,7 +119,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def noise_factor(self) -> FloatArray:
-        """G (n, r), G G' the covariance that white disturbances add to x in one sample.
+        """Matrix G (n, r): white disturbances add the covariance G G' to x in one sample.
 
         It equals that of the machine if only a static block was applied; otherwise ModelError.
         """
@@ -181,10 +181,10 @@ class GeneralizedPlant(PartitionedSystem):
         z: Sequence[str] | None = None,
         y: Sequence[str] | None = None,
     ) -> GeneralizedPlant:
-        """Return the plant with some of its channels; all of a side whose names are not given.
+        """Return the plant with some channels; a side without names keeps all of its channels.
 
-        w, z and y are exactly the channels that are named; the effort and the noise of an actuator
-        that is left out leave with it. LabelError when a name is not a channel of that side.
+        w, z and y are exactly the channels that are named. If an actuator is left out, its effort
+        and its noise are left out too. LabelError when a name is not a channel of that side.
         """
         found = self if u is None else self.around(self.unweighted.select(u=u))
         if w is not None or z is not None:

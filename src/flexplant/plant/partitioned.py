@@ -340,7 +340,7 @@ class MeasuredResponse(Value):
     frf : Frf
         Response from actuators to sensors.
     hold : bool
-        False where it was measured from sample to sample.
+        False if the response was measured from sample to sample and contains the zero-order hold.
     delay : float [samples]
         Delay that the response contains.
 

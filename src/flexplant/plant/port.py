@@ -71,7 +71,7 @@ def observed(
 
 
 class ForcePort(Value):
-    """A port in w or u. A new kind has a `name` and defines by `push` where it acts.
+    """A port in w or u. A new kind has a `name` and a method `push`, which says where it acts.
 
     Examples
     --------
@@ -99,7 +99,7 @@ class ForcePort(Value):
 
     @property
     def unit(self) -> str | None:
-        """Unit of the channel; None where it has none."""
+        """Unit of the channel; None if it has no unit."""
         return None
 
     @property
@@ -122,7 +122,7 @@ class ForcePort(Value):
 
 
 class SensorPort(Value):
-    """A port in y. A new kind has the fields below and defines by `row` or `see` what it measures.
+    """A port in y. A new kind has the fields below; its `row` or `see` says what it measures.
 
     Define `row` for a sensor of a displacement, for example of one point relative to another. With
     a `quantity`, the sensor measures the velocity or the acceleration of this displacement instead.
@@ -191,7 +191,7 @@ class SensorPort(Value):
 
     @property
     def inertial(self) -> bool:
-        """Whether it measures absolute motion: no accelerometer measures against the ground."""
+        """Whether it measures absolute motion, as every accelerometer does."""
         return self.order == 2 if self.absolute is None else self.absolute
 
     @abstractmethod

@@ -356,8 +356,8 @@ class Feedthrough(ResidualForm):
     Displacements then respond to forces at once: the matrices D12, D22 and D11 contain the static
     flexibility ``phi phi' / omega^2`` of the modes that were replaced. Velocities and accelerations
     of these modes are neglected, because they are small at frequencies far below those of the
-    modes. White forces then reach displacements directly, and samples would have infinite variance:
-    give the forces a `shape` for Kalman filters and simulation. A simulation needs a delay of at
+    modes. White forces then reach displacements directly, and samples would have infinite variance.
+    For Kalman filters and simulation, give the forces a `shape`. A simulation needs a delay of at
     least one sample, which every machine has.
 
     Parameters

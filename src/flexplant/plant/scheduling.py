@@ -26,8 +26,8 @@ class Position(Value):
     Parameters
     ----------
     name : str
-        Its name: ``plant.at(x=0.03)``.
-    range : (2,) sequence [m or rad]
+        Name of the position; a position x is changed by ``plant.at(x=0.03)``. range : (2,) sequence
+    [m or rad]
         Least and largest value.
     start : float, optional [m or rad]
         Position of a plant just after it was assembled. By default 0 if the range contains 0,
@@ -109,7 +109,8 @@ class PlaceTable(Value):
     grid : mapping {name: (k,) array} [m or rad]
         Values of each position, increasing.
     places : (k, ..., 3) array [m]
-        The place at each point of the grid, one axis for each position, in their order.
+        The place at each point of the grid. The array has one axis for each position of `grid`, in
+        the same order.
 
     Examples
     --------
@@ -160,8 +161,9 @@ class PlaceMotion(Value):
     start : (3,) array [m] or mapping {point: weight}
         The place where all positions are zero.
     along : mapping {name: (3,) array} or PlaceTable
-        Displacement of the place per unit of each position. (1, 0, 0) moves with the stage's x.
-        (-1, 0, 0) moves against it, like the point of the stage below a head on the frame.
+        Displacement of the place per unit of each position. A place with (1, 0, 0) moves with the
+        stage's x. A place with (-1, 0, 0) moves against it, like the point of the stage below a
+        head on the frame.
 
     Examples
     --------

@@ -50,7 +50,7 @@ _VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeVisibility(Value):
-    """How well w excites, u reaches, y and z see an elastic mode.
+    """How well w excites an elastic mode, u reaches it, and y and z see it.
 
     If damping couples the modes (`plant.form` is then dense), the mode is one of the undamped
     structure, and its damping is the diagonal entry of the modal damping matrix.

@@ -14,7 +14,7 @@ from .mode_delta import DampingDelta, stated_by_mode
 
 @dataclass(frozen=True, eq=False)
 class Dampings(Uncertainty):
-    """Uncertain damping of modes, a relative error of 2 zeta omega: `mode6:damping`.
+    """Uncertain damping of modes: the relative error of 2 zeta omega of each mode.
 
     Parameters
     ----------
@@ -28,8 +28,8 @@ class Dampings(Uncertainty):
     Raises
     ------
     LabelError, ModelError, ShapeError
-        When a plant lacks a mode, its modes are coupled by damping, or a share is negative, or 1 or
-        more.
+        When a plant lacks a mode, its modes are coupled by damping, or a share is not between 0
+        and 1.
 
     Examples
     --------

@@ -49,7 +49,8 @@ class Delay(Uncertainty):
     Raises
     ------
     ModelError
-        When it is not positive, or a plant is continuous or has less delay.
+        When `samples` is not positive, or a plant is continuous or has a smaller delay than
+        `samples`.
 
     Examples
     --------

@@ -21,10 +21,10 @@ class Delta(Value):
     Delta, derive a class and define its method `changed`. This method returns the machine that
     differs by a given amount, for example by means of `MachineParts.with_port`. The channels w and
     z of the Delta are computed from the plants at both ends of its range. Therefore the matrix [A
-    B; C D] of the plant must be an affine or a linear fractional function of the amount. The row of
-    a sensor that moves is taken as linear between the ends:
-    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. A kind whose channels are found in another way
-    overrides `opened`. A change of M, D or K changes the modes, and the plant is not an affine
+    B; C D] of the plant must be an affine or a linear fractional function of the amount. For a
+    sensor that moves from the point p, write its place as a sum that is linear in the amount a:
+    ``at={p: 1.0, p + h: a / 2, p - h: -a / 2}``. If the channels of your kind are found in another
+    way, override `opened`. A change of M, D or K changes the modes, and the plant is not an affine
     function of it. State such a change by `Parameters`.
 
     Parameters
@@ -33,8 +33,8 @@ class Delta(Value):
         Prefix of the channel names: `mode6:freq` has the input `mode6:freq:w` and the output
         `mode6:freq:z`.
     scale : float
-        Change at delta = 1: a relative change; for a parameter a change in its unit, for the delay
-        in samples.
+        Change at delta = 1. It is a relative change, except for a parameter (in the unit of the
+        parameter) and for the delay (in samples).
     mode : int
         Number of the mode, from 1, rigid-body modes included; 0 for a Delta that belongs to no
         mode.

@@ -37,16 +37,17 @@ class Fit(Uncertainty):
     modes is ``J C J'``. The stiffness and the damping of each mode become the Deltas `mode6:freq`,
     `mode6:damping`. If damping couples the modes (a large damper to ground, an overdamped pair),
     the parameters of the fit themselves are the Deltas, and they act on all modes and mode shapes.
-    Machines that are drawn at random have different values of the parameters; machines of a
-    calibrated plant have different modes instead.
+    Machines that are drawn at random differ in the parameters. Machines of a calibrated plant (one
+    that has the measured poles) differ in their modes instead.
 
     Parameters
     ----------
     source : UpdateResult, ModalUncertainty or MeasuredModes
         One of three sources. The first is a fit; the plant must have been assembled from the
-        `model` of this fit, directly or after calibration. If the fit has a discrepancy, or the
-        plant is calibrated, the `uncertainty` of the fit is used in its place; a mode may then
-        differ by two standard deviations. The second is the uncertainty of a calibrated model,
+        `model` of this fit, or from the model with measured poles, `fit.calibrated(measured)`. For
+        such a calibrated plant, and for a fit with a discrepancy (an estimated error of the model
+        itself), the `uncertainty` of the fit is used in its place. A mode may then differ by two
+        standard deviations. The second is the uncertainty of a calibrated model,
         ``fit.uncertainty(measured)``. The third are measured poles with mode numbers and a
         covariance.
     modes : sequence of int, optional

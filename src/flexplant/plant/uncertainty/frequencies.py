@@ -14,7 +14,7 @@ from .mode_delta import FrequencyDelta, stated_by_mode
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Frequencies(Uncertainty):
-    """Uncertain frequencies of modes, a relative error of each: `mode6:freq` on omega^2.
+    """Uncertain frequencies of modes: the relative error of each; its Delta changes omega^2.
 
     Parameters
     ----------

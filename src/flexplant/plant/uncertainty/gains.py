@@ -77,7 +77,7 @@ def _with_gain(plant: Partition, system: StateSpace, delta: GainDelta) -> StateS
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gains(Uncertainty):
-    """Uncertain gains of actuators and sensors, a relative error of each: `u1:gain`.
+    """Uncertain gains of actuators and sensors: the relative error of each gain.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Gains(Uncertainty):
     Raises
     ------
     LabelError, ModelError
-        When a plant lacks an actuator or sensor, or a share is not positive, or 1 or more.
+        When a plant lacks an actuator or sensor, or a share is not between 0 and 1.
 
     Examples
     --------

@@ -45,7 +45,7 @@ class Known(NamedTuple):
 
     @classmethod
     def independent(cls, deltas: Sequence[Delta], *, deviations: float = DEVIATIONS) -> Known:
-        """Return independent Deltas, each of which is 1 at some standard deviations."""
+        """Return independent Deltas; each is 1 at the given number of standard deviations."""
         return cls(tuple(deltas), np.eye(len(deltas)) / deviations**2)
 
 
@@ -53,8 +53,8 @@ class Uncertainty(Value):
     """A kind of uncertainty of a machine, for ``plant.uncertain(...)``.
 
     To add a new kind, derive a class and define its method `deltas`, which returns the Deltas of a
-    plant. Define `known` instead if the Deltas are correlated, or if other numbers than the Deltas
-    are drawn for a machine. For uncertain dynamics define `delta_blocks` and `with_blocks`.
+    plant. Define `known` instead if the Deltas are correlated, or if a machine is drawn by other
+    numbers than the Deltas. For uncertain dynamics define `delta_blocks` and `with_blocks`.
 
     Examples
     --------

@@ -17,23 +17,23 @@ class Neglected(Uncertainty):
     """The modes that a plant lacks: one dynamic Delta with weights that bound their effect.
 
     Machines that are drawn at random have these modes, and Deltas of modes act on the modes with
-    the same numbers. An exception are parameters of the plant's own model: if these are drawn, the
-    drawn machines do not have the neglected modes.
+    the same numbers. If parameters of the plant's own model are drawn, however, the machines do not
+    have the neglected modes.
 
     Parameters
     ----------
     model : StandardPlant, FEModel, Modes, ReducedModel or NeglectedModes, optional
-        A model of the same machine with more modes: the difference from w and u to z and y is
-        bounded by additive weights (see `NeglectedModes`). A structure gets the plant's ports, a
-        plant must have its channels. The plant's evaluation model when not given.
+        Model of the same machine with more modes. Additive weights bound its difference from the
+        plant, from w and u to z and y (see `NeglectedModes`). A structure gets the plant's ports; a
+        plant must have the same channels. By default this is the plant's evaluation model.
     resonances : int
         Number of neglected modes that the weights follow.
 
     Raises
     ------
     ModelError, CertificateError
-        When the model has other channels, does not differ or differs in its rigid body; when the
-        bound cannot be verified.
+        When the model has other channels, does not differ from the plant, or differs in its
+        rigid-body modes. Also when the bound cannot be verified.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Neglected(Uncertainty):
         return neglected_modes(plant, self._whole(plant), resonances=self.resonances)
 
     def larger(self, plant: Partition) -> Any:
-        """Return the plant with these modes, None where only a bound is known."""
+        """Return the plant with these modes; None if only a bound is known."""
         return None if isinstance(self.model, NeglectedModes) else self._whole(plant)
 
     def _whole(self, plant: Any) -> Any:
