@@ -81,7 +81,8 @@ class PlantMachines:
     these machines come from the fit. Otherwise they come from the uncertainty that the user states:
     frequencies, with the changes of the mode shapes that belong to them, and dampings. Gains,
     delays and other stated Deltas are drawn as well. Machines have the modes of the evaluation
-    model, except where parameters or shapes of the plant's own model are stated.
+    model, unless the stated uncertainty contains parameters or mode shapes of the plant's own
+    model.
 
     Parameters
     ----------
@@ -128,7 +129,8 @@ class PlantMachines:
         Raises
         ------
         ModelError
-            When a machine is not physical: what is known reaches beyond what the structure allows.
+            When a drawn machine is not physical, because the uncertainty is larger than the
+            structure allows.
         """
         return list(self.each(count, rng=rng))
 

@@ -175,7 +175,7 @@ class SensorPort(Value):
 
     @property
     def unit(self) -> str | None:
-        """Unit of the channel: that of the motion at its place, None for a sum of both kinds.
+        """Unit of the channel: that of the motion at its place; None for a sum of m and rad.
 
         A kind that measures something else has a field `unit` instead; one that overrides `see`
         has no unit unless it states one.

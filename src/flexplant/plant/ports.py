@@ -46,8 +46,9 @@ class Sensor(SensorPort):
         Stable system of sensor and anti-alias filter, from motion to signal. Its states are added
         to those of the plant.
     latency : float [s]
-        Delay of the signal, in seconds. In a sampled plant it is exact, also between samples; a
-        continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
+        Delay of the signal, in seconds. A sampled plant contains it exactly, also if it is a
+        fraction of a sample. A continuous plant neglects it and says so (`ports.with_pade(order)`
+        approximates it there).
     absolute : bool, optional
         Whether the sensor also measures the motion of the floor (BaseAcceleration): True for
         inertial sensors such as a geophone (absolute velocity), False for sensors that measure
@@ -98,8 +99,9 @@ class Poi(Value):
     name : str
         Name of the POI; its channels in z are `name:axis`.
     at : str, (3,) array [m] or mapping {place: weight}
-        A DOF label (the axes replace its direction), any point of the structure, or a weighted sum
-        of places, ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``, which has one axis.
+        A DOF label, any point of the structure, or a weighted sum of places. The direction of a
+        single label is ignored, because `axes` gives the directions. A weighted sum has one axis;
+        an example is ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``.
     axes : sequence of str
         Motions among x, y, z [m], rx, ry, rz [rad]; a Reference uses the first one unless it names
         others. Labels in a weighted sum keep their own directions.
@@ -368,13 +370,14 @@ class Ports(Value):
     def units(self) -> dict[str, str]:
         """The SI units of all channels that have one, and of derived channels.
 
-        Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
-        sensors, unless a coloured noise states a `unit`; references, errors and estimates like
-        their POI, efforts like their actuator. A weighted sum of displacements and rotations has
-        the unit of its displacements if the vector of their weights has the length 1, because the
-        weights of the rotations are then lever arms [m]. It has the unit of its rotations if the
-        vector of the rotations' weights has the length 1. It has no unit if this length is 1 for
-        both groups or for neither. Filters of ports do not change units.
+        Forces have the unit N or N m and motions m or rad (per s, per s^2), according to their
+        directions. Noises have the unit of their sensors, unless a coloured noise states a `unit`.
+        References, errors and estimates have the unit of their POI, efforts that of their actuator.
+        A weighted sum of displacements and rotations has the unit of its displacements if the
+        vector of their weights has the length 1, because the weights of the rotations are then
+        lever arms [m]. It has the unit of its rotations if the vector of the rotations' weights has
+        the length 1. It has no unit if this length is 1 for both groups or for neither. Filters of
+        ports do not change units.
         """
         found = {port.name: port.unit for port in self.physical}
         for port in self.w:
@@ -403,7 +406,7 @@ class Ports(Value):
 
     @property
     def followed(self) -> tuple[tuple[Poi, str], ...]:
-        """The axes that have a set-point, each after its POI."""
+        """The axes that have a set-point, as pairs of a POI and an axis."""
         pois = ((self.poi(one.poi), one.axes) for one in self.references)
         return tuple((poi, axis) for poi, axes in pois for axis in axes or poi.axes[:1])
 
@@ -427,7 +430,8 @@ class Ports(Value):
     def with_pade(self, order: int = 2) -> Ports:
         """Return the ports with every latency as an all-pass filter, for continuous designs.
 
-        `order`, 1 or more: states of each; the phase is correct up to ``order / (6 latency)`` Hz.
+        `order` is the number of states of each filter, at least 1. The phase is correct up to
+        ``order / (6 latency)`` Hz.
         """
 
         def late(port: Any) -> Any:

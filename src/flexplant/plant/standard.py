@@ -56,18 +56,20 @@ class StandardPlant(Partition):
         Origin of the plant: `plant.assembled` holds ports, modes, noise and delay of a plant that
         was assembled from a structure.
     uncertainty : UncertainPlant, optional
-        Uncertainty of its modes, in ``plant.uncertain(...).nominal``; kept when weights are added.
+        Uncertainty of the plant. It exists in ``plant.uncertain(...).nominal``, and it is kept when
+        weights are added.
     evaluation : EvaluationModel, optional
         Larger model of the same machine, on which results are checked; see `assemble_plant`.
         ``plant.replace(evaluation=model)`` changes it, ``plant.replace(evaluation=None)`` removes
         it.
     measurement : MeasuredResponse, optional
-        The measured response on which loops are judged: of ``plant.measured(frf)``.
+        Measured response on which loops are judged; ``plant.measured(frf)`` adds it.
 
     Raises
     ------
     LabelError
-        When the names are not those of the system's channels, in this order, or u and y share one.
+        When the names are not those of the system's channels, in this order, or u and y have a name
+        in common.
     ModelError
         When a density is negative or not finite.
 
@@ -145,7 +147,8 @@ class StandardPlant(Partition):
         Raises
         ------
         LabelError, ModelError
-            When a name is unknown; when a weight is not one by one, or of another sampling time.
+            When a name is unknown; when a weight has several inputs or outputs, or another sampling
+            time.
         """
         return weighted(self, *both_weights(weights, z, w))
 
@@ -255,13 +258,15 @@ class StandardPlant(Partition):
     def measured(self, frf: Frf, *, hold: bool = True, delay: float = 0.0) -> StandardPlant:
         """Return the plant with the measured response of its machine, on which loops are judged.
 
-        A plant of ``fit.calibrated(measured)`` has the response to which the model was fitted
-        (`FrfResidual` without a hold) where channels have the names of its actuators and sensors.
+        A plant made from ``fit.calibrated(measured)`` has such a response already, if the model was
+        fitted to a response (`FrfResidual` without a hold) whose channels have the names of the
+        plant's actuators and sensors.
 
         Parameters
         ----------
         frf : Frf
-            From actuators to sensors of this plant, by their names; some of them suffice.
+            Response from actuators to sensors of this plant, which are found by name. It may
+            contain only some of them.
         hold : bool
             False for a response that was measured from sample to sample: it has the zero-order
             hold in it.
@@ -312,8 +317,9 @@ class StandardPlant(Partition):
         Parameters
         ----------
         name : str
-            A POI; or an actuator or disturbance of a continuous plant.
+            Name of a POI, or of an actuator or disturbance of a continuous plant.
         points : (p, 3) array [m]
+            Points of the structure at which the port is placed.
 
         Raises
         ------
@@ -340,7 +346,7 @@ class StandardPlant(Partition):
             `Fit`: a fit, its uncertainty or measured modes may be given directly. Your own kind
             derives from `Uncertainty`.
         frequency, damping : float, (m,) array or {mode: float}, optional
-            Short for `Frequencies` and `Dampings`.
+            The same as `Frequencies(frequency)` and `Dampings(damping)`.
 
         Returns
         -------
@@ -376,9 +382,10 @@ class StandardPlant(Partition):
     def machines(self) -> PlantMachines | None:
         """Possible machines of this plant, drawn once; None without a stated uncertainty.
 
-        Machines that agree with the measurement, for a plant made from ``fit.calibrated(measured)``
-        or from ``plant.uncertain(fit.machines(measured))`` with an evaluation model; otherwise
-        machines drawn from the uncertainty stated by ``plant.uncertain(...)``.
+        A plant made from ``fit.calibrated(measured)``, or from
+        ``plant.uncertain(fit.machines(measured))`` with an evaluation model, has machines that
+        agree with the measurement. Otherwise they are drawn from the uncertainty stated by
+        ``plant.uncertain(...)``.
         """
         fit = fitted_machines(self)
         if fit is None and self.uncertainty is None:
@@ -389,7 +396,7 @@ class StandardPlant(Partition):
     def evaluation_plant(self) -> StandardPlant | None:
         """The evaluation model with this plant's channels, sampled and delayed like it.
 
-        Assembled once and kept. None without an evaluation model.
+        It is assembled once and kept. It is None if there is no evaluation model.
 
         LabelError or ModelError when a plant that was given as evaluation model has other channels,
         or another sampling time or delay.
@@ -413,9 +420,9 @@ class StandardPlant(Partition):
 
 
 def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System) -> StandardPlant:
-    """Return a StandardPlant, also of a system whose labels distinguish w, u, z and y.
+    """Return a plant, or a system whose labels distinguish w, u, z and y, as a StandardPlant.
 
-    Called by all functions that take a plant.
+    All functions that take a plant call it.
 
     Parameters
     ----------
@@ -425,9 +432,10 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
     Raises
     ------
     LabelError
-        When the labels do not distinguish them.
+        When the labels do not distinguish w, u, z and y.
     ModelError
-        When it is neither, or a `GeneralizedPlant`: take its `unweighted`.
+        When it is neither a plant nor such a system, or a `GeneralizedPlant` (use its
+        `unweighted`).
 
     Examples
     --------
@@ -477,9 +485,10 @@ def assemble_plant(
 ) -> StandardPlant:
     """Return the standard plant of a structure with its channels.
 
-    ``M q'' + D q' + K q = f`` (the paper's (1), or (8) when reduced) in modal states, with forces
-    at the disturbances and actuators and motions at the POIs and sensors. The filters of the ports
-    (shapes, dynamics) add their states.
+    The plant contains ``M q'' + D q' + K q = f`` (equation (1) of the paper, or (8) for a reduced
+    model) in modal states. The forces f act at the disturbances and actuators, and the outputs are
+    the motions at the POIs and sensors. The filters of the ports (shapes, dynamics) add their
+    states.
 
     Parameters
     ----------
@@ -501,10 +510,10 @@ def assemble_plant(
     Returns
     -------
     StandardPlant
-        Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators; z: POI axes
-        `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references. The latencies of
-        ports have an effect only after the plant is sampled. `plant.form` says whether A is in
-        modal blocks.
+        A continuous plant. w contains disturbances, sensor noises `y1:noise` and references, and u
+        the actuators. z contains POI axes `die:z`, errors `die:error` and efforts `u1:effort`, and
+        y the sensors and references. The latencies of ports have an effect only after the plant is
+        sampled. `plant.form` says whether A is in modal blocks.
 
     Raises
     ------
@@ -517,10 +526,11 @@ def assemble_plant(
     Warns
     -----
     FlexplantWarning
-        When damping couples the modes so that blocks cannot hold it: an overdamped pair, two poles
-        that are (nearly) equal, or a damper to ground whose pole in a rigid-body motion is faster
-        than 1e-4 of the first elastic frequency (slower ones are neglected: rigid-body modes are
-        undamped by convention). The undamped modes are then coupled by all of D (dense form).
+        When damping couples the modes so that a block for each mode cannot represent it. The cause
+        is an overdamped pair, two poles that are (nearly) equal, or a damper to ground whose pole
+        in a rigid-body motion is faster than 1e-4 of the first elastic frequency. Slower poles are
+        neglected, because rigid-body modes are undamped by convention. The undamped modes are then
+        coupled by the whole matrix D (dense form).
 
     References
     ----------

@@ -126,11 +126,12 @@ def frequency_response(
     Parameters
     ----------
     model : FEModel, Modes or ReducedModel; or StateSpace
-        Modes that `solve_modes` found for an FEModel are used again while they are in use.
+        The structure or the system. If modes of an FEModel that `solve_modes` found are still in
+        memory, they are used again.
     ports : Ports
-        The channels of a structure. For a system, `freq` takes this place.
+        Channels of a structure. For a system, `freq` is the second argument instead.
     freq : (n_freq,) array [Hz]
-        Frequencies, increasing. None: `default_freq` of a system.
+        Frequencies, increasing. For a system, None uses those of `default_freq`.
     damping : Damping, optional
         Damping of an FEModel, in place of its D. `Rayleigh` damping is used as a matrix. Modal
         damping applies to the modes and static shapes used; all other motions have the damping of
@@ -148,8 +149,8 @@ def frequency_response(
     Raises
     ------
     ModelError
-        When a response is infinite at one of the frequencies, a side of the ports is empty, or
-        arguments do not go together.
+        When a response is infinite at one of the frequencies, the ports have no inputs or no
+        outputs, or the arguments do not fit together.
     SolverError
         When a direct solution is spoilt by rounding.
 

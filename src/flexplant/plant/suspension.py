@@ -109,9 +109,10 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
 
     The stiffness becomes ``K + sum_s k_s r_s' r_s``. Here k_s is the stiffness of spring s, and the
     row r_s gives the motion at this spring. The damping matrix D changes in the same way.
-    Rigid-body motions that stretch a spring become suspension modes, true oscillations at low
-    frequency; those that do not stay exactly at 0. Springs of negative stiffness turn these motions
-    into pairs of real poles, one of them unstable; such springs must not bend the structure.
+    Rigid-body motions that stretch a spring become suspension modes, which oscillate at a low
+    frequency. The other rigid-body motions stay exactly at 0 Hz. Springs of negative stiffness turn
+    the motions that stretch them into pairs of real poles, one of which is unstable. Such springs
+    must not bend the structure.
 
     Parameters
     ----------
@@ -120,7 +121,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
         error of this is about the ratio of the stiffness of the springs to that of the structure,
         so springs should be much softer than the structure. Modes that a reduced model left out are
         stiffened and damped one by one.
-    springs : GroundSpring or sequence
+    springs : GroundSpring or sequence of GroundSpring
+        Springs and dampers to ground.
 
     Returns
     -------

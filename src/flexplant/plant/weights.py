@@ -68,9 +68,9 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     Raises
     ------
     AssumptionError, LabelError, ModelError
-        When the plant has no reference or no displacement sensors; when the named POI has no
-        reference; when the actuators do not move the axes apart, or the plant was not assembled
-        from a structure; when the order is not 0 to 4.
+        When the plant has no reference or no displacement sensors, or the named POI has no
+        reference. Also when the actuators cannot move the axes independently, the plant was not
+        assembled from a structure, or the order is not 0 to 4.
 
     Examples
     --------
@@ -111,12 +111,12 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StageWeights(Value):
-    """Weights for `plant.weighted(z=weights.z, w=weights.w)`; print it, change it.
+    """Weights for `plant.weighted(z=weights.z, w=weights.w)`, which you may print and change.
 
     Parameters
     ----------
     z, w : mapping {channel: StateSpace, float or None}
-        None leaves the channel out.
+        Weight of each channel; None leaves the channel out.
     text : str
         Meaning of the weights, in words.
     uncertain : UncertainPlant, optional
@@ -145,11 +145,11 @@ def stage_weights(
 ) -> StageWeights:
     """Return a four-block set of weights for a positioning stage.
 
-    ``plant.weighted(z=weights.z, w=weights.w)`` is what `flexplant.design_hinf` then takes; a
-    controller with one degree of freedom reads `reference_errors`. `design_stage` does all three,
+    Pass ``plant.weighted(z=weights.z, w=weights.w)`` to `flexplant.design_hinf`. A controller with
+    one degree of freedom reads the errors of `reference_errors`. `design_stage` does all of this,
     and finds the largest bandwidth. If the design reaches a gamma below 1, |T| at u is below
     `peak`. A table of ``help(flexplant.plant)`` shows the effect of the arguments on one machine.
-    How it works: `algorithms`.
+    `algorithms` explains how the weights are computed.
 
     Parameters
     ----------
@@ -359,10 +359,11 @@ def mixed_sensitivity(
 ) -> StandardPlant:
     """Return the plant whose H-infinity norm is that of ``[W_S S; W_KS K S; W_T T]``.
 
-    ``e = r - G u, u = K e``: S = (I + G K)^-1 from r to e, T = G K S. MATLAB's `augw` builds the
-    same plant; `design_hinf` designs K for it, as `mixsyn` does. If G has a rigid-body mode or an
-    integrator, this plant has an invariant zero on the stability limit from r to the outputs, which
-    the standard assumptions exclude. In this case add a disturbance at u, as `stage_weights` does.
+    The loop is ``e = r - G u, u = K e``. The sensitivity from r to e is S = (I + G K)^-1, and T = G
+    K S is the complementary sensitivity. MATLAB's `augw` builds the same plant; `design_hinf`
+    designs K for it, as `mixsyn` does. If G has a rigid-body mode or an integrator, this plant has
+    an invariant zero on the stability limit from r to the outputs, which the standard assumptions
+    exclude. In this case add a disturbance at u, as `stage_weights` does.
 
     Parameters
     ----------

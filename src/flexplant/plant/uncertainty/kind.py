@@ -90,7 +90,7 @@ class Uncertainty(Value):
         return ()
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return a system of the plant, or of its bilinear image, with their channels first."""
+        """Return a system of the plant, or its bilinear image, with the blocks' channels first."""
         return system
 
     def larger(self, plant: Partition) -> Any:

@@ -93,9 +93,10 @@ class NeglectedModes(Value):
 def neglected_modes(
     plant: Partition | System, evaluation: Any, *, resonances: int = 24
 ) -> NeglectedModes:
-    """Return weights that bound the difference of a whole model and a plant, (w, u) to (z, y).
+    """Return weights that bound the difference between a larger model and a plant.
 
-    The bound is ``sigma_max(W^-1 (G_whole - G) diag(scales)) <= 1`` at all frequencies, where W is
+    The bound is ``sigma_max(W^-1 (G_whole - G) diag(scales)) <= 1`` at all frequencies. Here G and
+    G_whole are the responses of the plant and of the larger model from w and u to z and y, and W is
     the diagonal matrix of the weights. The square of each weight is
     ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``. Linear
     programming finds the coefficients p: the weight must be above the difference at every
@@ -104,17 +105,18 @@ def neglected_modes(
     well damped. The bound is then verified on other frequencies, with points through every
     resonance.
 
-    Rigid-body motions are the same in both and cancel, so that the difference is finite at 0 Hz.
+    The rigid-body motions of both are the same and cancel, so that the difference is finite at
+    0 Hz.
 
     Parameters
     ----------
     plant : StandardPlant
-        Continuous, or sampled (its continuous plant is compared).
+        The plant, continuous or sampled. Of a sampled plant the continuous one is compared.
     evaluation : StandardPlant, FEModel, Modes or ReducedModel
-        With the same channels; a structure gets the plant's ports.
+        The larger model. A plant must have the same channels; a structure gets the plant's ports.
     resonances : int
-        Number of neglected modes that the weights follow; all others lie below a smooth line. Each
-        costs two states for each output.
+        Number of neglected modes that the weights follow. All others lie below a smooth line. Each
+        mode that is followed costs two states for each output.
 
     Returns
     -------

@@ -118,7 +118,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Shapes(Uncertainty):
-    """Uncertain shapes of modes: `mode6:shape1` changes how a mode is driven and how it is seen.
+    """Uncertain shapes of modes: how strongly a mode is driven, and how it is seen.
 
     Parameters
     ----------

@@ -149,9 +149,9 @@ class UncertainPlant(Value, Generic[P]):
     def system(self) -> StateSpace:
         """The continuous system with all channels.
 
-        Inputs [blocks `u1:dynamics:w`; Delta channels `mode6:freq:w`; neglected modes
-        `die:z:neglected:w`, `y1:neglected:w`; w; u], outputs [`u1:dynamics:z`; `mode6:freq:z`;
-        `amp1:neglected:z`, `u1:neglected:z`; z; y].
+        The inputs are, in this order, those of blocks (`u1:dynamics:w`), of Deltas (`mode6:freq:w`)
+        and of neglected modes (`die:z:neglected:w`, `y1:neglected:w`), then w and u. The outputs
+        are `u1:dynamics:z`, `mode6:freq:z`, `amp1:neglected:z`, `u1:neglected:z`, then z and y.
         """
         system = self.opened.system
         if self.neglected is not None:
@@ -242,9 +242,9 @@ class UncertainPlant(Value, Generic[P]):
         Parameters
         ----------
         values : mapping {name: float, array or StateSpace}, optional
-            Such as {"mode6:freq": 0.5}; Deltas that are not named are 0. Beyond 1 is allowed. A
-            block such as `u1:dynamics` takes a number, a matrix or a stable system; a continuous
-            one is sampled like the plant (Tustin).
+            Values of the Deltas, such as {"mode6:freq": 0.5}. Deltas that are not named are 0, and
+            values beyond 1 are allowed. A block such as `u1:dynamics` takes a number, a matrix or a
+            stable system; a continuous system is sampled like the plant (Tustin).
 
         Raises
         ------
@@ -283,7 +283,7 @@ class UncertainPlant(Value, Generic[P]):
         return self._closed(machine, self.drawn_blocks(rng))
 
     def drawn_blocks(self, rng: np.random.Generator, size: float | None = None) -> dict[str, Any]:
-        """Return a drawn stable system for each block, by name; of gain `size`, or at most 1."""
+        """Return random stable systems of the blocks, by name; its gain is `size` or at most 1."""
         poles = self.plant.continuous.system.poles()
         return {
             one.name: drawn_delta(one, rng, poles, rng.uniform() if size is None else size)

@@ -54,8 +54,9 @@ class UnmodelledDynamics(Uncertainty):
     Parameters
     ----------
     weight : number or system of one input and one output
-        W: at each frequency the largest relative error, of the additive form the largest error
-        [unit of y over that of u]. Stable; continuous, or sampled at the plant's rate.
+        Weight W, a stable system, continuous or sampled at the plant's rate. Its gain at each
+        frequency is the largest relative error there. In the additive form it is the largest
+        absolute error [unit of y over that of u].
     at : str or sequence of str
         Actuators, sensors, or both.
     form : {"inverse", "coprime"}, optional
@@ -64,7 +65,7 @@ class UnmodelledDynamics(Uncertainty):
         takes all u and y and no `at`; the units must give signals of similar size (see
         `ncf_margin`).
     name : str, optional
-        Name of the Delta; by default from the channels: `u1:dynamics`.
+        Name of the Delta; by default it follows from the channels, such as `u1:dynamics`.
 
     Raises
     ------
