@@ -1,12 +1,12 @@
 """Estimation: the motion at a point of interest from sensors elsewhere.
 
-- `design_kalman(plant)`: the stationary filter of the POIs; modes of the evaluation model that are
-  truncated in the plant count as noise.
-- `KalmanEstimator.rms(channel)`: the predicted error; ``rms(channel, on=other_plant)``: the error
-  on another plant.
-- `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
-  moving POI); ``step(y, u)`` runs sample by sample.
-- `consistency`, `estimate_noise`: a test of the filter with a record, and noise levels from it.
+- `design_kalman(plant)`: the stationary Kalman filter of the motions at the points of interest
+  (POIs). Modes of the evaluation model that are truncated in the plant count as noise.
+- `KalmanEstimator.rms(channel)`: the predicted error. ``rms(channel, on=other_plant)`` gives the
+  error on another plant.
+- `KalmanEstimator.estimate(records)`: estimates from recorded data, with `FixedLag`, `Smoother`,
+  gaps, outliers or a moving POI. ``step(y, u)`` runs the filter sample by sample.
+- `consistency` tests the filter with a record; `estimate_noise` finds noise levels from a record.
 - `design_static`: the estimate from the sensors of one instant.
 
 >>> import flexplant as fx
@@ -19,16 +19,16 @@
 >>> round(static.rms("die:x") / observer.rms("die:x"), 1)
 25.9
 
-**How accurate is a predicted error?** As accurate as the evaluation model, including errors of its
-mesh: ``modes.extrapolated(coarser)`` corrects these, and ``observer.interval`` gives the interval
-of the error on machines that agree with a measurement. For a plate of 0.6 m x 0.6 m, a mesh of 8 x
-8 elements predicts the error of finer meshes within 6 % in z and within 23 % in rotations. For a
-plate of 0.5 m x 0.3 m the same mesh predicts an error in z that is 65 % too large: above 10 kHz,
-modes of nearly equal frequency have other shapes on a finer mesh. There 12 x 12 elements agree with
-24 x 24 within 5 % in z.
+**How accurate is a predicted error?** It is as accurate as the evaluation model, including the
+errors of its mesh, which ``modes.extrapolated(coarser)`` corrects. ``observer.interval`` gives the
+interval of the error on machines that agree with a measurement. For a plate of 0.6 m x 0.6 m, a
+mesh of 8 x 8 elements predicts the error of finer meshes within 6 % in z and within 23 % in
+rotations. For a plate of 0.5 m x 0.3 m the same mesh predicts an error in z that is 65 % too large,
+because above 10 kHz modes of nearly equal frequency have other shapes on a finer mesh. For this
+plate 12 x 12 elements agree with 24 x 24 elements within 5 % in z.
 
-Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
-(`KalmanEstimator.to_filterpy`).
+`design_kalman` does what ``kalman`` and ``lqe`` do in MATLAB and python-control.
+`KalmanEstimator.to_filterpy` makes a filter for filterpy.
 """
 
 from ..rooms import public_names as _public_names

@@ -87,8 +87,8 @@ class ConsistencyReport(Value):
         the ratio of the spectrum to the spectrum of the model with the best-fitting levels of
         process and sensor noise. The most significant peak comes first.
     causes : tuple of str
-        The likely causes: "none", or of "outliers", "offset", "noise level", "noise ratio",
-        "frequency", "truncation", "folding".
+        Likely causes: "none", or some of "outliers", "offset", "noise level", "noise ratio",
+        "frequency", "truncation" and "folding". `consistency` explains them.
     text : str
         Verdict in words.
     level : float
@@ -151,7 +151,7 @@ class ConsistencyReport(Value):
 
     @property
     def cause(self) -> Cause:
-        """The first of the causes."""
+        """The first of the likely causes."""
         return self.causes[0]
 
     @property
@@ -180,8 +180,8 @@ def consistency(
     model passes all five with the probability `level`. The likely causes follow from the failed
     tests:
 
-    - *outliers*: single samples of a sensor that noise cannot explain, and whose effect on the
-      filter is that of one sample;
+    - *outliers*: single samples of a sensor that noise cannot explain. The filter reacts to such a
+      sample as to one wrong sample;
     - *offset* of a sensor: the mean of its innovations is larger than the spectrum at the lowest
       frequencies explains.
 
@@ -190,19 +190,19 @@ def consistency(
     modes above half the sampling rate appear at lower frequencies. Innovations that are not white
     are called coloured. The causes are:
 
-    - *truncation* or *folding*: the innovations are coloured with the spectrum that the evaluation
-      model predicts, if there is one. The plant is then correct except for these modes;
+    - *truncation* or *folding*: there is an evaluation model, and the innovations have the coloured
+      spectrum that it predicts. The plant is then correct except for these modes;
     - *noise level*: the innovations are white, but their NIS differs from 1. The sensors with too
       large innovations are named;
-    - *noise ratio*: the innovations are coloured, but other levels of process and sensor noise
-      (two levels, fitted to the spectrum) explain them;
+    - *noise ratio*: the innovations are coloured, but two other levels, one of the process noise
+      and one of the sensor noise, explain them. The levels are fitted to the spectrum;
     - *frequency*: the spectrum has another peak, and a change of a neighbouring mode explains it
-      better than an additional mode does. Frequency and damping of all such modes are fitted to
-      the record by maximum likelihood, including the commands, so that a closed loop does not bias
-      them (`moved`);
-    - any other peak: *truncation*, if it lies above all modes or a truncated mode is known there;
-      *folding*, if the plant has modes above it, or the truncated mode lies above half the rate;
-      or a disturbance that is missing in the plant.
+      better than an additional mode does. Frequency and damping of all such modes are fitted to the
+      record by maximum likelihood. The fit includes the commands, so that a closed loop does not
+      bias the result (`moved`);
+    - any other peak means *truncation* if it lies above all modes of the plant, or at a truncated
+      mode that is known. It means *folding* if the plant has modes above the peak, or the truncated
+      mode lies above half the rate. A disturbance that is missing in the plant is also possible.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def consistency(
         normalised estimation error squared (NEES), whose interval takes the correlation of the
         errors over time into account.
     level : float
-        Probability with which a correct model passes.
+        Probability that a correct model passes all tests.
 
     Returns
     -------

@@ -48,8 +48,9 @@ class Estimate(Value, Mapping[str, FloatArray]):
     data : (nz, N) array [m or rad]
         The estimates; NaN while the measurements do not determine one yet.
     deviations : (nz, N) array [m or rad]
-        Standard deviations of their errors, on the filter's model, where truncated modes count as
-        white noise. Infinite as long as an estimate is not determined.
+        Standard deviations of the errors of the estimates. They hold on the filter's model, in
+        which truncated modes count as white noise. Infinite as long as an estimate is not
+        determined.
     sensors : sequence of str
         Names of the sensors.
     innovations : (ny, N) array

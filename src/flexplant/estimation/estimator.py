@@ -60,9 +60,9 @@ class KalmanEstimator(PoiFilter):
         Truncated modes, as noise and static compliance.
     tried : tuple of str
         Methods by which the gain was computed, in the order in which they were tried. The last one
-        succeeded; the reason is given for each one that failed. The Riccati equation of the
-        covariance is tried first. If it is not accurate enough, Newton steps in square roots
-        follow.
+        succeeded. For the others the reason of failure is given. The Riccati equation of the
+        covariance is tried first. If its solution is not accurate enough, Newton steps on square
+        roots of the covariance follow.
 
     Examples
     --------
@@ -129,30 +129,32 @@ class KalmanEstimator(PoiFilter):
     ) -> Estimate:
         """Return the motions at the POIs from recorded measurements and commands.
 
-        The gain is time-varying at the start of the record, and during and after gaps, in which the
-        available sensors are used. It counts as stationary when the remaining change affects all
-        later estimates and innovations by less than 1e-6 of their variance. Filter and Predictor
-        process the record in blocks of samples at all times, without approximation. FixedLag and
-        Smoother do so when the gain is stationary; before, each sample takes about a millisecond.
+        The gain varies with time at the start of the record, and during and after gaps. In a gap
+        the other sensors are used. The gain counts as stationary when its remaining change affects
+        all later estimates and innovations by less than 1e-6 of their variance. Filter and
+        Predictor always process the record in blocks of samples, without approximation. FixedLag
+        and Smoother do so once the gain is stationary; until then each sample takes about a
+        millisecond.
 
         Parameters
         ----------
         records : Response, mapping {channel: (N,) array} or data frame
-            All sensors and the commands u as the controller gave them (delays are in the filter);
-            NaN and masked entries are missing samples of a sensor. Other channels are ignored.
+            Records of all sensors and of the commands u as the controller gave them, without their
+            delay (the filter contains it). NaN and masked entries are missing samples of a sensor.
+            Other channels are ignored.
         lag : Predictor, Filter, FixedLag or Smoother, optional
             Type of the estimates; Filter() by default.
         start : (n,) array, optional
             Initial state x[0|-1] of the stationary filter: zeros for a machine at rest, or the
-            `state` of the estimate of the preceding record. None: damped modes are in stationary
-            motion due to the disturbances, rigid-body motions and undamped modes are unknown
-            (diffuse prior), and u was 0 before the record.
+            `state` of the estimate of the preceding record. By default damped modes are in
+            stationary motion due to the disturbances, rigid-body motions and undamped modes are
+            unknown (diffuse prior), and u was 0 before the record.
         path : (N, 3) array [m] or mapping {name: (N, 3) array}, optional
             Position of a moving POI at each sample; by name for several POIs.
         gate : float, optional
             Number of standard deviations above which an innovation is an outlier. Such a sample of
             a sensor is treated as missing. With 5 or 6, only a fraction of 6e-7 or 2e-9 of correct
-            samples is rejected. The estimate lists them (`gated`). None: all samples count.
+            samples is rejected. The estimate lists them (`gated`). By default all samples are used.
 
         Returns
         -------

@@ -31,12 +31,13 @@ from .machine_noise import unsure_noise
 def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
-    It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
-    "die": ``observer.rms("die")`` is the predicted error, ``close_loop(plant, observer, servo)``
-    runs it in a loop, ``observer.estimate(records)`` on recorded data. The motion of truncated
-    modes of the evaluation model counts as noise, and the predicted error is as accurate as that
-    model (see ``help(flexplant.estimation)``; the equations are in `algorithms`). Without an
-    evaluation model the predicted error does not include truncation.
+    It reads the sensors (not the references) and the applied u, and gives the estimate `die:hat`
+    for a POI "die". ``observer.rms("die")`` is the predicted error.
+    ``close_loop(plant, observer, servo)`` runs the filter in a loop, and
+    ``observer.estimate(records)`` applies it to recorded data. The motion of truncated modes of the
+    evaluation model counts as noise, and the predicted error is as accurate as that model (see
+    ``help(flexplant.estimation)``; the equations are in `algorithms`). Without an evaluation model
+    the predicted error does not include truncation.
 
     Parameters
     ----------
@@ -47,10 +48,10 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
         refused, and the message tells how to add them.
     machines : PlantMachines, optional
         The machines ``plant.machines`` that agree with a measurement. If they are given, the filter
-        relies less on uncertain modes. The noise of the truncated modes is increased towards the
-        mean covariance of the difference between the machines and the filter's model: not at all,
-        by a quarter, by half or by all of the way. The filter with the smallest upper ends of the
-        intervals of the errors is returned. Without truncated modes this argument has no effect.
+        relies less on uncertain modes. The noise of the truncated modes is moved towards the mean
+        covariance of the difference between the machines and the filter's model: by 0, 1/4, 1/2 or
+        all of this change. The filter whose error intervals have the smallest upper ends is
+        returned. Without truncated modes this argument has no effect.
 
     Returns
     -------

@@ -53,9 +53,9 @@ class LeftOut(Value):
     cross : (nz, ny) array
         Covariance N_t between POIs and sensors.
     plant : StandardPlant
-        Plant whose response to u includes the static compliance of the truncated modes. Attachment
-        vectors (static shapes under unit forces) may represent this compliance; only u excites
-        them.
+        Plant whose response to u includes the static compliance of the truncated modes. This
+        compliance may consist of attachment vectors (static shapes under unit forces), which only u
+        excites.
     whole : StandardPlant
         Plant that includes the truncated modes. It is used to compute these values for other POIs.
 

@@ -75,7 +75,7 @@ class MovedModes(Value):
     poles : (m,) complex array [rad/s]
         Poles of the machine.
     covariance : (2 m, 2 m) array
-        Covariance of the errors of the m values ``log |pole|``, followed by those of the m
+        Covariance of the errors of 2 m values: first the m values ``log |pole|``, then the m
         logarithms of the decay rates.
 
     Examples

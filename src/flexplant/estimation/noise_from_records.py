@@ -41,24 +41,24 @@ def estimate_noise(
 ) -> NoiseLevels:
     """Return the densities of all disturbances and sensor noises that explain a record best.
 
-    The innovations e of a fixed filter are stationary for any levels, including rigid-body motion,
-    and their spectrum is linear in the variances t_i of the channels::
+    The innovations e of a fixed filter are stationary for any noise levels, even if the machine has
+    rigid-body motion. Their spectrum is linear in the variances t_i of the channels::
 
         S(f) = sum_i t_i P_i(f),   P_i = T_i T_i^*,   T_i = H_i + C (z I - A + K C)^-1 (G_i - K H_i)
 
     A, C and K are the matrices of the filter (K is the predictor gain), G_i and H_i are the gains
     from the noise of channel i to the states and to the sensors, and ``z = exp(2 pi i f dt)``. For
     sensor noise ``G_i = 0``. I is the periodogram of the innovations at a frequency f. Whittle's
-    likelihood l over the lines of the Fourier transform, its derivatives and Fisher's information F
-    are sums::
+    likelihood l, its derivatives and Fisher's information F are sums over the lines of the Fourier
+    transform::
 
         l = -sum_f log det S + tr S^-1 I,   dl/dt_i = -sum_f tr S^-1 P_i - tr S^-1 P_i S^-1 I
         information F_ij = sum_f tr S^-1 P_i S^-1 P_j
 
     The search for the maximum is Fisher's scoring (Newton's method with F in place of the second
     derivatives) in the logarithms of t_i. It starts at the non-negative least-squares fit of the
-    autocovariances, which are linear in t_i as well. The filter is designed again with the result,
-    so that its innovations become white, and the likelihood is then that of the exact filter.
+    autocovariances, which are linear in t_i as well. The filter is then designed again with the
+    result. Its innovations become white, so that the likelihood is that of the exact filter.
 
     Parameters
     ----------
@@ -383,8 +383,8 @@ class NoiseLevels(Value):
         Largest derivative of the logarithm of the likelihood at the end of the search, relative to
         the standard deviation of this derivative. The search ends when it is below 1e-4.
     nis : float
-        Mean normalised innovation squared per sensor of the filter with these levels, from the
-        record: 1 if the model explains it.
+        Mean normalised innovation squared per sensor, for the filter with these levels on the
+        record. It is 1 if the model explains the record.
     samples : int
         Number of used samples.
     verdict : str
