@@ -6,12 +6,13 @@ such systems.
 
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
 - `frequency_response`: the `Frf` of a system, or of a structure between its ports.
-- `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
+- `discretized`: exact sampling of a plant with a hold and a delay. `tustin` and `matched` sample
+  controllers.
 - `Delayed`: a system with a delay or a derivative in continuous time, exact on the frequency axis.
 - `step`, `impulse`, `lsim`, `step_info`: time responses in numbers; `fx.plot.step` draws them.
 - `h2_norm`, `hinf_norm`, `peak_gain`: norms, with a proof for the last two.
-- `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,
-  `modal_form`: fewer or clearer states.
+- `series`, `parallel`, `feedback`, `connect`, `lft`: connections of systems.
+- `balanced`, `minimal`: fewer states. `modal_form`: states in blocks, one for each mode.
 
 >>> import flexplant as fx
 >>> g = fx.lti.tf([1.0], [1.0, 0.02, 1.0])
@@ -27,7 +28,8 @@ such systems.
 <StateSpace: 3 states, continuous, in -> out>
 
 **From MATLAB and python-control.** Their systems are accepted wherever a system is expected;
-`to_control()` converts back. Their names (``fx.c2d``) raise an error with the name used here.
+`to_control()` converts back. If you use one of their names (``fx.c2d``), the error message tells
+the name in flexplant.
 
 | there | here |
 |---|---|

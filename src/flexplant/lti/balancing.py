@@ -32,8 +32,8 @@ class BalancedReduction(Value):
         Hankel singular values of the stable part, the largest first. With weights they are those of
         the weighted stable part.
     bound : float [output unit / input unit]
-        Twice the sum of the discarded values: no frequency has a larger error. NaN with weights,
-        where no such bound holds.
+        Twice the sum of the discarded values. The error is not larger at any frequency. NaN with
+        weights, because this bound does not hold for them.
     error : float [output unit / input unit]
         H-infinity norm of the difference between the given and the reduced system, computed from
         this difference. With weights it is the norm of the weighted difference.
@@ -250,7 +250,7 @@ def hankel_values(sys: System) -> FloatArray:
 def hankel_norm(sys: System) -> float:
     """Return the Hankel norm: the largest gain from past inputs to future outputs.
 
-    The largest of the `hankel_values`; infinite when the system is not strictly stable.
+    It is the largest of the `hankel_values`, and infinite when the system is not strictly stable.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from .statespace import StateSpace, System, as_statespace
 
 
 def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> StateSpace:
-    """Return the continuous system whose samples a sampled system gives (``d2c``).
+    """Return the continuous system from which a sampled system can be made (``d2c``).
 
     With a zero-order hold ``[A_d, B_d; 0, 1] = e^([A, B; 0, 0] dt)``. The logarithm of this matrix
     gives A and B. The result is sampled again as a check.
@@ -39,8 +39,8 @@ def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> St
     Raises
     ------
     ModelError
-        When `sys` is continuous already, or no real continuous system has these samples: a pole at
-        0 (a delay) or a single one on the negative real axis.
+        When `sys` is continuous already, or no real continuous system has these samples. This is so
+        for a pole at z = 0 (a delay) and for a single pole on the negative real axis.
 
     Examples
     --------
@@ -153,8 +153,8 @@ def descriptor(
     Raises
     ------
     ShapeError, ModelError
-        When sizes do not match, or the equations do not determine x_2: the system would
-        differentiate its inputs (its index is above 1), or has no unique solution.
+        When sizes do not match, or the equations do not determine x_2. In the second case the
+        system would differentiate its inputs (its index is above 1), or has no unique solution.
 
     Examples
     --------

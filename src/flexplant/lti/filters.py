@@ -16,8 +16,9 @@ from .statespace import StateSpace, System, as_statespace
 def tf(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt: float = 0.0) -> StateSpace:
     """Return a transfer function of one input and one output as state space.
 
-    ``(b[0] s^m + ... + b[m]) / (a[0] s^n + ... + a[n])``, z in place of s when sampled; kept as
-    first- and second-order sections in series, whose poles are exact to rounding.
+    The transfer function is ``(b[0] s^m + ... + b[m]) / (a[0] s^n + ... + a[n])``, with z in place
+    of s if it is sampled. It is stored as first- and second-order sections in series, whose poles
+    are exact to rounding.
 
     Parameters
     ----------
@@ -187,7 +188,7 @@ def low_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateS
     Returns
     -------
     StateSpace
-        ``gain / (s/w + 1)`` or ``gain / (p^2 + sqrt(2) p + 1)``, p = s / w.
+        ``gain / (p + 1)`` or ``gain / (p^2 + sqrt(2) p + 1)``, with p = s / w and w = 2 pi freq.
 
     Raises
     ------
@@ -206,12 +207,14 @@ def low_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateS
 def high_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     """Return a high-pass filter, Butterworth for order 2.
 
-    ``gain (s/w) / (s/w + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, p = s / w.
+    It is ``gain p / (p + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, with p = s / w and w = 2 pi
+    freq.
 
     Parameters
     ----------
     freq, order, gain
-        As for `low_pass_filter`: order is the slope at low frequencies, gain that at high ones.
+        Parameters as for `low_pass_filter`, but `order` is the slope at low frequencies and `gain`
+        the gain at high frequencies.
 
     Raises
     ------
@@ -306,7 +309,7 @@ def lead_lag_filter(zero: float, pole: float, *, gain: float = 1.0) -> StateSpac
 def inverse_sensitivity(
     bandwidth: float, *, peak: float = 2.0, floor: float = 1e-3, slope: int = 1
 ) -> StateSpace:
-    """Return a weight W with ``|W S| <= 1`` where S is as wanted: 1 / |W| bounds S.
+    """Return a weight W of the sensitivity S: ``|W S| <= 1`` means that S is below 1 / |W|.
 
     Parameters
     ----------
@@ -322,8 +325,8 @@ def inverse_sensitivity(
     Returns
     -------
     StateSpace
-        ``((s / peak^(1/k) + w) / (s + w floor^(1/k)))^k``, k the slope, with the crossing at the
-        bandwidth exactly.
+        ``((s / peak^(1/k) + w) / (s + w floor^(1/k)))^k``, where k is the slope. The frequency w is
+        such that |W| is exactly 1 at the bandwidth.
 
     Raises
     ------
@@ -370,8 +373,9 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     Returns
     -------
     StateSpace
-        ``Q(-s) / Q(s)``, ``Q = sum_k c_k (s delay)^k`` with
-        ``c_k = (2n-k)! n! / ((2n)! k! (n-k)!)``, n the order; real modal sections in series.
+        ``Q(-s) / Q(s)`` with ``Q = sum_k c_k (s delay)^k`` and
+        ``c_k = (2n-k)! n! / ((2n)! k! (n-k)!)``, where n is the order. It consists of real modal
+        sections in series.
 
     Raises
     ------

@@ -176,7 +176,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     Parameters
     ----------
     freq : (n_freq,) array [Hz]
-        Increasing, not negative.
+        Frequencies, increasing and not negative.
     data : (n_out, n_in, n_freq) complex array [output unit / input unit]
         Responses, by output, input and frequency.
     inputs, outputs : sequences of str, optional
@@ -209,10 +209,10 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     Notes
     -----
     Responses can be added to and multiplied by numbers, systems, and other responses at the same
-    frequencies. Errors of two responses are assumed independent, so that variances add; the
-    variance of a product is ``|G2|^2 var G1 + |G1|^2 var G2`` to first order. A system adds no
-    variance. Data of a single measurement (coherence, correlation of outputs, segments) are left
-    out of sums and products.
+    frequencies. Errors of two responses are assumed independent. The variance of a sum is therefore
+    the sum of the variances, and that of a product is ``|G2|^2 var G1 + |G1|^2 var G2`` to first
+    order. A system adds no variance. Data of a single measurement (coherence, correlation of
+    outputs, segments) are left out of sums and products.
 
     Raises
     ------
@@ -527,10 +527,11 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     """Return the frequency response ``C (s I - A)^-1 B + D``.
 
-    s = 2 pi i f, or exp(2 pi i f dt) when sampled. If A has 1 x 1 and 2 x 2 diagonal blocks, each
-    block is solved in closed form; the cost of a frequency is then proportional to the number of
-    states when A is block diagonal. Otherwise the response is computed from the poles and residues,
-    or from the Schur form of A if its eigenvectors are ill-conditioned.
+    Here s = 2 pi i f; for a sampled system it is exp(2 pi i f dt). If A has 1 x 1 and 2 x 2
+    diagonal blocks, each block is solved in closed form; the cost of a frequency is then
+    proportional to the number of states when A is block diagonal. Otherwise the response is
+    computed from the poles and residues, or from the Schur form of A if its eigenvectors are
+    ill-conditioned.
 
     Parameters
     ----------
@@ -543,7 +544,7 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     Returns
     -------
     Frf
-        data (n_out, n_in, n_freq).
+        Response whose `data` has the shape (n_out, n_in, n_freq).
 
     Raises
     ------

@@ -46,7 +46,8 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     points : int
         Largest number of points. 64 channels of 24 lightly damped modes need about 3500.
     tolerance : float
-        Step of the natural logarithm of a magnitude: 0.05 is 0.4 dB.
+        Largest difference of the natural logarithm of a magnitude from the straight lines; 0.05 is
+        0.4 dB.
 
     Returns
     -------

@@ -54,7 +54,7 @@ def controllability_gramian(sys: System) -> FloatArray:
 def observability_gramian(sys: System) -> FloatArray:
     """Return Q (n, n): ``A' Q + Q A + C' C = 0``, or ``Q = A' Q A + C' C`` when sampled.
 
-    The dual of `controllability_gramian`.
+    It is the dual of `controllability_gramian`.
 
     Parameters
     ----------

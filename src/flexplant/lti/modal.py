@@ -57,7 +57,7 @@ class ModalForm(Value):
 
 
 def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
-    """Return a system with A in real blocks: [[s, w], [-w, s]] per pair, [p] per real pole.
+    """Return a system with A in real blocks, [[s, w], [-w, s]] for a pair, [p] for a real pole.
 
     A rigid-body mode has two poles at 0 but only one eigenvector. It becomes a pair of integrators
     [[0, w], [0, 0]], whose poles are exactly at 0 (at 1 when sampled). The states are scaled so

@@ -79,20 +79,21 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
     sys : StateSpace or control.StateSpace
         Continuous or sampled, any numbers of channels.
     progress : bool, optional
-        Whether to show a progress bar. None: on a terminal for work of more than two seconds.
+        Whether to show a progress bar. By default it is shown on a terminal for work of more than
+        two seconds.
 
     Returns
     -------
     gain : float
         Largest singular value; infinite when the system is not strictly stable.
     freq : float [Hz]
-        Frequency of the peak; that of the least stable pole when the gain is infinite; infinite
-        when the peak is the feedthrough.
+        Frequency of the peak. If the gain is infinite, it is the frequency of the least stable
+        pole. It is infinite if the gain is largest towards infinite frequency (the feedthrough).
 
     Raises
     ------
     SolverError
-        When the level set does not converge.
+        When the iteration does not converge.
 
     References
     ----------
@@ -124,12 +125,13 @@ def linf_norm(sys: System) -> float:
     Returns
     -------
     float
-        Relative accuracy 1e-8; infinite when a pole lies on the axis (rigid-body modes do).
+        The norm, with a relative accuracy of 1e-8. It is infinite when a pole lies on the frequency
+        axis, as the poles of rigid-body modes do.
 
     Raises
     ------
     SolverError
-        When the level set does not converge.
+        When the iteration does not converge.
 
     Examples
     --------
@@ -188,10 +190,11 @@ SAME_NORM = 1e-5
 def h2_norm(sys: System) -> float:
     """Return the H2 norm: the rms of all outputs together for white inputs of unit intensity.
 
-    ``trace(C P C')^(1/2)``, P the controllability Gramian (``trace(C P C' + D D')^(1/2)`` when
-    sampled). For a system in modal blocks P has a closed form. The norm is computed a second time
-    from the observability Gramian Q, by ``trace(B' Q B) = trace(C P C')``. Both results must agree
-    to a relative tolerance of 1e-5, or within the rounding errors of their terms.
+    The norm is ``trace(C P C')^(1/2)``, and ``trace(C P C' + D D')^(1/2)`` for a sampled system,
+    where P is the controllability Gramian. For a system in modal blocks P has a closed form. The
+    norm is computed a second time from the observability Gramian Q, by
+    ``trace(B' Q B) = trace(C P C')``. Both results must agree to a relative tolerance of 1e-5, or
+    within the rounding errors of their terms.
 
     Parameters
     ----------
@@ -201,8 +204,8 @@ def h2_norm(sys: System) -> float:
     Returns
     -------
     float
-        Infinite when the system is not strictly stable (rigid-body modes are not), or continuous
-        with feedthrough; `norm_report` says which.
+        The norm. It is infinite when the system is not strictly stable (rigid-body modes are not),
+        or when it is continuous and has feedthrough; `norm_report` says which of these.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class RiccatiSolution(Value):
     Parameters
     ----------
     P : (n, n) array
-        Symmetric.
+        Solution of the equation, symmetric.
     gain : (n, p) array
         Gain of the filter or of the controller. A filter has the gain
         ``K = (A P C' + S) (C P C' + R)^-1`` in discrete time, or ``K = (P C' + S) R^-1`` in
@@ -105,7 +105,8 @@ def filter_dare(
     Q : (n, n) array
         Symmetric matrix; for a filter it is the covariance of the process noise.
     R : (p, p) array
-        Symmetric, non-singular, possibly indefinite.
+        Symmetric, non-singular matrix; for a filter it is the covariance of the sensor noise. It
+        may be indefinite.
     S : (n, p) array, optional
         Cross term; by default zero.
 
@@ -119,8 +120,8 @@ def filter_dare(
     ShapeError, ModelError
         For wrong sizes, entries that are not finite, or a singular R.
     SolverError
-        When no strictly stabilising solution exists (a mode on the unit circle that Q does not
-        excite, an unstable one that C does not see) or the residual stays too large.
+        When no strictly stabilising solution exists, because Q does not excite a mode on the unit
+        circle or C does not see an unstable mode. Also when the residual stays too large.
 
     References
     ----------
@@ -181,7 +182,8 @@ def control_dare(
 ) -> RiccatiSolution:
     """Return X of ``X = A' X A - (A' X B + S) (B' X B + R)^-1 (A' X B + S)' + Q``.
 
-    The dual of `filter_dare`: `gain` is F with u = -F x, closed loop A - B F.
+    This equation is the dual of that of `filter_dare`. The `gain` of the result is F of the law u =
+    -F x, which gives the closed loop A - B F.
 
     Parameters
     ----------
@@ -220,7 +222,8 @@ def control_care(
 ) -> RiccatiSolution:
     """Return X of ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``.
 
-    The dual of `filter_care`: `gain` is F with u = -F x, closed loop A - B F.
+    This equation is the dual of that of `filter_care`. The `gain` of the result is F of the law u =
+    -F x, which gives the closed loop A - B F.
 
     Parameters
     ----------

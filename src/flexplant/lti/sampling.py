@@ -26,9 +26,9 @@ def discretized(
 ) -> StateSpace:
     """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
 
-    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; this is exact,
-    also for delays that are not a multiple of h. If A is block diagonal, a closed form is used for
-    each block.
+    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]`` with h = 1 / rate. The result is
+    exact, also for delays that are not a multiple of h. If A is block diagonal, a closed form is
+    used for each block.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def discretized(
     rate : float [Hz]
         Sampling rate.
     delay : float [samples]
-        Delay of the inputs; its integer part adds this number of states per delayed input, and a
-        fraction adds one more.
+        Delay of the inputs. A delay of n samples adds n states for each delayed input; a further
+        fraction of a sample adds one more state.
     delayed : iterable of str, optional
         Delayed inputs; all by default.
 

@@ -55,7 +55,7 @@ class StateSpace(Value):
     Parameters
     ----------
     A, B, C, D : (n, n), (n, m), (p, n), (p, m) arrays
-        Real and finite; D may be the number 0. n = 0 is a static gain.
+        Real and finite matrices. D may be the number 0. A system with n = 0 is a static gain.
     dt : float [s]
         Sampling time; 0 for continuous time.
     inputs, outputs, states : sequences of str, optional
@@ -392,8 +392,8 @@ class StateSpace(Value):
     def from_control(cls, sys: Any) -> StateSpace:
         """Return a system of python-control or SciPy as a StateSpace with the same names.
 
-        A transfer function becomes sections in series, each channel of a matrix with separate
-        states: `minimal` removes common states.
+        A transfer function becomes sections in series. In a matrix of transfer functions each
+        channel has separate states; `minimal` removes those that channels have in common.
         """
         return cls(**foreign_fields(sys))
 

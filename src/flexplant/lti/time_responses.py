@@ -30,8 +30,8 @@ _FINE, _FEWEST, _MOST = 200.0, 500, 20_000
 class TimeResponse(Value):
     """Signals at the outputs of a system over time.
 
-    ``response["y1", "u1"]`` is the response (n_time,) at one output to one input, and
-    ``response["y1"]`` the same where a single input, or all inputs together, drove the system.
+    ``response["y1", "u1"]`` is the response (n_time,) at one output to one input. If the system has
+    a single input, or all inputs drove it together, ``response["y1"]`` is this response.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ def step(
     time : (n_time,) array [s], optional
         Equidistant instants from 0; for a sampled system its sampling instants.
     duration : float [s], optional
-        Length of the response if `time` is not given. By default until the slowest pole has decayed
-        to 1 % or made twenty oscillations.
+        Length of the response if `time` is not given. By default the response ends when the slowest
+        pole has decayed to 1 % or made twenty oscillations.
 
     Returns
     -------
@@ -178,8 +178,8 @@ def lsim(
 ) -> TimeResponse:
     """Return the response to given signals at all inputs.
 
-    ``dx/dt = A x + B u, y = C x + D u`` is solved without an error of integration. Between two
-    instants u is held constant or is linear, as `between` says.
+    ``dx/dt = A x + B u, y = C x + D u`` is solved without an integration error. `between` says
+    whether u is held constant or is linear between two instants.
 
     Parameters
     ----------
@@ -288,8 +288,8 @@ def step_info(
     output, input : str, optional
         The channel; by default the only one.
     band : float
-        Fraction of the value at rest: the response has settled when it stays this close to that
-        value.
+        Relative tolerance of the settling time: the response has settled when its distance from the
+        value at rest stays below this fraction of that value.
 
     Returns
     -------
