@@ -1,15 +1,16 @@
 """Virtual machines: full-order models with hidden differences, used like hardware.
 
-No machine here has the mesh or the plate theory of the models used for design, so that the claims
-of a design are tested independently.
+No machine here has the mesh or the plate theory of the models that are used for design. The claims
+of a design are therefore tested independently.
 
-- `wafer_stage`: a free plate in polynomials with rotary inertia, masses that no drawing shows,
-  scattered stiffness and damping, sensors with finite resolution, and a delay.
+- `wafer_stage`: a free plate, described by polynomials and with rotary inertia. It has masses that
+  no drawing shows, scattered stiffness and damping, sensors with finite resolution, and a delay.
 - `magnet_stage`: a stage on magnets of negative stiffness, in six axes.
 - `three_masses`: a sampled standard plant of three masses, for small examples.
 - `gantry`, `dual_stage`, `steering_mirror`, `flexible_joint`, `isolation_table`, `hexapod`,
   `ball_screw`, `maglev_block`: sampled plants of driven machines with relative drives and sensors.
-- `WaferStage.measure_frf`, ``poles``: measurements; ``run``, ``loop``: to test a design.
+- `WaferStage.measure_frf` and ``poles`` measure a machine; ``run`` and ``loop`` test a design on
+  it.
 
 >>> import flexplant as fx
 >>> machine = fx.testbeds.wafer_stage(damping=0.01)

@@ -29,11 +29,11 @@ from .lumped_machines import Stretch, along_leg, lumped, two_points
 def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of an H-gantry on a frame with soft feet.
 
-    Two linear motors push the ends of a bridge (60 kg, guides 1 m apart) along y, a third pushes
-    the carriage (18 kg) along x on it; all push against the frame (900 kg on feet that let it sway
-    at 11 and 13 Hz). The tool, 5 kg on a column of the carriage, sways at 62 and 80 Hz. Encoders
-    measure what the motors move. The tool's x and y relative to the frame are followed, the
-    bridge's skew is held.
+    Two linear motors push the ends of a bridge (60 kg, guides 1 m apart) along y against the frame.
+    A third motor pushes the carriage (18 kg) along x against the bridge. The frame (900 kg) stands
+    on feet on which it sways at 11 and 13 Hz. The tool, 5 kg on a column of the carriage, sways at
+    62 and 80 Hz. An encoder at each motor measures the motion that this motor causes. The tool has
+    references for x and y relative to the frame, and the skew of the bridge has a reference too.
 
     Parameters
     ----------
@@ -105,11 +105,12 @@ def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
     """Return the plant of a short stroke on a long stroke, below a lens on isolators.
 
-    Along x: the long stroke (60 kg) is pushed against the base (3000 kg at 4 Hz), the short stroke
-    (15 kg, with a mirror block of 4 kg at 700 Hz) against the long stroke, which does not touch it.
-    The lens (70 kg at 95 Hz) hangs in a metrology frame (500 kg, isolated at 1.2 Hz from the base).
-    An interferometer measures the mirror block relative to the lens, a second sensor the gap
-    between both strokes; the die relative to the lens and the gap are followed.
+    All bodies move along x. One actuator pushes the long stroke (60 kg) against the base (3000 kg,
+    4 Hz). The other pushes the short stroke (15 kg, with a mirror block of 4 kg at 700 Hz) against
+    the long stroke, without contact between the two. The lens (70 kg, 95 Hz) hangs in a metrology
+    frame (500 kg, isolated from the base at 1.2 Hz). An interferometer measures the mirror block
+    relative to the lens, and a second sensor the gap between both strokes. The die relative to the
+    lens has a reference, and so has the gap.
 
     Parameters
     ----------
@@ -165,10 +166,10 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
 def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a mirror that tilts on flexures.
 
-    A mirror of 0.12 kg and 80 mm tilts about x and y at 23 and 26 Hz against a housing (2.5 kg,
-    bolted on at 310 Hz and more); its rim bends at 2.3 and 2.6 kHz. Four coils push against the
-    housing in two pairs, a moment each; two differential sensors measure the tilt of the mirror in
-    the housing. The tilt of its centre is followed.
+    A mirror of 0.12 kg and 80 mm tilts about x and y at 23 and 26 Hz in a housing (2.5 kg, with
+    bolts that give 310 Hz and more). The rim of the mirror bends at 2.3 and 2.6 kHz. Four coils
+    push against the housing; each pair makes one moment. Two differential sensors measure the tilt
+    of the rim relative to the housing. The tilt of the mirror's centre has a reference.
 
     Parameters
     ----------
@@ -219,10 +220,11 @@ def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
 def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
     """Return the plant of a robot's joint: a gear that winds up and a link that bends.
 
-    Behind the gear the motor has 1.4 kg m^2 and turns the root of the link (1.1 kg m^2) by a gear
-    of 2.6e4 N m/rad; the link's tip (2.2 kg m^2) follows at a bending stiffness of 9e3 N m/rad. The
-    motor pushes against a pedestal (9 kg m^2 at 24 Hz). Encoders measure motor and root in the
-    pedestal; the tip relative to it is followed.
+    The motor (1.4 kg m^2, as seen behind the gear) turns the root of the link (1.1 kg m^2) through
+    a gear of the stiffness 2.6e4 N m/rad. The tip of the link (2.2 kg m^2) is connected to the root
+    by a bending stiffness of 9e3 N m/rad. The motor pushes against a pedestal (9 kg m^2, 24 Hz).
+    Encoders measure the motor and the root relative to the pedestal. The tip has a reference
+    relative to the pedestal.
 
     Parameters
     ----------
@@ -269,12 +271,12 @@ def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
 
 
 def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
-    """Return the plant of a vibration isolation table with geophones; nothing is followed.
+    """Return the plant of a vibration isolation table with geophones; it has no references.
 
     A honeycomb table (1.5 m by 1 m, 300 kg) floats on four air mounts at 2.1 Hz above a shaking
-    floor; it bends from 175 Hz on. Four actuators push against the floor next to the mounts, four
-    geophones, corrected below their corner, measure absolute velocity above them. The point of
-    interest is the absolute motion of the table's centre.
+    floor. Its bending modes begin at 175 Hz. Four actuators at the mounts push against the floor.
+    Above them four geophones measure the absolute velocity; their response is corrected below their
+    corner frequency. The point of interest is the absolute motion of the table's centre.
 
     Parameters
     ----------
@@ -324,10 +326,10 @@ def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a hexapod with stiff legs on a soft base.
 
-    Six legs, each a stack of 1.5e7 N/m with an actuator that strains it, carry a platform (22 kg)
-    with a load (8 kg at 140 Hz and more). They stand on a base (120 kg) that sways on its mounts
-    at 16 to 35 Hz. Sensors in the legs measure their length; all six motions of the platform
-    relative to the base are followed.
+    Six legs carry a platform (22 kg) with a load (8 kg, 140 Hz and more). Each leg is a stack of
+    the stiffness 1.5e7 N/m with an actuator that strains it. The legs stand on a base (120 kg) that
+    sways on its mounts at 16 to 35 Hz. Sensors in the legs measure their lengths. All six motions
+    of the platform relative to the base have references.
 
     Parameters
     ----------
@@ -389,10 +391,10 @@ def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
 def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a screw axis with an encoder on its motor and one at its load.
 
-    Motor and screw (2.4e-3 kg m^2, lead 10 mm) move a table (140 kg) by an axial stiffness of
-    1.3e8 N/m; a workpiece (35 kg) stands on it at 48 Hz. The nut pushes against a machine bed
-    (1100 kg at 14 Hz). The motor's angle and the table relative to the bed are measured; the
-    workpiece relative to the bed is followed.
+    A motor and a screw (2.4e-3 kg m^2, lead 10 mm) move a table (140 kg) through an axial stiffness
+    of 1.3e8 N/m. A workpiece (35 kg) stands on the table and sways at 48 Hz. The nut pushes against
+    a machine bed (1100 kg, which sways at 14 Hz). Encoders measure the angle of the motor and the
+    table relative to the bed. The workpiece has a reference relative to the bed.
 
     Parameters
     ----------
@@ -442,9 +444,10 @@ def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 def maglev_block(*, rate: float = 10e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a block that floats freely, pushed in six axes by eight actuators.
 
-    A glass ceramic block (0.4 m by 0.4 m by 0.06 m, 24 kg) floats; it bends from 1430 Hz on.
-    Four actuators push up at inset corners, four along its sides; six sensors measure it against
-    the world. A point off its centre is followed in x, y and rz and held in z, rx and ry.
+    A glass ceramic block (0.4 m by 0.4 m by 0.06 m, 24 kg) floats; its bending modes begin at
+    1430 Hz. Four actuators push up near its corners, and four push along its sides. Six sensors
+    measure its motion relative to the ground. The point of interest, which is not at the centre,
+    has references in x, y and rz, and is to be held at rest in z, rx and ry.
 
     Parameters
     ----------

@@ -52,11 +52,11 @@ class WaferStage(Value):
     delay : float [samples]
         Delay from a measurement to the reaction of the actuators, including fractions.
     step : float [m]
-        Step of its sensors; 0 for none.
+        Step (resolution) of the sensors; 0 if they have no steps.
     drawing : mapping
         Size, thickness and material of its plate (or block) as drawn; by default the paper's.
     magnets : tuple of GroundSpring
-        Magnets on which a block floats, as drawn; empty where it is free.
+        Magnets on which a block floats, as drawn; empty for a free plate or block.
 
     Examples
     --------
@@ -111,17 +111,18 @@ class WaferStage(Value):
             Numbers of the modes, counted from 1 with rigid-body modes, as in the paper. Elastic
             modes are sorted by frequency; overdamped ones are not counted.
         deviation : float
-            Standard deviation of their errors, relative to their size; 0: ideal, no covariance.
+            Standard deviation of the errors of the poles, relative to their size. With 0 the poles
+            are exact and the result has no covariance.
         rng : int or Generator, optional
             Random generator of the errors, or its seed.
 
         Raises
         ------
         LabelError
-            When a mode is not there, or is a rigid-body mode (a drift has no pole to measure).
+            When a mode does not exist, or is a rigid-body mode, which has no pole to measure.
         ModelError
-            When a mode is not a whole number, or lies above half the machine's rate, where no
-            sampled measurement shows it, or the deviation is negative.
+            When a mode is not a whole number, or the deviation is negative. Also when a mode lies
+            above half the machine's rate, where no sampled measurement shows it.
         """
         own = self._own_poles
         known = range(self._n_rigid + 1, self._n_rigid + own.size + 1)
@@ -143,16 +144,16 @@ class WaferStage(Value):
         )
 
     def loop(self, ports: Ports, *blocks: Any) -> ClosedLoop:
-        """Return the machine's own closed loop, for its margins; ports and blocks as for `run`."""
+        """Return the closed loop of the machine, for its margins; arguments as for `run`."""
         return close_loop(self._plant(ports), *blocks)
 
     def scheduled(self, ports: Ports, schedule: ScheduledLoop) -> ScheduledLoop:
-        """Return the machine's own loops with controllers that follow its position.
+        """Return the loops of the machine with controllers that follow its position.
 
         Parameters
         ----------
         ports : Ports
-            Its channels, with positions.
+            Channels of the machine, with positions.
         schedule : ScheduledLoop
             Schedule of a model's controllers, which then run on the machine.
         """
@@ -173,12 +174,13 @@ class WaferStage(Value):
         Parameters
         ----------
         ports : Ports
-            Its channels, with the noise that acts.
+            Channels of the machine, with the noise that acts.
         *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
             Observers and controllers that run on the machine.
         duration : float [s]
             Duration of the run.
         reference : SetPointProfile, array or mapping, optional
+            Set-points of the run, as for `simulate`.
         rng : int or Generator, optional
             Seed of the noise.
         runs : int, optional
@@ -218,16 +220,17 @@ class WaferStage(Value):
     ) -> Frf:
         """Return the FRFs from actuator forces to sensors, measured under feedback.
 
-        A free plate drifts, a stage on magnets falls, so a servo from the drawing holds it.
-        Random-phase multisines are added to all actuators at once, orthogonal over as many
-        experiments as there are actuators;
-        total forces F and outputs Y then give ``G = Y F^-1`` (joint input-output: dividing Y by
-        the excitation alone would be biased by the feedback).
+        A servo that is designed with the drawing holds the machine, because a free plate drifts and
+        a stage on magnets falls. Random-phase multisines are added to all actuators at once. There
+        are as many experiments as actuators, and the multisines of different experiments are
+        orthogonal. The response is ``G = Y F^-1``, with the total forces F and the outputs Y (joint
+        input-output method). Y divided by the excitation alone would be biased by the feedback.
 
         Parameters
         ----------
         ports : Ports
-            Actuators and sensors; its disturbances and sensor noises act.
+            Actuators and sensors. The disturbances and sensor noises of the ports act during the
+            measurement.
         period : float [s]
             Period of the multisine; its inverse is the frequency resolution.
         periods, discard : int

@@ -47,26 +47,28 @@ def wafer_stage(
 ) -> WaferStage:
     """Return the virtual machine: the paper's plate with an actuator's mass that no drawing shows.
 
-    A free plate of Table 1 with rotary inertia in polynomials, solved to convergence: no mesh of
-    any drawing has its frequencies. A point mass is added at
-    (L/2, L/4), the paper's z_8, and up to 0.1 kg somewhere; stiffness is scattered over the plate
-    by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is not a
-    whole number of samples.
+    The machine is the free plate of Table 1 of the paper, with rotary inertia. It is described by
+    polynomials that are solved to convergence, so that its frequencies differ from those of any
+    mesh of the drawing. A point mass is added at (L/2, L/4), the paper's z_8, and another of up to
+    0.1 kg at a random place. The stiffness is scattered over the plate by 0.3 % and the damping
+    over its modes by 30 %. The sensors have steps of 0.05 nm, and the delay is not a whole number
+    of samples.
 
     Parameters
     ----------
     elements : (int, int), optional
-        Number of elements along x and y of a mesh of the drawn plate, which then takes the place of
-        the polynomials: a machine of the same formulation as the models, without scatter, second
-        mass and sensor steps, and with a delay of 1 sample by default. (8, 8) is the paper's with
-        243 DOFs.
+        Number of elements along x and y. If it is given, a mesh of the drawn plate takes the place
+        of the polynomials. The machine then has the same formulation as the models, without
+        scatter, second mass and sensor steps, and its delay is 1 sample by default. (8, 8) is the
+        mesh of the paper, with 243 DOFs.
     size : (float, float) [m]
         Sides of the plate along x and y; by default the paper's.
     thickness : float [m]
+        Thickness of the plate; by default the paper's.
     damping : float
         Mean modal damping ratio of the elastic modes of the plate without added masses.
     added_mass : float [kg]
-        The hidden mass.
+        Mass of the actuator that no drawing shows.
     rate : float [Hz]
         Sampling rate of its controller.
     delay : float [samples], optional
@@ -181,12 +183,14 @@ def magnet_stage(
 ) -> WaferStage:
     """Return a virtual machine that floats on magnets, with a mass that no drawing shows.
 
-    A block of linear elasticity in polynomials, solved to convergence: no mesh of bricks has its
-    frequencies. Magnets at its corners attract, ``K - sum_s |k_s| r_s' r_s``, so that the six
-    rigid-body motions grow until a loop holds them. The stiffnesses of the magnets differ from the
-    drawn ones by up to 10 %. A mass is added on the bottom at (3/4, 1/4) of its sides, and another
-    of up to 0.1 kg somewhere; stiffness is scattered over the block by 0.3 %, damping over its
-    modes by 30 %, sensors have steps of 0.05 nm, and the delay is not a whole number of samples.
+    The machine is an elastic block, described by polynomials that are solved to convergence. Its
+    frequencies therefore differ from those of any mesh of bricks. Magnets at its corners attract,
+    so that its stiffness is ``K - sum_s |k_s| r_s' r_s`` (k_s is the stiffness of magnet s, and the
+    row r_s gives the motion there). The six rigid-body motions grow until a loop holds them. The
+    stiffnesses of the magnets differ from the drawn ones by up to 10 %. A mass is added on the
+    bottom at (3/4, 1/4) of its sides, and another of up to 0.1 kg at a random place. The stiffness
+    is scattered over the block by 0.3 % and the damping over its modes by 30 %. The sensors have
+    steps of 0.05 nm, and the delay is not a whole number of samples.
 
     Parameters
     ----------
@@ -249,10 +253,10 @@ def three_masses(*, rate: float | None = 2e3, delay: int = 1) -> StandardPlant:
         u1 --> [1 kg]--/\/\/--[1 kg]--/\/\/--[1 kg]     free along x
                  y1            die              y2
 
-    The actuator u1, with amplifier noise `amp`, pushes the first mass; the sensors y1 and y2 see
-    the ends; the point of interest `die`, with a reference, is the middle mass, which no sensor
-    sees. Springs of 4e5 N/m give modes at 0, 100.7 and 174.3 Hz, 1 % damped. For first trials and
-    for the examples in docstrings.
+    The actuator u1, with amplifier noise `amp`, pushes the first mass. The sensors y1 and y2
+    measure the masses at both ends. The point of interest `die`, with a reference, is the middle
+    mass, which no sensor measures. Springs of 4e5 N/m give modes at 0, 100.7 and 174.3 Hz with 1 %
+    damping. The plant serves for first trials and for the examples in docstrings.
 
     Parameters
     ----------
