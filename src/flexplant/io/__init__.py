@@ -1,14 +1,14 @@
 """Readers and writers of other formats; for values of flexplant use `.save` and `flexplant.load`.
 
-- `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
-- `read_matrices`: matrices without DOFs, which still give `frequencies(10)`; `read_modes`: modes of
-  a solved model.
+- `read_model(K, mass=, dofs=, units=)`: the model of a finite-element program, with its DOFs.
+- `read_matrices`: matrices, also without DOFs; their `frequencies(10)` can still be computed.
+- `read_modes`: modes of a model that another program has solved.
 - `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
   `estimate_frf`.
 - `read_mat`, `write_mat`: systems to and from MATLAB.
 
-The first three detect the format; readers of a single format have more options. An error for a file
-that cannot be read says what to export instead.
+The first three detect the format; readers of a single format have more options. If a file cannot be
+read, the error says what to export instead.
 
 >>> import tempfile, pathlib
 >>> import flexplant as fx
@@ -35,7 +35,7 @@ that cannot be read says what to export instead.
 | responses | `read_frf_csv`, ... | .csv, .mat, .npz: frequency responses |
 | values for MATLAB | `read_mat`, `write_mat` | .mat: systems and plants; responses are written |
 
-**Your own model**, in any units, is read, checked, solved and reduced:
+**Your own model**, in any units, is read, checked, solved and reduced in these steps:
 
 ```python
 model = fx.read_model(
@@ -52,31 +52,36 @@ print(small.quality(model, band=(100.0, 5000.0), inputs=keep.labels[:2], outputs
 
 **What to write in Ansys, Nastran, Abaqus, COMSOL**, and how to read it:
 
-- Ansys, matrices: a modal analysis with ``LUMPM,OFF`` and ``WRFULL,1`` writes ``file.full``; nodes
-  by ``CDWRITE,DB,model,cdb``, or of ``file.rst``.
-  ``fx.read_model("file.full", nodes="model.cdb")`` (extra ``ansys``).
+- Ansys, matrices: a modal analysis with ``LUMPM,OFF`` and ``WRFULL,1`` writes ``file.full``.
+  ``CDWRITE,DB,model,cdb`` writes the nodes, which are also in ``file.rst``. Read both by
+  ``fx.read_model("file.full", nodes="model.cdb")`` (needs the extra ``ansys``).
 - Ansys, modes: ``ANTYPE,MODAL``, ``MODOPT,LANB,100``, ``RESVEC,ON`` with loads at actuators and
-  POIs (and ``D,,,SUPPORT`` at six DOFs of a free one), ``MXPAND`` write ``file.rst``.
-  ``fx.io.read_modes("file.rst", zeta=0.002)``.
-- Nastran, matrices: ``ASSIGN OUTPUT4='run.op4',UNIT=31``, case control
-  ``EXTSEOUT(ASMBULK,EXTID=1,MATOP4=31)``, all DOFs wanted in ``ASET1``: ``.op4``, read with
-  ``dofs=``; or ``EXTSEOUT(ASMBULK,EXTID=1,DMIGPCH)``: ``.pch``, ten digits.
-  ``fx.read_model("run.pch", nodes="run.bdf")``.
-- Nastran, modes: SOL 103, ``EIGRL`` with ``MASS``, ``DISPLACEMENT=ALL``, ``RESVEC=YES`` with
-  ``USET,U6`` at actuators and POIs, ``PARAM,POST,-1``: ``.op2``; or ``DISPLACEMENT(PUNCH)=ALL``:
-  ``.pch``, with ``nodes="run.bdf"``. ``fx.io.read_modes("run.op2", zeta=0.002)``.
+  POIs, and ``MXPAND`` write ``file.rst``. A free structure also needs ``D,,,SUPPORT`` at six DOFs.
+  Read the file by ``fx.io.read_modes("file.rst", zeta=0.002)``.
+- Nastran, matrices: list all DOFs that you want in ``ASET1``. ``ASSIGN OUTPUT4='run.op4',UNIT=31``
+  with the case control ``EXTSEOUT(ASMBULK,EXTID=1,MATOP4=31)`` writes ``run.op4``, which is read
+  with ``dofs=``. ``EXTSEOUT(ASMBULK,EXTID=1,DMIGPCH)`` writes ``run.pch`` with ten digits. Read it
+  by ``fx.read_model("run.pch", nodes="run.bdf")``.
+- Nastran, modes: SOL 103 with ``EIGRL`` (normalisation ``MASS``), ``DISPLACEMENT=ALL``,
+  ``RESVEC=YES``, ``USET,U6`` at actuators and POIs, and ``PARAM,POST,-1`` writes ``run.op2``. Read
+  it by ``fx.io.read_modes("run.op2", zeta=0.002)``. With ``DISPLACEMENT(PUNCH)=ALL`` it writes
+  ``run.pch``, which is read with ``nodes="run.bdf"``.
 - Abaqus, matrices: ``*MATRIX GENERATE, STIFFNESS, MASS`` and ``*MATRIX OUTPUT, STIFFNESS, MASS``
-  write ``_STIF1.mtx``, ``_MASS1.mtx`` (1: the step); a flat input file.
+  write ``_STIF1.mtx`` and ``_MASS1.mtx`` (1 is the number of the step). The input file must be flat
+  (without parts and assemblies). Read the files by
   ``fx.read_model("job_STIF1.mtx", mass="job_MASS1.mtx", nodes="job.inp")``.
-- COMSOL, matrices, by LiveLink: ``s = mphmatrix(model, 'sol1', 'out', {'Kc', 'Ec'}); K = s.Kc;
-  M = s.Ec; save('m.mat', 'K', 'M', '-v7')``. ``fx.read_model("m.mat", dofs="dofs.csv")``.
-- any: Matrix Market, ``.npz``, ``.mat`` of K, M; a table ``node, direction, x, y, z``; modes as
-  universal file (55 or 2414, nodes 15 or 2411) or Exodus.
+- COMSOL, matrices: the LiveLink commands ``s = mphmatrix(model, 'sol1', 'out', {'Kc', 'Ec'})``,
+  ``K = s.Kc``, ``M = s.Ec`` and ``save('m.mat', 'K', 'M', '-v7')`` write ``m.mat``. Read it by
+  ``fx.read_model("m.mat", dofs="dofs.csv")``.
+- Any other program: write K and M as Matrix Market, ``.npz`` or ``.mat``, and the DOFs as a table
+  ``node, direction, x, y, z``. Write modes as a universal file (dataset 55 or 2414, nodes in
+  dataset 15 or 2411) or as Exodus.
 
-Give ``units=("mm", "t", "s")`` where the model is not in SI, ``rigid_below=`` where rigid-body
-modes came out near 0. Modes serve models that only a cluster can solve. The static motion of the
-truncated modes is then missing (residual vectors, ``RESVEC``, provide most of it), which a note
-states, and damping must be given.
+Give ``units=("mm", "t", "s")`` if the model is not in SI units. Give ``rigid_below=`` if the
+frequencies of rigid-body modes in the file are not exactly 0. Read modes instead of matrices if the
+model is so large that only a cluster can solve it. You must then give the damping. The static
+motion of the truncated modes is missing, as a note of the result states; residual vectors
+(``RESVEC``) provide most of it.
 """
 
 from ..rooms import public_names as _public_names

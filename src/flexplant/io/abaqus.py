@@ -58,18 +58,18 @@ def read_abaqus(
     inp : str or Path, optional
         The input file, for the coordinates in its `*NODE` blocks.
     dofs : DofSet, optional
-        DOFs of the rows, for FORMAT=COORDINATE, which does not name them.
+        DOFs of the rows. Give them for FORMAT=COORDINATE, which does not name the rows.
 
     Returns
     -------
     FEMatrices
-        Matrices with the printed number of `digits`. They are not `located` where `inp` is not
-        given.
+        Matrices; `digits` is the number of printed digits. Without `inp` the nodes have no
+        coordinates (the matrices are not `located`).
 
     Raises
     ------
     FlexplantError
-        When a line has another form; it is named.
+        When a line has another form; the message names the line.
     ModelError
         When there are internal nodes (Lagrange multipliers of contact, couplings or hybrid
         elements), degrees of freedom that are not displacements, or nodes in transformed systems.

@@ -32,26 +32,27 @@ def read_ansys(
 ) -> FEMatrices:
     """Return the matrices of an ANSYS .full file, their rows named by node and direction.
 
-    The file holds the upper triangle, which is completed, and constrained DOFs as empty rows, which
-    are dropped and named in `constrained`. It does not hold coordinates, nor which nodes have a
-    local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
+    The file holds the upper triangle of each matrix, which is completed. It holds constrained DOFs
+    as empty rows, which are dropped and named in `constrained`. The coordinates of the nodes and
+    their local coordinate systems (NROTAT) are not in this file, but in the .rst or .cdb file of
+    the same model.
 
     A lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are not a displacement or rotation,
-    and a file without M are refused. A damping matrix in the file is not read, as `notes` state:
-    give damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about
-    the new x, then about the new y.
+    and a file without M are refused. A damping matrix in the file is not read, as `notes` state;
+    give modal damping instead. The angles of local systems are THXY, THYZ and THZX of ANSYS, which
+    turn about z, then about the new x, then about the new y.
 
     Parameters
     ----------
     path : str or Path
         The .full file. Needs ansys-mapdl-reader: ``pip install 'flexplant[ansys]'``.
     nodes : path, or mapping {node: (x, y, z)}, optional
-        A .rst or .cdb file, whose local coordinate systems are turned to global directions; or a
-        text table `node, x, y, z`. Without it the result is not `located`, which is sufficient for
-        held structures.
+        A .rst or .cdb file, or a text table `node, x, y, z`. Nodes with a local coordinate system
+        in the .rst or .cdb file are turned to global directions. Without `nodes` the result has no
+        coordinates (it is not `located`), which is sufficient for held structures.
     rotations : mapping {node: (3, 3) array}, optional
-        Direction cosines of local coordinate systems, where `nodes` does not give them: row i
-        holds the global components of local axis i.
+        Direction cosines of local coordinate systems that `nodes` does not give. Row i holds the
+        global components of the local axis i.
 
     Returns
     -------

@@ -32,7 +32,7 @@ def read_exodus_modes(
     variables: Mapping[str, str] | None = None,
     M: Matrix | None = None,
 ) -> Modes:
-    """Return the modes of an Exodus file: one time step a mode.
+    """Return the modes of an Exodus file, in which each time step is a mode.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def read_exodus_modes(
         Nodal variables of the shapes, such as {"z": "DispZ", "rx": "RotX"}; by default DispX ...
         RotZ, in the usual spellings.
     M : (n, n) array or sparse matrix [kg], optional
-        The mass matrix in the order of the DOFs (node by node), to check the shapes with.
+        Mass matrix in the order of the DOFs (node by node). It is used to check the shapes.
 
     Returns
     -------

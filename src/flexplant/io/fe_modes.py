@@ -165,37 +165,38 @@ def read_modes(
 
     Use it for models that are too large to be solved here: the shapes at all nodes become `Modes`,
     from which plants and reduced models are made. The suffix determines the format: Nastran .op2,
-    and .pch of DISPLACEMENT(PUNCH); ANSYS .rst; Exodus .exo, .e (frequencies in Hz in the place of
-    time); universal files .uff, .unv of normal modes.
+    and .pch of DISPLACEMENT(PUNCH); ANSYS .rst; Exodus .exo, .e (with frequencies in Hz in place of
+    the times); universal files .uff, .unv of normal modes.
 
-    Residual attachment vectors are not in such files, and cannot be made without M and K: the
-    static motion of truncated modes is missing, as `notes` state. Nastran and ANSYS can write
-    residual vectors as further modes of high frequency (RESVEC), which provide most of it.
+    Such files contain no residual attachment vectors (static deformations of the truncated modes),
+    and these cannot be computed without M and K. The static motion of the truncated modes is
+    therefore missing, as `notes` state. Nastran and ANSYS can write residual vectors as further
+    modes of high frequency (RESVEC), which provide most of it.
 
     Parameters
     ----------
     path : str or Path
         Path of the file.
     zeta : float, (k,) array or None
-        Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
-        modes have none.
+        Damping ratios. Only universal files contain them; None uses those of the file. Rigid-body
+        modes are undamped.
     nodes : str or Path, optional
         File with the nodes, if they are not in the first file: the bulk data of Nastran (.bdf,
         .dat), a universal file, or a table `node, x, y, z`.
     rigid_below : float [Hz], optional
-        Modes below this are rigid-body modes, and set to exactly 0.
+        Frequency below which modes count as rigid-body modes and are set to exactly 0 Hz.
     units : (length, mass, time), optional
-        Units of the file: ("mm", "t", "s") for instance; the modes are in SI. None: the units in a
-        universal file (dataset 164), or SI.
+        Units of the file, for example ("mm", "t", "s"). The modes that are returned are in SI
+        units. By default the units are those stated in a universal file (dataset 164), or SI.
     matrices : FEMatrices or FEModel, optional
         Model in SI with the same nodes; its M checks that the shapes are mass-normalised.
 
     Returns
     -------
     Modes
-        Modes in global directions, with unit generalised masses where the file contains masses
-        (LAMA, dataset 55) and unchanged otherwise. `certificate["mass"]` is the largest entry of
-        phi^T M phi - I where `matrices` are given.
+        Modes in global directions. If the file contains generalised masses (LAMA, dataset 55), the
+        shapes are scaled to unit masses; otherwise they are unchanged. If `matrices` are given,
+        `certificate["mass"]` is the largest entry of phi^T M phi - I.
 
     Raises
     ------

@@ -275,11 +275,12 @@ class Format:
     Parameters
     ----------
     suffixes : sequence of str
-        Ends of the names of such files, in lower case: ".mtx".
+        Ends of the names of such files, in lower case, for example ".mtx".
     read : function
         ``read(path, **options)`` returns the `FEMatrices` of a file.
     begins : function, optional
-        Whether the first bytes of a file show the format, for files of any name.
+        Function of the first bytes of a file that returns whether they show this format. It finds
+        the format of files with any name.
     mesh : sequence of str
         Ends of the names of files that hold only the nodes.
     mesh_option : str
@@ -307,7 +308,7 @@ class Format:
 
     @property
     def several(self) -> bool:
-        """Whether its files hold several matrices, of which those with usual names are taken."""
+        """Whether a file holds several matrices, so that they are chosen by their names."""
         damping = inspect.signature(self.read).parameters.get("damping")
         return damping is not None and damping.default == USUAL
 

@@ -30,9 +30,9 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
 
     The file has a line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
     y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where known), and then one line
-    for each frequency, with all digits. Where known, lines `# resolution: 0.5` [Hz], `# window:
-    hann` and `# overlap: 0.5` follow the first. The correlation between outputs and a window with
-    parameters are not written: `.save` keeps them.
+    for each frequency, with all digits. If they are known, the lines `# resolution: 0.5` [Hz],
+    `# window: hann` and `# overlap: 0.5` follow the first line. The correlation between outputs and
+    a window with parameters are not written: `.save` keeps them.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
         Frequency responses to write.
     units : mapping {channel: unit}, optional
         Units of channels, such as {"y1": "rad", "u1": "N m"}. By default those of the Frf are
-        written; where it has no units, N for inputs and, by the quantity of the Frf, m, m/s or
-        m/s^2 for outputs.
+        written. If it has no units, inputs have the unit N, and outputs the unit m, m/s or m/s^2
+        that belongs to the quantity of the Frf.
 
     Raises
     ------
@@ -215,7 +215,8 @@ def read_frf_npz(
         `coherence` and `variance` are read if present. What `Frf.save` wrote is read by
         `flexplant.load`.
     freq, data : str
-        Names of the arrays (n_freq,) and (n_out, n_in, n_freq); (n_freq,) for a single pair.
+        Names of the arrays of frequencies (n_freq,) and of responses (n_out, n_in, n_freq). The
+        responses may have the shape (n_freq,) for one output and one input.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Quantity of the outputs, where the file does not contain it.
     frequency_axis : int, optional
@@ -227,7 +228,7 @@ def read_frf_npz(
     FlexplantError
         When it is not an .npz file, or arrays are missing.
     ShapeError
-        When sizes do not match, or which axis is frequency is not clear.
+        When sizes do not match, or it is not clear which axis is that of frequency.
     ModelError
         When frequencies do not increase, or entries are not finite.
 

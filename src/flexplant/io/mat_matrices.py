@@ -37,8 +37,8 @@ def read_matlab(
     path : str or Path
         The .mat file; version 7.3 (HDF5) needs h5py: ``pip install 'flexplant[hdf5]'``.
     stiffness, mass, damping : str, optional
-        Names of the variables, fields of structures as "model.K0". By default the usual names are
-        searched: K, M and C or D. `damping=None`: no damping.
+        Names of the variables; a field of a structure has a name like "model.K0". By default the
+        usual names are searched: K, M and C or D. With `damping=None` no damping is read.
     dofs : DofSet, or path of a table for `read_dofs`, optional
         DOFs of the rows, which the file does not contain.
 
@@ -83,8 +83,8 @@ def read_npz(
     Parameters
     ----------
     stiffness, mass, damping : str or Path
-        One file each, as `scipy.sparse.save_npz` or `numpy.save` writes it; or as `stiffness` alone
-        an .npz of `numpy.savez(path, K=K, M=M, D=D)`.
+        A file for each matrix, as `scipy.sparse.save_npz` or `numpy.save` writes it. Instead,
+        `stiffness` alone may be an .npz file of `numpy.savez(path, K=K, M=M, D=D)`.
     dofs : as for `read_matlab`
 
     Raises

@@ -28,9 +28,9 @@ def write_mat(
     """Write a system, a plant or frequency responses, or several of them, for MATLAB.
 
     The variables of a system are `A, B, C, D, dt` (0 is continuous) and cell arrays of names
-    `inputs`, `outputs`, `states`; a plant has also `w, u, z, y` and the densities `asd` of w (0
-    where a channel has no density); responses are `freq` [Hz] and `data` (n_out, n_in, n_freq).
-    Each of several values is a structure with these fields::
+    `inputs`, `outputs`, `states`. A plant also has `w, u, z, y` and the densities `asd` of w, which
+    are 0 for channels without a density. Responses have `freq` [Hz] and `data` (n_out, n_in,
+    n_freq). Each of several values is a structure with these fields::
 
         S = load('design.mat');
         P = ss(S.plant.A, S.plant.B, S.plant.C, S.plant.D, S.plant.dt, ...

@@ -55,8 +55,8 @@ def read_matrix_market(
 ) -> FEMatrices:
     """Return the matrices of Matrix Market files.
 
-    A triangle is completed, rows of held DOFs are dropped and printed digits are counted; `notes`
-    say what was done. Rows and columns are counted from 1 in the file.
+    If the file holds one triangle, the other one is added. Rows of held DOFs are dropped, and
+    printed digits are counted. `notes` say what was done. The file counts rows and columns from 1.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def read_matrix_market(
     Raises
     ------
     FlexplantError
-        When a file is not a Matrix Market file, is cut short, or a line holds something else; the
-        line is named.
+        When a file is not a Matrix Market file, is cut short, or holds a line of another form. The
+        message names the line.
     ModelError
         When a matrix is complex, skew-symmetric or a pattern without numbers.
 
@@ -255,18 +255,18 @@ def read_harwell_boeing(
 ) -> FEMatrices:
     """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
 
-    The matrices are assembled and real (or integer): symmetric (RSA, of which the file holds the
-    lower triangle) or not (RUA).
+    The matrices must be assembled and real (or integer). They may be symmetric (RSA; the file then
+    holds the lower triangle) or not (RUA).
 
     Parameters
     ----------
     stiffness, mass, damping, dofs
-        As for `read_matrix_market`; files .rsa, .rua, .hb, .rb.
+        As for `read_matrix_market`, but with files .rsa, .rua, .hb or .rb.
 
     Raises
     ------
     FlexplantError, ModelError, ShapeError
-        As for `read_matrix_market`; ModelError for elements that are not assembled, too.
+        As for `read_matrix_market`; also ModelError for element matrices that are not assembled.
 
     Notes
     -----

@@ -48,8 +48,9 @@ def read_matrices(
 ) -> FEMatrices:
     """Return the matrices of a file in any known format, for example for `check`.
 
-    By suffix and content: Matrix Market or Abaqus .mtx; Harwell-Boeing .rsa, .rua; MATLAB .mat;
-    NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch.
+    The suffix and the content of the file determine the format: Matrix Market or Abaqus .mtx;
+    Harwell-Boeing .rsa, .rua; MATLAB .mat; NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4
+    and .pch.
 
     Parameters
     ----------
@@ -138,16 +139,16 @@ def read_model(
     stiffness : str, optional
         Name of the variable, in files that hold several (.mat, .op4, .pch).
     mass, damping : str or Path, optional
-        Files of M and D, or names of variables; in a file of several matrices those with usual
-        names by default. `damping=None`: no damping.
+        Files of M and D, or names of variables in a file of several matrices. By default such a
+        file is searched for the usual names. With `damping=None` no damping is read.
     dofs : DofSet, or path of a table for `read_dofs`, optional
         DOFs of the rows, where the file does not contain them. Their coordinates use the unit of
         length of the file too.
     nodes : str or Path, optional
-        Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
-        .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
+        File of the coordinates, if the first file names its rows but has no coordinates. It is a
+        table `node, x, y, z`, an ANSYS .rst or .cdb, a Nastran .bdf, or an Abaqus .inp.
     units : (length, mass, time)
-        Units of the file: ("mm", "t", "s") for instance; the model is in SI.
+        Units of the file, for example ("mm", "t", "s"). The model that is returned is in SI units.
     massless : "refuse" or "condense"
         Treatment of DOFs and motions without mass; condensing them is exact.
     free : bool
@@ -165,8 +166,8 @@ def read_model(
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
-        When the reader of this format does not have an option, for its errors, and when the
-        matrices do not form a model.
+        When the reader of this format does not have an option or finds an error, or the matrices do
+        not form a model.
 
     Warns
     -----

@@ -407,7 +407,8 @@ def read_op4(
 ) -> FEMatrices:
     r"""Return the stiffness, mass and damping matrices of a Nastran OUTPUT4 file.
 
-    The file names its matrices, but neither nodes nor units. Rows that are zero are kept.
+    The file contains the names of its matrices, but no nodes and no units. Rows that are zero are
+    kept.
 
     Parameters
     ----------
@@ -415,21 +416,22 @@ def read_op4(
         An .op4 file, binary (32 or 64 bit integers, either byte order) or text.
     stiffness, mass, damping : str, optional
         Names of the matrices. By default the usual names (KAA, KAAX, KGG, KXX, KFF, KLL; MAA, ...;
-        BAA, ...) are searched, one of which must exist. `damping=None`: no damping is read. A zero
-        matrix of 1 x 1, as EXTSEOUT writes it, counts as missing.
+        BAA, ...) are searched, one of which must exist. With `damping=None` no damping is read. A
+        zero matrix of 1 x 1, as EXTSEOUT writes it, counts as missing.
     dofs : DofSet, optional
         DOFs of the rows of the matrices.
 
     Returns
     -------
     FEMatrices
-        Matrices with the number of `digits` of K as printed in a text file, or 7 in single
+        Matrices; `digits` is the number of digits of K as printed in a text file, or 7 in single
         precision (type 1).
 
     Raises
     ------
     FlexplantError
-        When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
+        When the file is cut off, damaged, or not an OUTPUT4 file. The message names the byte or the
+        line.
     ModelError
         When the choice of a matrix is not clear, or M or D is complex.
 
@@ -478,8 +480,8 @@ def read_op4_matrices(
     Returns
     -------
     dict {name: (m, n) array or csc_array}
-        Sparse where the file holds it sparse, or a large one is nearly empty; float64, or
-        complex128. A doubled name gets `_2`.
+        Matrices of float64 or complex128. A matrix is sparse if it is sparse in the file, or if it
+        is large and nearly empty. If a name occurs twice, the second one gets `_2`.
 
     Raises
     ------

@@ -45,33 +45,34 @@ def read_dmig(
 ) -> FEMatrices:
     """Return the matrices of a Nastran punch file (DMIG cards), their rows named by node.
 
-    Components 1..6 become x, y, z, rx, ry, rz. Rows are sorted by node and component; nodes that
-    only the vector VAX of the analysis set names are kept as empty rows.
+    Components 1..6 become x, y, z, rx, ry, rz. Rows are sorted by node and component. Nodes that
+    are named only in the vector VAX of the analysis set are kept as empty rows.
 
     Parameters
     ----------
     path : str or Path
         A .pch file with DMIG cards in large, small or free fields.
     bdf : str or Path, optional
-        The bulk data, for the coordinates of the nodes (GRID, CORD2R, CORD2C, CORD2S); nodes that
-        move in local directions (field CD) are turned into the basic system.
+        File of the bulk data, with the coordinates of the nodes (GRID, CORD2R, CORD2C, CORD2S).
+        Nodes that move in local directions (field CD) are turned into the basic system.
     stiffness, mass, damping : str, optional
         Names of the matrices. By default the usual names (KAAX, KAA, KGG, K2GG; MAAX, ...; BAAX,
-        ...) are searched, one of which must exist. `damping=None`: no damping is read. Structural
-        damping (K4AAX) is not viscous and is not read.
+        ...) are searched, one of which must exist. With `damping=None` no damping is read.
+        Structural damping (K4AAX) is not viscous and is never read.
     scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
         Direction of scalar points (component 0); without it they are refused.
 
     Returns
     -------
     FEMatrices
-        Matrices with the printed number of `digits` (ten in a usual punch file, so that soft modes
-        may be lost). They are not `located` where `bdf` is not given.
+        Matrices; `digits` is the number of printed digits. A usual punch file has ten, which may be
+        too few for soft modes. Without `bdf` the nodes have no coordinates (the matrices are not
+        `located`).
 
     Raises
     ------
     FlexplantError
-        When a card cannot be read; the line is named.
+        When a card cannot be read; the message names the line.
     LabelError
         When a named matrix does not exist, or a node has no coordinates in `bdf`.
     ModelError

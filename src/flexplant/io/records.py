@@ -27,8 +27,8 @@ RECORD_READERS: dict[str, Callable[[Path], RecordedChannels]] = {
 def read_records(path: str | Path, *, rate: float | None = None) -> Response:
     r"""Return the time records of a file, in SI, with their names, sampling rate and units.
 
-    By suffix: universal files .uff, .unv (dataset 58 of function type 1), LabVIEW .lvm, and tables
-    .csv, .txt with the names of the channels above the numbers.
+    The suffix determines the format: universal files .uff, .unv (dataset 58 of function type 1),
+    LabVIEW .lvm, and tables .csv, .txt with the names of the channels above the numbers.
 
     Parameters
     ----------
@@ -40,20 +40,20 @@ def read_records(path: str | Path, *, rate: float | None = None) -> Response:
     Returns
     -------
     Response
-        ``found["acc"]`` is the record of a channel, (n_time,), or (n_runs, n_time) where each
-        channel was recorded several times; `found.rate` [Hz]; `found.units`. Known units are
-        converted (g to m/s^2). Numbers in unknown units are unchanged, and the channel is missing
-        in `units`. Channels of universal files are named by node and direction, "41:z", forces "u
-        41:z".
+        ``found["acc"]`` is the record of a channel, with the shape (n_time,), or (n_runs, n_time)
+        if each channel was recorded several times. `found.rate` is the sampling rate [Hz], and
+        `found.units` are the units. Known units are converted (g to m/s^2). Numbers in unknown
+        units are unchanged, and the channel is missing in `units`. Channels of universal files are
+        named by node and direction: motions "41:z", forces "u 41:z".
 
     Raises
     ------
     FlexplantError
-        When the format is not known, holds no time records, or the file is damaged; the line is
-        named.
+        When the format is not known, holds no time records, or the file is damaged. The message
+        names the line.
     ModelError
-        When no rate is known, or `rate` is given and the file holds one; when samples were not
-        taken in equal steps.
+        When no rate is known, or `rate` is given although the file holds one. Also when samples
+        were not taken in equal steps.
 
     See Also
     --------

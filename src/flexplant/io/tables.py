@@ -50,22 +50,23 @@ def read_dofs(
 ) -> DofSet:
     """Return the DofSet of a text table: the DOFs of the rows of the matrices.
 
-    Three forms: one line a DOF with columns `node, direction, x, y, z`; one line a DOF with `node,
-    direction`, and the coordinates in a second table of `nodes`; or a table of nodes (`node, x, y,
-    z`) all of which have the same `directions`. A column `row` (from 1) gives the order; otherwise
+    The table has one of three forms. Either each line is a DOF with the columns
+    `node, direction, x, y, z`. Or each line is a DOF with the columns `node, direction`, and a
+    second table of `nodes` gives the coordinates. Or each line is a node (`node, x, y, z`), and all
+    nodes have the same `directions`. A column `row` (from 1) gives the order of the DOFs; otherwise
     the order of the lines is used.
 
     Parameters
     ----------
     path : str or Path
-        The table: commas, semicolons, tabs or spaces; a first line with the names of the columns.
-        Directions may be x to rz, UX to ROTZ, T1 to R3 or 1 to 6.
+        Path of the table. Columns are separated by commas, semicolons, tabs or spaces, and the
+        first line gives their names. Directions may be x to rz, UX to ROTZ, T1 to R3 or 1 to 6.
     nodes : str or Path, optional
         A table `node, x, y, z`, with or without a first line of names.
     directions : sequence of str, optional
         Directions of every node, in the order of the rows: ("x", "y", "z").
     length : str or float
-        The unit of the coordinates, "mm" for instance, or its size in metres.
+        Unit of the coordinates, for example "mm", or the length of this unit in metres.
 
     Raises
     ------

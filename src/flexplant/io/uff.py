@@ -52,8 +52,8 @@ def read_frf_uff(
 
     They are read from dataset 58, text or binary, where every record gives the response of one
     output to one input. A direction of -3 means z with the opposite sign. A file without dataset 58
-    may hold dataset 2414: the responses of all nodes of a model to its load sets, named "load 1"
-    and so on, per whole load set.
+    may hold dataset 2414, with the responses of all nodes of a model to its load sets. These are
+    then responses to whole load sets, which are named "load 1" and so on.
 
     Nodes that move in a coordinate system of dataset 18 or 2420 (the displacement system of
     dataset 15 or 2411) are turned to global directions. System 0 is the global one, and so is
@@ -77,8 +77,8 @@ def read_frf_uff(
     Returns
     -------
     Frf
-        Responses with outputs "41:z" and inputs "u 41:z", sorted by node and direction. Where a
-        direction is missing, the name of the entity takes its place.
+        Responses with outputs "41:z" and inputs "u 41:z", sorted by node and direction. If a record
+        has no direction, the name of its entity is used instead.
 
     Raises
     ------
@@ -86,9 +86,9 @@ def read_frf_uff(
         When pyuff is missing, the file is damaged, pairs are missing or doubled, or records are
         over different frequencies; the pairs are listed.
     ModelError
-        When units or quantities are not clear, or zero frequency would be integrated; when a node
-        moves in a system that is not there or not read, or was measured in too few of its local
-        directions to know a global one.
+        When units or quantities are not clear, or zero frequency would be integrated. Also when a
+        node moves in a coordinate system that is missing or cannot be read, or when it was measured
+        in too few local directions to compute a global one.
 
     Notes
     -----
@@ -192,8 +192,8 @@ def _in_global_directions(frf: Frf, path: str | Path) -> Frf:
 def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> MeasuredModes:
     """Return poles and mode shapes of a universal file (datasets 55 and 2414).
 
-    Normal and complex modes are read. Where a file holds both datasets, those of dataset 55 are
-    taken, which test software writes.
+    Normal and complex modes are read. If a file holds both datasets, the modes of dataset 55 are
+    used, because this is the one that test software writes.
 
     The file numbers the modes in the order of the measurement; `numbered` finds which modes of a
     model they are.
@@ -292,8 +292,8 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     FlexplantError
         When pyuff is missing, the file is damaged, or holds no nodes.
     ModelError
-        When a node is given, or moves, in a coordinate system that is not read (`read_frf_uff`), or
-        in local directions where the file holds no results.
+        When a node is given, or moves, in a coordinate system that cannot be read (see
+        `read_frf_uff`). Also when it moves in local directions and the file holds no results.
 
     Examples
     --------

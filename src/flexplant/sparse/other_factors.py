@@ -22,16 +22,16 @@ _ORDERS = ("default", "best", "amd", "metis", "nesdis")
 class Cholmod(Value):
     """Factor with CHOLMOD [Chen2008]_: ``pip install scikit-sparse``, 0.4.16 or later.
 
-    It needs SuiteSparse and a compiler (Debian: ``apt-get install libsuitesparse-dev``), and parts
-    of CHOLMOD are under the GPL, so that no extra of this package installs it. 24 modes of a plate
-    of 99 400 DOFs took 5.6 s with it and 5.2 s without, of a solid of 52 700 DOFs 24 s and 10 s.
-    Modes are counted and checked as always, by the library's own factorisation.
+    It needs SuiteSparse and a compiler (Debian: ``apt-get install libsuitesparse-dev``). No extra
+    of this package installs it, because parts of CHOLMOD are under the GPL. 24 modes of a plate of
+    99 400 DOFs took 5.6 s with it and 5.2 s without it. For a solid of 52 700 DOFs the times were
+    24 s and 10 s. The modes are always counted and checked by flexplant's own factorisation.
 
     Parameters
     ----------
     order : str
-        How CHOLMOD orders the unknowns: "default" (minimum degree, METIS where that fills),
-        "best", "amd", "metis" or "nesdis".
+        Method by which CHOLMOD orders the unknowns: "default" (minimum degree, or METIS if that
+        gives too many nonzero entries), "best", "amd", "metis" or "nesdis".
 
     Examples
     --------
