@@ -1,10 +1,11 @@
 """Export: C code of controllers, and functional mock-up units.
 
-- `write_c`: a controller in one C file with its header, from a `fx.ClosedLoop` (observer and servo
-  together) or a `fx.Controller`; 60 states take 0.04 us per sample.
-- `write_fmu`: a `fx.StandardPlant` or a controller, sampled, for FMI 2.0 and 3.0.
+- `write_c`: writes a controller as one C file with its header. It is given as a `fx.ClosedLoop`
+  (observer and servo together) or a `fx.Controller`. 60 states take 0.04 us per sample.
+- `write_fmu`: writes a sampled `fx.StandardPlant` or controller as a functional mock-up unit (FMU)
+  for FMI 2.0 and 3.0, which Simulink and other simulation programs import.
 
-Names elsewhere: MATLAB Coder, Simulink Coder.
+In MATLAB, MATLAB Coder and Simulink Coder serve the same purpose.
 
 >>> import tempfile, pathlib
 >>> import flexplant as fx

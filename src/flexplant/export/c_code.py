@@ -41,33 +41,35 @@ def write_c(
 ) -> tuple[Path, Path]:
     """Write a sampled controller as C99: one source file and its header, no allocation.
 
-    The states are transformed to blocks of two, of which a compiler computes several at a time;
-    their response is compared with that of the controller. Numbers have 17 digits (9 in single
-    precision), which is exact. The functions are `_reset`; `_start`, which begins without a step
-    from the present commands (it finds steady states with these commands, if they exist); `_output`
-    and `_update`, or `_step`. A value that is not finite holds the last outputs and raises a flag.
+    The states are transformed to blocks of two, so that a compiler can compute several blocks at a
+    time. As a check, the response of the blocks is compared with that of the controller. Numbers
+    have 17 digits (9 in single precision), which is exact. The names of the functions end in
+    `_reset`, `_start`, `_output`, `_update` and `_step`. `_start` begins without a jump of the
+    present commands: it finds steady states with these commands, if they exist. In each sample call
+    `_output` and then `_update`, or only `_step`. If a value is not finite, the last outputs are
+    held and a flag is raised.
 
     Parameters
     ----------
     controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or {place: one of these}
-        Sampled controller. All blocks of a ClosedLoop go to one file: inputs are the channels of
-        `plant.y`, outputs the driven actuators, then the monitored outputs. Inputs named like an
-        output (observer, `anti_windup_form`) get the applied commands. Controllers in a mapping
-        differ only in their outputs (feedforward, decoupling, gains after the states), which are
-        interpolated linearly between places. For a ScheduledLoop all matrices are interpolated, and
-        its position is the last input.
+        Sampled controller. All blocks of a ClosedLoop go to one file. Its inputs are the channels
+        of `plant.y`, and its outputs the driven actuators, followed by the monitored outputs. An
+        input with the name of an output (as in an observer or an `anti_windup_form`) gets the
+        applied command. The controllers of a mapping may differ only in their outputs (feedforward,
+        decoupling, gains after the states), which are interpolated linearly between places. For a
+        ScheduledLoop all matrices are interpolated, and its position is the last input.
     path : path
-        Path of the source; the header is next to it.
+        Path of the source file. The header is written to the same folder.
     name : str, optional
         Prefix of the functions; by default the name of the file.
     limits : float, (low, high) or mapping {actuator: one of these}, optional
-        Limits of the actuators in the units of u, to which commands are limited.
+        Limits of the commands of the actuators, in the units of u.
     anti_windup : float [s], optional
         Recovery time of a ClosedLoop, as for `simulate`. For a single controller that does not read
-        the applied commands it is the `recovery` of `anti_windup_form`; where it is not given,
-        limits need a controller of which Hanus' form exists.
+        the applied commands it is the `recovery` of `anti_windup_form`. If it is not given, limits
+        are possible only for a controller that has Hanus' form (see `anti_windup_form`).
     schedule : str, optional
-        Input whose value is the place, for a mapping.
+        Name of the input whose value is the place, for controllers in a mapping.
     single : bool
         Whether to compute in float instead of double.
 
@@ -82,7 +84,7 @@ def write_c(
         When a command depends on an applied command of the same sample, or limits need a recovery
         time.
     CertificateError
-        When the blocks differ from the controller, by rounding to single precision for instance.
+        When the blocks differ from the controller, for example by rounding to single precision.
     LabelError
         When the name is not a C identifier, or an actuator or the input of a schedule is unknown.
     ModelError

@@ -336,20 +336,22 @@ def write_fmu(
     anti_windup: float | None = None,
     schedule: str | None = None,
 ) -> Path:
-    """Write a sampled plant or controller as a unit for co-simulation (FMI).
+    """Write a sampled plant or controller as a functional mock-up unit for co-simulation (FMI).
 
-    Simulink, Dymola, OpenModelica and others import it. It contains C sources (those of `write_c`
-    and the interface) and a library for this computer, if a C compiler is found. Time advances in
-    samples: a communication step computes all samples within it, with constant inputs. Outputs that
-    depend on inputs of the same sample are computed when they are read.
+    Simulink, Dymola, OpenModelica and other programs import it. It contains C sources (those of
+    `write_c` and the interface) and, if a C compiler is found, a library for this computer. Time
+    advances in samples: in each communication step all samples within this step are computed with
+    constant inputs. Outputs that depend on inputs of the same sample are computed when they are
+    read.
 
     Parameters
     ----------
     system : StandardPlant, GeneralizedPlant, StateSpace, Controller or ClosedLoop
-        Sampled system. A plant has all of w, u, z and y as channels; a ClosedLoop gives its
-        controller, as for `write_c`.
+        Sampled system. The unit of a plant has w and u as inputs, and z and y as outputs. Of a
+        ClosedLoop the controller is written, as by `write_c`.
     path : str or Path
-        Path such as "stage.fmu", written atomically; its name is that of the model.
+        Path such as "stage.fmu". The file is written completely or not at all. Its name becomes the
+        name of the model.
     version : str
         "3.0" or "2.0".
     limits, anti_windup, schedule
@@ -358,8 +360,8 @@ def write_fmu(
     Returns
     -------
     Path
-        Path of the file. Channels keep names and units; a channel that is both input and output
-        gets ``|y`` after its output name.
+        Path of the file. Channels keep their names and units. If a channel is both an input and an
+        output, ``|y`` is added to the name of the output.
 
     Raises
     ------
@@ -374,7 +376,8 @@ def write_fmu(
     Warns
     -----
     FlexplantWarning
-        When no C compiler is found: the unit holds sources only, for tools that compile them.
+        When no C compiler is found. The unit then contains only sources, which the importing
+        program must compile.
 
     References
     ----------

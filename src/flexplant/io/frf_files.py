@@ -37,7 +37,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     Parameters
     ----------
     path : str or Path
-        The file, written atomically.
+        Path of the file, which is written completely or not at all.
     frf : Frf
         Frequency responses to write.
     units : mapping {channel: unit}, optional

@@ -40,7 +40,7 @@ def write_mat(
     Parameters
     ----------
     path : str or Path
-        The file, written atomically; no ending is added.
+        Path of the file, which is written completely or not at all. No ending is added.
     value : StateSpace, control.StateSpace, plant, Frf, or mapping of them
         Value to write; several values as {"plant": plant, "K": controller, "frf": frf}. A
         controller or an observer is written as its `.system`, a weighted plant with its weights.

@@ -1,9 +1,9 @@
-"""All pictures: functions that draw values on `ax=` or new axes, and return the axes.
+"""All pictures: functions that draw values on the axes `ax` or on new axes, and return the axes.
 
 - `bode`, `frf`, `singular_values`, `nyquist`, `sensitivity`: responses and loops.
-- `response`, `exposures`, `budget`, `spectra`: runs and errors by source.
+- `response`, `exposures`, `budget`, `spectra`: simulated runs, and errors by source.
 - `update`, `parameters`, `residual`, `stabilisation`, `identified`: measurements and updates.
-- `layout`, `mode_shape`, `sensor_map`, `placed`: the machine and its devices.
+- `layout`, `mode_shape`, `sensor_map`, `placed`: the machine, its sensors and its actuators.
 - `report(path, ...)`: a whole design as one HTML file, with zoomable pictures, moving mode shapes,
   certificates, seeds and versions.
 
@@ -16,7 +16,8 @@
 >>> axes.get_xlabel()
 'frequency [Hz]'
 
-**Legend.** The labels below select a style of `STYLES`; other lines follow `CYCLE`.
+**Legend.** A line with one of the labels below has the style of this label in `STYLES`. Other lines
+have the colours of `CYCLE`, one after the other.
 
 | drawn | label | look |
 |---|---|---|
@@ -28,14 +29,14 @@
 | bounds | "bound" | red dots |
 | differences | | purple |
 
-Seen from above, sensors are black crosses, actuators triangles, POIs circles. Axes have SI units
-with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g); later lines on the same
-axes keep it. Frequencies are in Hz, gains in dB with the unit of 0 dB. More than four lines that
-would hide each other get one panel each; more than six lines in one panel are labelled at their
-ends.
+In views from above, sensors are black crosses, actuators triangles and POIs circles. Axes have SI
+units with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g). Lines that are
+added later to the same axes have the same prefix. Frequencies are in Hz. Gains are in dB, and the
+axis says which gain is 0 dB. If more than four lines would hide each other, each line has a
+separate panel. If there are more than six lines in one panel, they are labelled at their ends.
 
-Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB: `bode`,
-`singular_values`, `nyquist`, `pole_map`, `root_locus`, `step`.
+For ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``rlocus`` and ``step`` of MATLAB use `bode`,
+`singular_values`, `nyquist`, `pole_map`, `root_locus` and `step`.
 """
 
 from ..rooms import public_names as _public_names

@@ -44,9 +44,10 @@ def bode(
 ) -> Axes:
     """Draw magnitude [dB] and phase [deg] over frequency, a pair of panels for each channel.
 
-    Phases of systems are continuous over frequency; those of measurements, drawn as points, follow
-    the first system by whole turns, or lie between -180 and 180 degrees without one.
-    With ``wrap=True`` all lie between -180 and 180 degrees, as a dynamic analyser draws them.
+    Phases of systems are continuous over frequency. Measurements are drawn as points, and their
+    phases are shifted by whole turns to be near those of the first system. Without a system they
+    lie between -180 and 180 degrees. With ``wrap=True`` all phases lie between -180 and 180
+    degrees, as a dynamic analyser draws them.
 
     Parameters
     ----------
@@ -138,12 +139,12 @@ def _whole_turns(ax: Axes) -> None:
 def singular_values(
     systems: Any, *, freq: FloatArray | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the singular values of responses: the largest as a line, the area down to the smallest.
+    """Draw the largest singular value of responses as a line, and the area down to the smallest.
 
     The largest one is the gain of the worst direction of the inputs at each frequency; its peak is
     the H-infinity norm of a stable system. Channels should have one unit, or be weighted. Singular
-    values that are zero at all frequencies are left out, as for a controller of fewer motions than
-    channels.
+    values that are zero at all frequencies are left out. They occur, for example, for a controller
+    that has more channels than it controls motions.
 
     Parameters
     ----------
@@ -195,13 +196,13 @@ def frf(
 ) -> Axes:
     """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
 
-    Measurements are black points under the lines. The first line without a role in the legend is
-    thick, so that others do not hide it.
+    Measurements are black points under the lines. The first line whose label has no style of its
+    own (see `flexplant.plot`) is thick, so that other lines do not hide it.
 
     Parameters
     ----------
     responses : mapping {label: Frf or system}
-        What to compare.
+        Responses to compare.
     output, input : str
         Names of the output and the input that are drawn.
     colors : mapping {label: color}, optional
@@ -209,17 +210,17 @@ def frf(
     unit : str, optional
         Unit of the gain (of 0 dB), if the responses have none.
     reference : str, optional
-        A label: the differences of the other responses from this one are drawn as well, where
-        they share its frequencies.
+        Label of one response. The differences of the other responses from this one are drawn too,
+        if they are given at the same frequencies.
     band : (low, high) [Hz], optional
         Frequency range to draw; all by default.
     freq : (n_freq,) array [Hz], optional
         Frequencies; by default a grid of each system, refined at its resonances.
     also : sequence of str, optional
-        "phase" [deg, within half a turn of 0] and "coherence", each in a panel below;
-        "deviation", the standard deviation of measurements, as a line below them.
+        Further quantities to draw. "phase" [deg, between -180 and 180] and "coherence" have a panel
+        each. "deviation" draws the standard deviation of measurements as a line below them.
     ax : Axes, optional
-        Axes for the magnitude, without phase and coherence.
+        Axes for the magnitude, if neither phase nor coherence is drawn.
 
     Returns
     -------

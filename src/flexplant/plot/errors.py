@@ -40,8 +40,8 @@ _RIGHT_OF_AXES: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 
 def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes:
     """Draw the cumulative spectra of an error budget, stacked by source.
 
-    Each area is the variance of a source below a frequency; the areas end at the variances of the
-    budget, the top at the square of the rms.
+    The height of each area is the variance that a source causes below a frequency. At the last
+    frequency the heights are the variances of the budget, and their sum is the square of the rms.
 
     Parameters
     ----------

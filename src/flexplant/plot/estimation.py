@@ -48,8 +48,9 @@ def predictions(
     Parameters
     ----------
     rows : sequence of EstimatorComparison, or mapping {design: (k, 4) array}
-        Comparisons of the same estimators in k cases; or for each design and case the predicted rms
-        error, the measured one, and the ends of its confidence interval.
+        Comparisons of the same estimators in k cases. A mapping gives four numbers for each design
+        and case: the predicted rms error, the measured one, and both ends of its confidence
+        interval.
     colors : mapping {design: color}, optional
         Colours of the diamonds.
     cases : sequence of str, optional
@@ -113,14 +114,16 @@ def predictions(
 
 
 def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the rms error of an estimate over the lag after which it is known.
+    """Draw the rms error of an estimate over its lag.
+
+    With a lag, the estimate of a sample uses measurements up to this time later.
 
     Parameters
     ----------
     report : LagReport
         Report from `observer.report()`.
     channel : str, optional
-        A POI's motion; by default the first.
+        Motion of a POI; by default the first of the report.
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 
@@ -270,10 +273,12 @@ def consistency(
 ) -> Axes:
     """Draw three tests of the innovations of a filter against its model.
 
-    The normalised innovation squared (NIS) over time, 1 when the noises have the stated size; its
-    correlation over lags, 0 for a correct model; and the cumulative periodogram minus a straight
-    line, 0 for white innovations. A correct model stays between the dotted bounds at the level:
-    everywhere in the third test, for that fraction of the points in the others.
+    The first test is the normalised innovation squared (NIS) over time, which is about 1 if the
+    noises have the stated size. The second is its correlation over lags, which is about 0 for a
+    correct model. The third is the cumulative periodogram minus a straight line, which is about 0
+    for white innovations. Dotted lines are bounds at the given `level`. For a correct model this
+    fraction of the points lies between the bounds in the first two tests. In the third test the
+    whole curve lies between them with this probability.
 
     Parameters
     ----------

@@ -476,8 +476,8 @@ def report(
 ) -> Path:
     """Write a design to one self-contained HTML file: result, design, certificates, versions.
 
-    The file does not load anything. Its pictures can be zoomed, dragged and read with the cursor,
-    mode shapes move, and it can be printed. Equal values give equal files, to the byte.
+    The file needs no other files and no network. Its pictures can be zoomed, dragged and read with
+    the cursor, mode shapes move, and it can be printed. Equal values give identical files.
 
     Parameters
     ----------
@@ -485,8 +485,8 @@ def report(
         Path of the file; an existing file is replaced.
     *parts : values of this package, or mappings {name: value}
         Values to report, in any order: plants, observers, controllers, loops, runs, placements,
-        modes, updates, studies. The figures at the top belong to the first of several loops. Other
-        values are shown by their repr.
+        modes, updates, studies. If there are several loops, the figures at the top belong to the
+        first one. Values of other kinds are shown as text.
     title, subtitle : str
         Title and subtitle. No date is added, so that equal designs give equal files.
     channel : str, optional

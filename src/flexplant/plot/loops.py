@@ -59,23 +59,23 @@ def nyquist(
 ) -> Axes:
     """Draw loop gains L in the complex plane, with -1 and the circle with ``|S| > modulus``.
 
-    More than four curves get one panel each.
+    If there are more than four curves, each has a separate panel.
 
-    ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
-    the mirror image is not drawn. Where a measured gain steps over a resonance the curve follows
-    the circle through its neighbouring lines.
+    The magnitude of ``S = 1 / (1 + L)`` is the inverse of the distance of L from -1. Only positive
+    frequencies are drawn, without the mirror image. If the frequencies of a measured gain are too
+    coarse for a resonance, the curve follows the circle through the neighbouring points.
 
     Parameters
     ----------
     loop_gains : StateSpace, Frf, ClosedLoop, or mapping {label: one of these}
-        Loop gains L of one channel each, with the sign of ``1 + L``. For a closed loop, the gain at
-        each actuator while the others stay closed.
+        Loop gains L of one channel each, for negative feedback (``1 + L``). Of a closed loop, the
+        gain at each actuator is drawn while the loops of the other actuators stay closed.
     channel : (output, input), optional
         Channel of systems with several channels.
     freq : (n_freq,) array [Hz], optional
         Frequencies; by default a grid of each system, refined at its resonances.
     modulus : float
-        Largest |S| of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
+        Value of |S| on the circle about -1, which has the radius 1 / modulus; 2 is 6 dB.
     reach : float
         Largest real and imaginary part of the picture.
     ax : Axes, optional
@@ -176,11 +176,11 @@ _RATIOS = (1e-3, 1e-2, 0.1, 0.3, 0.7)
 
 
 def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Axes:
-    """Draw poles (and zeros) by frequency and damping ratio, those right of the axis in red.
+    """Draw poles (and zeros) by frequency and damping ratio, unstable ones in red.
 
-    Lightly damped poles seem to lie on the imaginary axis; the damping ratio ``-Re s / |s|`` over
-    |s| in Hz separates them. Poles of sampled systems are mapped to ``log(z) / dt``. Poles at zero
-    frequency are named in the legend.
+    In the complex plane, lightly damped poles seem to lie on the imaginary axis. A diagram of the
+    damping ratio ``-Re s / |s|`` over |s| in Hz separates them. Poles of sampled systems are mapped
+    to ``log(z) / dt``. Poles at zero frequency are named in the legend.
 
     Parameters
     ----------
@@ -279,20 +279,20 @@ def sensitivity(
 ) -> Axes:
     """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
-    More than four curves get one panel each.
+    If there are more than four curves, each has a separate panel.
 
     Parameters
     ----------
     curves : ClosedLoop, Frf, (plant, controller), (freq [Hz], size), or mapping {label: of these}
-        Curves to draw. For a loop |S| from each reference to the error of its axis; without
-        references, and for `(plant, controller)`, the largest singular value of S at u; for an
-        `Frf`, such as `sensitivity(loop)`, its largest singular value.
+        Curves to draw. Of a loop, |S| from each reference to the error of its axis is drawn. Of a
+        loop without references, and of `(plant, controller)`, it is the largest singular value of S
+        at u. Of an `Frf`, such as `sensitivity(loop)`, it is the largest singular value.
     colors : mapping {label: color}, optional
         Colours of some lines.
     dashed : collection of str
         Labels of lines to draw thin and dashed, so that lines below them are visible.
     weight : StateSpace or float, optional
-        W of ``|W S| < 1``: its inverse is drawn as the bound.
+        Weight W of ``|W S| < 1``. Its inverse is drawn as a bound.
     freq : (n_freq,) array [Hz], optional
         Frequencies for pairs of plant and controller; by default a grid of each.
     ax : Axes, optional
@@ -358,19 +358,21 @@ def sensitivities(
 ) -> Axes:
     """Draw S, T and KS of loops below each other, with the bounds that weights set.
 
-    ``S = (I - L)^-1``, ``T = I - S``, ``K S`` from measurements y to commands u, broken at `at`.
-    For several channels the largest singular value is drawn, the gain of the worst direction; for S
-    also the smallest, as a thin line, since more actuators than axes leave a direction free.
+    The functions are ``S = (I - L)^-1``, ``T = I - S``, and ``K S`` from measurements y to commands
+    u. L is the gain of the loop that is broken at `at`. For several channels the largest singular
+    value is drawn, which is the gain of the worst direction. For S the smallest one is drawn too,
+    as a thin line: if there are more actuators than axes, the largest one is never below 1, because
+    one direction is not controlled.
 
     Parameters
     ----------
     loops : ClosedLoop, (plant, controller), or mapping {label: one of these}
         The plant may be a measured Frf.
     weights : mapping {"S", "T" or "KS": StateSpace or float}, optional
-        W of ``|W S| < 1`` and so on: their inverses are drawn as bounds, as `mixed_sensitivity`
-        takes them.
+        Weights W of ``|W S| < 1`` and so on, as for `mixed_sensitivity`. Their inverses are drawn
+        as bounds.
     at : {"u", "y"}
-        Where the loop is broken for S and T.
+        Place at which the loop is broken for S and T.
     freq : (n_freq,) array [Hz], optional
         Frequencies; by default a grid of each loop, refined at its resonances.
     colors : mapping {label: color}, optional

@@ -120,7 +120,7 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     Returns
     -------
     Axes
-        Axes with the root of a mean square in nm, urad and so on; other criteria unchanged.
+        Axes with the criterion. If it is a mean square, its root is drawn, in nm, urad and so on.
 
     Raises
     ------
@@ -165,16 +165,16 @@ def placed(
 ) -> Axes:
     """Draw the sensors, actuators and POIs of a plant on its structure, seen from above.
 
-    Each device is named; arrows show the directions of those in x and y. For a solid, devices in
-    its lower half are drawn separately, seen from below.
+    Each device has its name. Devices that act or measure in x or y have an arrow in this direction.
+    For a solid, devices in its lower half are drawn separately, seen from below.
 
     Parameters
     ----------
     plant : StandardPlant
         Plant assembled from a structure, such as `placement.on(plant)`.
     mode : int, optional
-        Number of a mode from 1, rigid-body modes included: its motion in z is drawn as contours,
-        and its nodal line.
+        Number of a mode, counted from 1 with the rigid-body modes. Its motion in z is drawn as
+        contours, with its nodal line.
     zones : sequence of Rectangle or Disc
         Excluded zones, hatched.
     ax : Axes, optional
@@ -316,9 +316,9 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     Returns
     -------
     list of Axes
-        A panel for the decoupling error, one for the participation of the modes in the loop (over
-        two positions, the lowest of all modes), and one for each figure. The smallest and largest
-        values are marked.
+        A panel for the decoupling error, one for the participation of the modes in the loop, and
+        one for each figure. Over two positions, the lowest participation of all modes is drawn. The
+        smallest and largest values are marked.
 
     Raises
     ------

@@ -20,25 +20,27 @@ _ROOM = 1.5
 
 
 def root_locus(sys: System, gains: npt.ArrayLike | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the poles of the closed loop for all gains k of a loop gain k L of negative feedback.
+    """Draw the poles of a closed loop with negative feedback of k L, over the gain k.
 
-    The roots of ``det(I + k L(s)) = 0`` as eigenvalues of ``A - k B (I + k D)^-1 C``: no polynomial
-    is formed, which would lose lightly damped modes.
+    The poles are the roots of ``det(I + k L(s)) = 0``. They are computed as eigenvalues of
+    ``A - k B (I + k D)^-1 C``. A polynomial is not used, because it would lose lightly damped
+    modes.
 
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
         The loop gain L, with as many inputs as outputs.
     gains : (n,) array, optional
-        Positive gains k; when not given 1e-3 to 1e3.
+        Positive gains k; by default from 1e-3 to 1e3.
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 
     Returns
     -------
     Axes
-        Imaginary over real part [rad/s]; of a sampled system in the plane of z with its unit
-        circle. Crosses are the poles of L, circles its zeros, dots the poles at k = 1.
+        Axes of the complex plane [rad/s]. For a sampled system it is the plane of z, with the unit
+        circle. Crosses are the poles of L, circles its zeros, and dots the poles of the closed loop
+        at k = 1.
 
     Raises
     ------

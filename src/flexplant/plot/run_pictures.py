@@ -49,7 +49,7 @@ def response(
 ) -> Axes:
     """Draw channels of a run (the first of several) over time, one panel for each unit.
 
-    More than four channels get separate panels and scales, since they would hide each other.
+    If there are more than four channels, which would hide each other, each has a separate panel.
 
     Parameters
     ----------
@@ -197,10 +197,11 @@ def step(
     systems : StateSpace, ClosedLoop, or mapping {label: one of these} or list of them
         Systems to draw, also of python-control and SciPy; several share their axes.
     outputs, inputs : str or sequence of str, optional
-        Channels of the first system; all by default. Of a loop with references, the references and
-        the motions of their POIs are the default. Other systems use the same names.
+        Channels of the first system; all by default. For a loop with references, the default is the
+        references and the motions of their POIs. The other systems must have the same names.
     duration : float [s], optional
-        Duration; by default until the slowest pole has decayed to 1 % or for 20 of its periods.
+        Duration. By default the response ends when the slowest pole has decayed to 1 % or made 20
+        oscillations.
     ax : Axes, optional
         Axes for a single channel.
 

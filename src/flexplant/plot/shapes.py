@@ -54,10 +54,9 @@ def mode_shape(
 ) -> Any:
     """Draw a mode of a plate, a solid or a frame in three dimensions (paper, Figs. 5 and 6).
 
-    The surface is found from the nodes: that of a solid has two sides. A structure whose nodes form
-    no surface is drawn as lines between nodes that are near, or between those that are `joined`.
-    The colour is the size of the displacement, in all directions together; dashed lines are the
-    edges at rest.
+    The surface is found from the nodes; a solid has two such surfaces. If the nodes form no
+    surface, lines are drawn between neighbouring nodes, or between those that are `joined`. The
+    colour shows the magnitude of the displacement vector. Dashed lines are the edges at rest.
 
     Parameters
     ----------
@@ -72,9 +71,9 @@ def mode_shape(
     color : str, optional
         One colour for the surface or the lines.
     joined : FEModel or (m, 2) array of int, optional
-        Draws lines in place of a surface, as suits a frame of beams: between nodes that the
-        stiffness matrix of a model joins, or between the nodes with these numbers, such as those
-        at the ends of each element in the file of the model.
+        Lines to draw in place of a surface, for example for a frame of beams. For a model, lines
+        are drawn between nodes that its stiffness matrix joins. An array gives the numbers of the
+        two nodes of each line, such as the ends of each element in the file of the model.
     ax : Axes3D, optional
         Axes to draw on, in three dimensions; by default those of a new figure.
 
@@ -343,8 +342,8 @@ def layout(
 ) -> Any:
     """Draw the places of nodes, desired DOFs, actuators, sensors and POIs (paper, Fig. 3).
 
-    A plate is drawn from above, a solid in three dimensions with arrows along which its actuators
-    push and its sensors measure.
+    A plate is drawn from above. A solid is drawn in three dimensions; arrows show the directions in
+    which its actuators push and its sensors measure.
 
     Parameters
     ----------

@@ -58,7 +58,8 @@ def localisation(
     found : Localisation
         Result of `localise`.
     candidates : sequence of Parameter, optional
-        As given to `localise`. With `dofs` they give a plan view of the candidates at their places.
+        Candidates that were given to `localise`. Together with `dofs` they give a plan view of the
+        candidates at their places.
     dofs : DofSet, optional
         DOFs of the model.
     ax : Axes, optional
@@ -172,7 +173,7 @@ def update(
     unused: Frf | FrfResidual | None = None,
     level: float = 0.95,
 ) -> dict[str, Axes]:
-    """Draw all of an update on one page.
+    """Draw all results of an update on one page.
 
     Parameters
     ----------
@@ -181,10 +182,10 @@ def update(
     before : ReducedModel or FEModel
         The model that was updated.
     residuals : sequence of Residual
-        Residuals of the update, or other measurements for the judgement.
+        Residuals of the update, or other measurements by which it is judged.
     unused : Frf or FrfResidual, optional
-        Measurement that was not fitted, to be drawn in place of that of the residuals. It has to be
-        a residual where its channels are not named by their DOFs, or where it was measured after a
+        Measured response that was not fitted. It is drawn in place of that of the residuals. Give
+        an FrfResidual if its channels are not named by their DOFs, or if it was measured after a
         hold.
     level : float
         Level of the confidence intervals.
@@ -192,10 +193,11 @@ def update(
     Returns
     -------
     dict of Axes
-        `frequencies` and `damping` (errors before and after, with poles), `mac before` and
-        `mac after` (with shapes), `parameters` (estimates with intervals and priors in grey, each
-        parameter in a row with its own axis), `convergence`, `response` (measured, before and
-        after, with responses).
+        Axes by name. `parameters` shows the estimates with intervals, and the priors in grey; each
+        parameter has a row with a separate axis. `convergence` shows the residual over iterations.
+        If poles are given, `frequencies` and `damping` show their errors before and after the
+        update. If shapes are given, there are `mac before` and `mac after`. If responses are given,
+        `response` shows the measured one, and those of the model before and after the update.
 
     Raises
     ------
@@ -434,7 +436,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
 def parameters(
     fit: UpdateResult, *, truth: dict[str, float] | None = None, axs: list[Axes] | None = None
 ) -> list[Axes]:
-    """Draw the parameters over iterations (paper, Fig. 9), one axes each, in one figure.
+    """Draw the parameters over iterations (paper, Fig. 9), each on separate axes of one figure.
 
     Parameters
     ----------

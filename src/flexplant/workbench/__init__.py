@@ -1,18 +1,20 @@
 """The workbench: loops shaped by hand in a browser, on measured responses and on models.
 
-- `open_page`: ``fx.workbench.open_page(plant)`` opens the page on this machine, and ``python -m
-  flexplant.workbench measured.uff`` opens it on a file. In a notebook the page is shown below the
-  cell.
-- `WorkbenchServer`: ``design``, the current design; ``serve``, ``close``.
+- `open_page`: ``fx.workbench.open_page(plant)`` opens the page for a plant, and
+  ``python -m flexplant.workbench measured.uff`` opens it for a file. In a notebook the page is
+  shown below the cell.
+- `WorkbenchServer`: the object that `open_page` returns. Its ``design`` is the current design;
+  ``serve`` and ``close`` start and end the page.
 - `LoopLimits`: limits that the page draws and checks.
-- `open_file`: opens a file by its path: a plant, or a design to continue.
+- `open_file`: reads a plant, or a design to continue, from a file.
 
-The page shows L, Nyquist, S, T, KS, PS, the error in time and by source, the truncated modes, and
-every machine of a fleet while a slider moves. Its result is a `fx.synthesis.LoopDesign`: the
-elements of each axis, switched on or off. It can be saved and loaded, and writes a script that
-repeats the design. The page needs Panel: ``pip install 'flexplant[workbench]'``. It accepts
-connections from this computer only, reads no pickle, and opens only files whose path it was given.
-`examples/workbench.py` shows its use.
+While a slider moves, the page shows the loop gain L, the Nyquist curve, S, T, KS and PS, the error
+over time and by source, the effect of truncated modes, and every machine of a fleet. Its result is
+a `fx.synthesis.LoopDesign`, which contains the controller elements of each axis; each element can
+be switched off. It can be saved and loaded, and writes a script that repeats the design. The page
+needs Panel: ``pip install 'flexplant[workbench]'``. It accepts connections from this computer only,
+never reads pickle files, and opens only files whose path you gave. `examples/workbench.py` shows
+its use.
 
 >>> import flexplant as fx
 >>> mass = fx.lti.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
@@ -21,7 +23,8 @@ connections from this computer only, reads no pickle, and opens only files whose
 >>> design.loops(mass).report.is_stable
 True
 
-Names elsewhere (MATLAB): ``controlSystemDesigner``, ``sisotool``: `open_page`; ShapeIt likewise.
+`open_page` serves the same purpose as ``controlSystemDesigner`` and ``sisotool`` in MATLAB, and as
+ShapeIt.
 """
 
 from ..rooms import public_names as _public_names

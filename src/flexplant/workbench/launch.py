@@ -117,7 +117,7 @@ class WorkbenchServer(Bench):
     Parameters
     ----------
     machines : mapping {name: plant}
-        Plants; the loop is shaped on the first.
+        Plants by name; the loop is shaped on the first of them.
     design : LoopDesign
         First design. Later, `design` is the one that was changed last in any tab.
     model, channel, move, limits, source : as for `open_page`
@@ -220,8 +220,8 @@ def open_page(
     Parameters
     ----------
     plant : Frf, StandardPlant, StateSpace, or a list or mapping of them
-        Measured or modelled plant. With several (a fleet) the loop is shaped on the first and
-        judged on all.
+        Measured or modelled plant. If several are given (a fleet), the loop is shaped on the first
+        and judged on all of them.
     design : LoopDesign, optional
         Design to continue. By default each axis begins with a PID controller and a low-pass filter
         well below its resonances.
@@ -229,7 +229,8 @@ def open_page(
         Model of a measured plant. It is drawn with the measurement, and gives the error and the
         effect of truncated modes.
     before, after, rate, delay, hold, rigid, unstable, references
-        As for `design_loops`; by default those of the plant or model: the axes that it drives.
+        Arguments of `design_loops`. By default they follow from the plant or model and the axes
+        that its actuators drive.
     channel : str, optional
         Channel of z whose rms is predicted; by default the first error of the plant.
     move : SetPointProfile, optional
@@ -237,14 +238,14 @@ def open_page(
     limits : LoopLimits, optional
         Limits that the page draws and checks.
     source : str
-        Line of Python that makes the plant, for the script that the page writes.
+        Line of Python that makes the plant. The script that the page writes contains it.
     port : int
         Port of the server; 0 takes a free one.
     open_browser : bool
-        Whether to serve the page and open it. False returns the object only; call its `serve`
-        later.
+        Whether to serve the page and open it. With False the page is not served until you call
+        `serve` of the returned object.
     block : bool, optional
-        Whether to wait until Ctrl-C. By default only where Python runs a script.
+        Whether to wait until Ctrl-C. By default it waits only if Python runs a script.
 
     Returns
     -------
@@ -253,7 +254,7 @@ def open_page(
     Raises
     ------
     ModelError, LabelError, ShapeError, AssumptionError
-        As for `design_loops`; ModelError when an option is of another kind.
+        As for `design_loops`; ModelError also when an option has a wrong type.
     FlexplantError
         When Panel is missing, or the port is taken.
 
@@ -289,8 +290,8 @@ def open_file(
     Parameters
     ----------
     path : str or Path
-        Universal, CSV, MATLAB or NumPy file with an Frf; or a file that `.save` of a plant, a
-        response or a LoopDesign wrote.
+        Universal, CSV, MATLAB or NumPy file with a frequency response, or a file that was written
+        by `.save` of a plant, a response or a LoopDesign.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Wanted quantity of the outputs of a measurement; see `flexplant.io.read_frf_uff`.
     scale : float, optional
@@ -299,7 +300,7 @@ def open_file(
     Raises
     ------
     FlexplantError
-        When the file holds none of these.
+        When the file contains neither a plant, nor a response, nor a design.
     ModelError
         When `quantity` or `scale` is given for something else than a measurement.
     FileNotFoundError

@@ -31,7 +31,7 @@ class LoopLimits(Value):
     Parameters
     ----------
     peak : float
-        Largest allowed |S|; 2 is a modulus margin of 0.5, 6 dB.
+        Largest allowed |S|. The value 2 (6 dB) is a modulus margin of 0.5.
     gain_margin : float, optional
         Smallest allowed gain margin, as a factor.
     phase_margin : float, optional [deg]
@@ -64,8 +64,9 @@ class LoopLimits(Value):
         Parameters
         ----------
         loop : AxisLoop
+            Loop of one axis.
         rms : float, optional
-            Predicted rms, where it is known.
+            Predicted rms of the error, if it is known.
         """
         stable, margins = loop.is_stable, loop.margins
 
