@@ -56,9 +56,9 @@ def read_dmig(
         File of the bulk data, with the coordinates of the nodes (GRID, CORD2R, CORD2C, CORD2S).
         Nodes that move in local directions (field CD) are turned into the basic system.
     stiffness, mass, damping : str, optional
-        Names of the matrices. By default the usual names are searched (such as KAAX, KAA, KGG,
-        K2GG, MAAX, BAAX), and one of them must exist. With `damping=None` no damping is read.
-        Structural damping (K4AAX) is not viscous and is never read.
+        Names of the matrices. By default the usual names (KAAX, KAA, KGG, K2GG; MAAX, ...; BAAX,
+        ...) are searched, one of which must exist. `damping=None`: no damping is read. Structural
+        damping (K4AAX) is not viscous and is not read.
     scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
         Direction of scalar points (component 0); without it they are refused.
 
