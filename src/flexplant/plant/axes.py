@@ -42,7 +42,8 @@ class DrivenAxes(Value):
     actuators : sequence of m str
         Actuators of the plant.
     freq : (r,) array [Hz]
-        Frequency at which each axis is decoupled; sigma = 2 pi freq. T : (m, r) array
+        Frequency at which each axis is decoupled; sigma = 2 pi freq.
+    T : (m, r) array
         Matrix from commands of the axes to actuators. It satisfies ``G(sigma) T = I / sigma^2``.
         ``G(sigma)`` is the response of the channels to the actuators at z = exp(sigma dt), without
         the factor ``exp(-sigma dt (delay + 1/2))`` of hold and delay. Where an axis moves as a

@@ -27,9 +27,10 @@ _UNITS = (
 class GravityAxes(Value):
     """Static transformations between the channels of a plant and its rigid body.
 
-    Let G be the rigid-body part of the plant from u to y. Then ``to_motions G to_actuators =
-    mass^-1 / s^2`` and ``to_motions G accelerations = I / s^2``. On ground springs the same
-    transformations are valid above the suspension frequencies, where the inertia dominates.
+    Let G be the rigid-body part of the plant from u to y. Then
+    ``to_motions G to_actuators = mass^-1 / s^2`` and ``to_motions G accelerations = I / s^2``. On
+    ground springs the same transformations are valid above the suspension frequencies, where the
+    inertia dominates.
 
     Parameters
     ----------

@@ -108,7 +108,8 @@ def decouple(
     ------
     AssumptionError
         When the actuators cannot move the axes independently, or the sensors cannot distinguish the
-    axes. LabelError, ModelError
+        axes.
+    LabelError, ModelError
         When an axis is unknown; when the plant was not assembled from a structure.
 
     References

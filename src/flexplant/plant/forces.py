@@ -284,7 +284,9 @@ class FirstOrder(_Spectrum):
     Parameters
     ----------
     rms : float [N]
-        Root mean square of the force. corner : float [Hz] Corner frequency, omega / (2 pi).
+        Root mean square of the force.
+    corner : float [Hz]
+        Corner frequency, omega / (2 pi).
 
     Examples
     --------
@@ -321,8 +323,10 @@ class NarrowBand(_Spectrum):
     Parameters
     ----------
     rms : float [N]
-        Root mean square of the force. freq : float [Hz] Centre frequency, omega / (2 pi). zeta :
-    float
+        Root mean square of the force.
+    freq : float [Hz]
+        Centre frequency, omega / (2 pi).
+    zeta : float
         Half the relative bandwidth, below 1.
 
     Examples

@@ -48,12 +48,12 @@ class MachineParts(Value):
     plant : StandardPlant
         The nominal plant.
     realisation : ModalRealisation
-        Modes of the structure; their blocks of A are replaced by `pairs`. pairs : (b, 2, 2) array
-    [rad/s]
+        Modes of the structure; their blocks of A are replaced by `pairs`.
+    pairs : (b, 2, 2) array [rad/s]
         Diagonal blocks of A, one for each mode.
     ports : Ports
-        Ports of the machine; `with_port` and `with_gain` change one of them. model : FEModel or
-    ReducedModel, optional
+        Ports of the machine; `with_port` and `with_gain` change one of them.
+    model : FEModel or ReducedModel, optional
         A model with other matrices, whose modes are then solved again in place of `realisation`.
     late : float [samples]
         Change of the delay of the actuators, relative to the nominal plant.

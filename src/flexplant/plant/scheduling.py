@@ -26,8 +26,8 @@ class Position(Value):
     Parameters
     ----------
     name : str
-        Name of the position; a position x is changed by ``plant.at(x=0.03)``. range : (2,) sequence
-    [m or rad]
+        Name of the position; a position x is changed by ``plant.at(x=0.03)``.
+    range : (2,) sequence [m or rad]
         Least and largest value.
     start : float, optional [m or rad]
         Position of a plant just after it was assembled. By default 0 if the range contains 0,

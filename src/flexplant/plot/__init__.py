@@ -1,4 +1,4 @@
-"""All pictures: functions that draw values on the axes `ax` or on new axes, and return the axes.
+"""All pictures: functions that draw values on the axes ``ax=`` or on new axes, and return the axes.
 
 - `bode`, `frf`, `singular_values`, `nyquist`, `sensitivity`: responses and loops.
 - `response`, `exposures`, `budget`, `spectra`: simulated runs, and errors by source.
