@@ -1,17 +1,18 @@
 """Damping first and motion after: three dampers, H-infinity and an input shaper on one machine.
 
-Run it: ``python examples/active_damping.py``. A mast of four masses stands on a base; a voice coil
-and a sensor at its tip damp it, a drive at its foot moves it. Velocity feedback, positive position
-feedback (PPF) and integral resonant control (IRC) are tuned by `damp_modes` for the damping ratio
-of the first mode, and compared with an H-infinity controller between the same coil and sensor. The
-plant has two of the four modes; every loop is judged on all of them. H-infinity leaves a smaller
-motion than any damper, because it uses the two modes of the plant. A warning says that |S| is large
-at the machine's other modes, so that small errors of these modes matter.
+Run it: ``python examples/active_damping.py``. A mast of four masses stands on a base. A voice coil
+and a sensor at its tip damp it, and a drive at its foot moves it. `damp_modes` tunes velocity
+feedback, positive position feedback (PPF) and integral resonant control (IRC) for the same
+damping ratio of the first mode. They are compared with an H-infinity controller that uses the same
+coil and sensor. The plant has two of the four modes, but every loop is judged on all of them.
+H-infinity leaves a smaller motion than any damper, because it uses the two modes of the plant. A
+warning says that |S| is large at the machine's other modes, so that small errors of these modes
+matter.
 
-Then the mast moves: the drive has the static force of the set-point and an integral law of 1 Hz,
-which is stable with the damper and unstable without it. A set-point leaves a vibration, which
-`residual_vibration` predicts by the modes of the loop and simulates; a ZVD shaper for the mode
-that vibrates most removes it.
+Then the mast moves. The drive gets the static force of the set-point and an integral law of 1 Hz,
+which is stable with the damper and unstable without it. A set-point leaves a vibration.
+`residual_vibration` predicts it from the modes of the loop and also simulates it. An input shaper
+(zero vibration and derivative, ZVD) for the mode that vibrates most removes the vibration.
 """
 
 # %% The machine: two modes in the plant, four in its evaluation model

@@ -1,10 +1,12 @@
 """What control engineers look for first, on textbook plants: each in a few lines.
 
-Run it: ``python examples/classical.py``. The distillation column of Skogestad and Postlethwaite
-with 20 % error of each input (their section 8.11.3: mu of robust stability 0.53, of robust
-performance 5.8 with the inverse of the plant as controller); the two masses and one uncertain
-spring of Wie and Bernstein; a PD law with a second of delay that is judged without sampling it;
-PI and PID of ordinary plants; LQG with an integrator, its margins and its step in numbers.
+Run it: ``python examples/classical.py``. The first plant is the distillation column of Skogestad
+and Postlethwaite with 20 % error of each input. With the inverse of the plant as controller, their
+section 8.11.3 states mu 0.53 for robust stability and 5.8 for robust performance. The second
+consists of the two masses and one uncertain spring of Wie and Bernstein. Then follow a PD law with
+a delay of one second, which is judged without sampling it, PI and PID controllers of ordinary
+plants, and an LQG controller with an integrator, with its margins and the figures of its step
+response.
 """
 
 # %% Plants

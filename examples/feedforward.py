@@ -1,11 +1,11 @@
 """Feedforward for a move of the wafer stage: how much each order reduces the error.
 
 Run it: ``python examples/feedforward.py``. Two loops of `wafer_stage.py`, designed on the model
-with measured poles, move a virtual machine by 100 um; the machine has another plate theory than the
-model. Feedforward is designed for this move on the model of each loop: order by order, and as an
-inverse with preview. Then a loop designed on the drawing, whose mass and stiffness are wrong,
-learns its feedforward gains from repeated moves. Errors at the die in nm: the largest during the
-move, and the mean over 5 ms after it::
+with measured poles, move a virtual machine by 100 um. The machine has another plate theory than the
+model. Feedforward is designed for this move on the model of each loop: first order by order, then
+as an inverse with preview. Finally a loop that is designed on the drawing, whose mass and stiffness
+are wrong, learns its feedforward gains from repeated moves. The table shows errors at the die in
+nm: the largest error during the move, and the mean error over 5 ms after it::
 
     feedforward      best servo         tolerant
                    largest   after   largest   after

@@ -1,25 +1,27 @@
 """A fleet of wafer stages: one robust controller for all against one for each machine.
 
 Run it: ``python examples/fleet.py`` for ten machines (50 s of two cores), as for the results below,
-or with another number: ``python examples/fleet.py 50``. The machines differ from the drawing in
-kind: each is a plate computed with polynomials and rotary inertia, with an unknown mass at z8 and
-another mass elsewhere, scattered stiffness and damping, and sensors with finite resolution. All are
-measured (poles of twelve modes, errors of 1e-5), updated, calibrated and controlled twice: by one
-controller for all machines, as fast as a sample of them allows, and by a controller that tolerates
-the remaining uncertainty of the machine's own modes. The paper claims that the second can be
-faster. The study can be stopped at any time: finished machines are stored in a file.
+or with another number: ``python examples/fleet.py 50``. The machines have another plate theory than
+the drawing: each is a plate computed with polynomials and rotary inertia. It has an unknown mass at
+z8 and another mass elsewhere, scattered stiffness and damping, and sensors with finite resolution.
+For each machine the poles of twelve modes are measured (with errors of 1e-5), and the model is
+updated and calibrated. Each is controlled twice. The first controller is the same for all machines,
+and as fast as a sample of them allows. The second is designed for one machine and tolerates the
+remaining uncertainty of its modes. The paper claims that the second can be faster. The study can be
+stopped at any time: finished machines are stored in a file.
 
 The claim is true for these ten machines. All are stable with both controllers, with a modulus
-margin of at least 0.4. With their own controller it is at least 0.43, and at most 0.1 % below the
-predicted one::
+margin of at least 0.4. With their own controllers the margin is at least 0.43, and it is at most
+0.1 % below the predicted margin::
 
                        bandwidth [Hz]            error rms [nm]                   MA [nm]
                    median    95 %   worst    median    95 %   worst    median    95 %   worst
     one for all      32.8    32.3    32.2      11.2    14.1    14.3      28.6    35.7    39.2
     one for each     67.8    67.5    67.4      4.08    4.79    4.86      8.05    9.77    9.88
 
-Every machine gave a result; the worst bandwidth is the lowest. All machines with the common
-controller exceed the specification of 12 nm MA after a move, and none with its own controller.
+Every machine gave a result; the worst bandwidth is the lowest. The specification is a moving
+average (MA) of the error of at most 12 nm after a move. All machines exceed it with the common
+controller, and none exceeds it with its own controller.
 """
 
 # %% Names and numbers

@@ -4,8 +4,8 @@ Run it: ``python examples/from_nastran.py``, or with files of your own:
 ``python examples/from_nastran.py stage.pch stage.bdf``. Nastran punches the matrices of a model as
 DMIG cards with ``PARAM,EXTOUT,DMIGPCH`` (or ``EXTSEOUT(DMIGPCH)``); the nodes are in the bulk data.
 Without files the script writes those of a free aluminium block as Nastran would, with ten digits
-per number. Ten digits are not enough for rigid-body modes at 0 Hz: the table shows the error, and
-how it is repaired.
+per number. Ten digits are not enough for rigid-body modes at 0 Hz. The table shows the error and
+its correction.
 """
 
 # %% Names and numbers

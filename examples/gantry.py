@@ -1,16 +1,18 @@
 """A gantry on soft feet, told from files to C code.
 
-Run it: ``python examples/gantry.py``. The files are those that a project has: stiffness and mass
-of a finite-element program as Matrix Market files in millimetres and tonnes, a table of nodes, and
-the frequency responses of a laboratory as a universal file (``examples/data/gantry_files.py``
-writes them, without flexplant). Two motors push the bridge along y, a third pushes the carriage
-along x, and all three push against the frame, which stands on soft feet.
+Run it: ``python examples/gantry.py``. The script starts from the files that a project usually has:
+stiffness and mass matrices of a finite-element program as Matrix Market files in millimetres and
+tonnes, a table of nodes, and the frequency responses of a laboratory as a universal file.
+(``examples/data/gantry_files.py`` writes these files without flexplant.) Two motors push the bridge
+along y, a third pushes the carriage along x, and all three push against the frame, which stands on
+soft feet.
 
-The model is identified, updated, and driven inside its frame. An H-infinity controller that
-tolerates what is not known of the modes is judged on the measured response, and every promise has
-an interval. Then a further sensor is chosen, and the controller is written in C. The files hold a
-camera of 0.8 kg that no drawing shows and a column that is 12 % softer than drawn. The script finds
-both, and prints the following, among other things::
+The modes of the machine are identified, and the model is updated. Then an H-infinity controller is
+designed that tolerates the remaining uncertainty of the modes. It is judged on the measured
+response, and every predicted figure has an interval. Then a further sensor is chosen, and the
+controller is written in C. The files hold a camera of 0.8 kg that no drawing shows and a column
+that is 12 % softer than drawn. The script finds both, and prints the following, among other
+things::
 
     camera = 0.81 +- 0.14 kg
     column = -0.12 +- 0.017

@@ -3,10 +3,10 @@
 Run it: ``python examples/joined_machine.py``. Four air bearings hold a stage on a frame and let it
 slide along x; four isolators hold the frame on the floor. The machine joined from the two models
 has one motion at exactly 0 Hz, the slide. Its modes are complex, because bearings and isolators
-damp it in a few places only. When the parts are first reduced and then joined, 420 DOFs become 84,
-and frequencies up to 1.4 kHz agree to 1e-3. The responses of the separate parts also give those of
-the machine. Conversely, when the frame is removed from the machine's responses, those of the stage
-remain.
+damp the machine only at a few places. When the parts are first reduced and then joined, 420 DOFs
+become 84, and frequencies up to 1.4 kHz agree to 1e-3. The responses of the separate parts also
+give those of the machine. Conversely, when the frame is removed from the machine's responses, those
+of the stage remain.
 """
 
 # %% Names and numbers

@@ -1,9 +1,10 @@
 """A six-axis stage that floats on magnets: from its mesh to the error at a moving point.
 
-Run it: ``python examples/maglev.py``. Magnets that attract have negative stiffness: without control
-the stage falls to one side; the distance doubles every 10 to 30 ms. Eight actuators with noisy
-amplifiers hold it, seven sensors measure its position relative to a floor that vibrates. The point
-of interest (POI), where a wafer is exposed, moves over its top, and no sensor sees it.
+Run it: ``python examples/maglev.py``. Magnets that attract have negative stiffness. Without control
+the stage falls to one side, and its distance from the centre doubles every 10 to 30 ms. Eight
+actuators with noisy amplifiers hold it, and seven sensors measure its position relative to a floor
+that vibrates. The point of interest (POI), where a wafer is exposed, moves over the top of the
+stage. No sensor measures this point.
 
 All numbers in the tables are computed without simulation: rms errors come from Lyapunov equations.
 The last table compares the predictions for the loop with the result on a virtual machine that is

@@ -1,12 +1,12 @@
 """From a noisy measurement to an updated model, with the accuracy of its parameters.
 
 Run it: ``python examples/measured_frf.py``. The virtual machine floats under a slow servo and is
-excited by multisines. Its frequency responses (FRFs) give poles, the poles show what is wrong in
-its drawing, and responses that were not used check the result. The machine differs from the drawing
-in three things: 0.5 kg at z8 that no drawing shows, Young's modulus 70 instead of 69 GPa, and 1 %
-modal damping instead of 0.7 %. It has the drawing's mesh, so that each parameter has a true value
-to compare with; ``wafer_stage.py`` shows an update for a machine that is computed with another
-theory. Pictures go to ``examples/out``.
+excited by multisines. Poles are identified from its frequency responses (FRFs). From the poles the
+errors of the drawing are found, and the result is checked by responses that were not used before.
+The machine differs from the drawing in three things: 0.5 kg at z8 that no drawing shows, Young's
+modulus 70 instead of 69 GPa, and 1 % modal damping instead of 0.7 %. It has the drawing's mesh, so
+that each parameter has a true value to compare with; ``wafer_stage.py`` shows an update for a
+machine that is computed with another theory. Pictures go to ``examples/out``.
 """
 
 # %% Names and numbers

@@ -1,10 +1,10 @@
 """A million degrees of freedom (DOFs) on a laptop: from the mesh to a closed loop.
 
-Run it: ``python examples/million_dofs.py 1000000`` (about a minute of one core and 7 GB), or with
-fewer DOFs; without a number it takes 100 000. A square plate is meshed. Its modes are computed,
-each with a residual, and a count proves that none is missing. The model is reduced to the DOFs of
-sensors and actuators, and a loop is closed on it. Frequencies are compared with those published by
-Leissa for a free square plate.
+Run it: ``python examples/million_dofs.py 1000000`` (about a minute of one core and 7 GB of memory),
+or with fewer DOFs. Without a number the model has 100 000 DOFs. A square plate is meshed. Its modes
+are computed, each with a residual, and a count proves that none is missing. The model is reduced to
+the DOFs of sensors and actuators, and a loop is closed on it. Frequencies are compared with those
+published by Leissa for a free square plate.
 """
 
 # %% Names and numbers

@@ -3,9 +3,10 @@
 Run it: ``python examples/moving_poi.py``. A plate is scanned under a lens: the point of interest
 (POI) runs over the plate at 0.3 m/s, from the middle towards an edge, while amplifier noise shakes
 the plate and a servo holds it. The model is a mesh with measured poles; the machine is computed
-with another theory. The motion of the POI is estimated from the same record in three ways: as the
-motion of the middle; as the motion of the middle transferred to the POI as if the plate were rigid;
-and with the path, so that every mode counts with its shape at the place of each sample.
+with another theory. The motion of the POI is estimated from the same record in three ways. The
+first takes the motion of the middle of the plate. The second transfers this motion to the POI as if
+the plate were rigid. The third uses the path, so that every mode contributes with its shape at the
+place of the POI at each sample.
 """
 
 # %% Names and numbers

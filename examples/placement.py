@@ -3,8 +3,8 @@
 Run it: ``python examples/placement.py``. The stage of ``wafer_stage.py`` carries 0.5 kg that no
 drawing shows; its model is updated from a measurement, with the uncertainty of the result. Four
 sensors are placed so that the error at the die, which no sensor sees, is smallest. They are chosen
-from a grid of 48 places outside the die; a bound shows that no choice can be better than that. The
-chosen sensors are then compared on the machine with sensors at the corners.
+from a grid of 48 places outside the die. A lower bound shows the error that no choice can fall
+below. The chosen sensors are then compared on the machine with sensors at the corners.
 """
 
 # %% Names and numbers

@@ -6,11 +6,11 @@ stage whose amplifiers are three times noisier than their data sheet says, and l
 sensor. A filter made with the data sheet states errors that are too small. The record shows this,
 and gives the noise densities with which the stated errors are correct.
 
-Machine and model have the same mesh here on purpose: only then the estimated densities should equal
-those used for the record. On a machine with all its modes (`fx.testbeds.wafer_stage`, all poles
-below half the rate in the model) modes above half the rate are aliased into the record. The verdict
-names them, and the estimated densities of the sensors are nearly four times too large, because they
-include these modes.
+Machine and model have the same mesh here on purpose, because only then should the estimated
+densities equal those used for the record. The machine of `fx.testbeds.wafer_stage` also has modes
+above half the rate, which are aliased into the record, even if the model has all poles below half
+the rate. The verdict names them, and the estimated densities of the sensors are nearly four times
+too large, because they include these modes.
 """
 
 # %% Names and numbers

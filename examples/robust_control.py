@@ -2,13 +2,13 @@
 
 Run it: ``python examples/robust_control.py``. The stage of ``wafer_stage.py`` is modelled by the 13
 modes of the measured band, with their measured poles. Real Deltas describe the uncertainty of their
-frequencies; a weight bounds the effect of the 147 modes above, which are truncated. For the sampled
-loop of a servo, with its delay, the script (1) bounds mu at all frequencies, also between grid
-points, (2) finds the worst gain from set-point to error, and the machine that has it, (3) simulates
-that machine, (4) compares both with the virtual machine, which is computed with another theory than
-all models here, (5) shows mu of an H-infinity controller that ignores the modes above, (6) reduces
-that controller, weighted by its loop, and writes it in C. The script stops when one of its claims
-is not true.
+frequencies. A weight bounds the effect of the 147 higher modes, which are truncated. The script has
+six steps. (1) For the sampled loop of a servo, with its delay, it bounds mu at all frequencies,
+also between grid points. (2) It finds the worst gain from set-point to error, and the machine that
+has this gain. (3) It simulates that machine. (4) It compares both with the virtual machine, which
+is computed with another theory than all models here. (5) It shows mu of an H-infinity controller
+that ignores the higher modes. (6) It reduces that controller with weights from its loop, and writes
+it in C. The script stops when one of its claims is not true.
 """
 
 # %% Names and numbers

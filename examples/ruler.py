@@ -2,10 +2,10 @@
 
 Run it: ``python examples/ruler.py``. No finite-element model is used: the responses give the modes,
 the modes give the plant, and the measured responses show the effect of the controller on the ruler
-itself. The ruler hangs free, the accelerometer is at its end, and ten places along it were hit; the
-record contains 50 Hz from the mains. The force is not calibrated: motions are in the unit of the
-record. The picture goes to ``examples/out``. Data: pydvma (Butlin, Woodhouse; BSD-3), see
-``data/ruler.LICENSE``.
+itself. The ruler hangs free, the accelerometer is at its end, and ten places along it were hit. The
+record contains a disturbance of 50 Hz from the mains. The force is not calibrated: motions are in
+the unit of the record. The picture goes to ``examples/out``. Data: pydvma (Butlin, Woodhouse;
+BSD-3), see ``data/ruler.LICENSE``.
 """
 
 # %% Names and numbers

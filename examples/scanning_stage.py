@@ -2,9 +2,9 @@
 
 Run it: ``python examples/scanning_stage.py``. The plate moves 200 mm in x below a lens and four
 encoder heads that stay with the frame, so that the measured and exposed points on the plate depend
-on x. One observer and one servo designed at the centre are compared with designs at eleven
-positions, interpolated linearly. Both run on a machine that is computed with another theory than
-the model.
+on x. One observer and one servo that are designed at the centre are compared with a scheduled
+controller: designs at eleven positions, between which the gains are interpolated linearly. Both run
+on a machine that is computed with another theory than the model.
 """
 
 # %% Names and numbers

@@ -1,10 +1,10 @@
 """A solid stage with six degrees of freedom, imported from matrices of another program.
 
-Run it: ``python examples/solid_stage.py``. A block of aluminium, meshed with eight-node bricks, is
-written as a finite-element program would do it: in Matrix Market files in mm and t with a table of
-the DOFs, and read back in SI: flexplant then knows matrices and nodes, but not the elements. Mode
-shapes are interpolated between the nodes, so that sensors, actuators and the point of interest may
-be anywhere in the block.
+Run it: ``python examples/solid_stage.py``. A block of aluminium is meshed with eight-node bricks.
+It is written as a finite-element program would do it, in Matrix Market files in mm and t with a
+table of the DOFs. Then it is read back in SI units, so that flexplant knows the matrices and the
+nodes, but not the elements. Mode shapes are interpolated between the nodes, so that sensors,
+actuators and the point of interest may be anywhere in the block.
 
 Six sensors and six actuators (each through its amplifier, with 40 us of cable) control x, y, z, rx,
 ry and rz of a point that no sensor sees.

@@ -1,7 +1,7 @@
 """Specifications of a stage as tests: ``python -m pytest examples/test_specifications.py``.
 
-``python examples/test_specifications.py`` prints the tables that they check. The design uses a
-reduced model; the tests use a virtual machine with all its modes, computed with another theory.
+``python examples/test_specifications.py`` prints the tables that these tests check. The design uses
+a reduced model; the tests use a virtual machine with all its modes, computed with another theory.
 When a test fails, the message is the table of all requirements, with reached and allowed values.
 """
 

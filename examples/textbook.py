@@ -4,13 +4,13 @@ Run it: ``python examples/textbook.py``. The plants are a slow lag, an integrato
 a lightly damped mode, and a lag with a zero in the right half plane. Each weight says how small one
 quantity has to be: ``|S| < 1 / |W_S|`` for errors, ``|K S| < 1 / |W_KS|`` for the effort and
 ``|T| < 1 / |W_T|`` for errors of the model. `design_hinf` finds the controller with the smallest
-norm gamma of all weighted quantities together. Where gamma is below 1 all bounds are met, where it
-is above 1 they are missed by at most that factor.
+norm gamma of all weighted quantities together. If gamma is below 1, all bounds are met. If it is
+above 1, they are missed by at most the factor gamma.
 
 The table compares gamma with a lower bound that holds for every controller, and says whether all
 bounds are met. For a zero z in the right half plane a bound is known by hand: S(z) = 1 for every
-controller, so that gamma is at least ``|W_S(z)|``. A bandwidth close to such a zero is impossible:
-the last plant shows it.
+controller, so that gamma is at least ``|W_S(z)|``. A bandwidth close to such a zero is impossible,
+as the last plant shows.
 """
 
 # %% Plants and weights

@@ -1,9 +1,9 @@
 """Loops shaped by hand in a browser, on measured FRFs of a machine, up to C code.
 
-Run it: ``python examples/workbench.py``. It measures the virtual stage, opens the workbench on its
-frequency responses, with a model for the error at the die and the truncated modes, and waits until
-Ctrl-C. ``--no-browser`` only prints the results that the page would show for the same design. For
-your own measurement, without a line of Python:
+Run it: ``python examples/workbench.py``. It measures the virtual stage and opens the workbench on
+its frequency responses, with a model for the error at the die and the truncated modes. Then it
+waits until Ctrl-C. ``--no-browser`` only prints the results that the page would show for the same
+design. For your own measurement, without a line of Python:
 ``python -m flexplant.workbench measured.uff --rate 10000``.
 """
 

@@ -1,4 +1,4 @@
-"""Certificates: what was verified after an answer was computed, each figure with its limit."""
+"""Certificates: figures by which an answer was verified after its computation, with limits."""
 
 from __future__ import annotations
 

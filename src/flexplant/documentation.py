@@ -1,9 +1,9 @@
 """The documentation as a site: ``python -m flexplant.documentation site`` (extra ``docs``).
 
-pdoc writes a page for every room: its docstring first, then what it exports. The pages of
-``flexplant/pages``, the examples and the README are added to these. An example's page shows what
-the example prints and draws: it is run once, and again when its source has changed. With
-``--no-runs`` only what is there already is shown.
+pdoc writes a page for every room, with its docstring first, followed by its exported names. The
+pages of ``flexplant/pages``, the examples and the README are added to these. The page of an example
+shows what the example prints and draws. For this the example is run once, and again when its source
+has changed. With ``--no-runs`` only the results of earlier runs are shown.
 """
 
 from __future__ import annotations

@@ -12,11 +12,12 @@
     └── CertificateError (RuntimeError)  an answer failed the check by another route
     FlexplantWarning     (UserWarning)
 
-An unknown name is a `LabelError`, sizes that do not match are a `ShapeError` and a value out of
-range is a `ModelError` everywhere: Raises lists what one would not expect. Every message says what
-is wrong, what was got, why it matters and what to do next. What is tried inside, fails and is
-replaced by something else is not an error: ``logging.getLogger("flexplant")`` says so at the
-level INFO (``logging.basicConfig(level="INFO")`` shows it).
+In all functions an unknown name raises a `LabelError`, sizes that do not match raise a
+`ShapeError`, and a value out of range raises a `ModelError`. The section Raises of a function lists
+further cases. Every message says what is wrong, which value was given, why it matters and what to
+do next. If an internal attempt fails and another method replaces it, this is not an error. The
+logger ``logging.getLogger("flexplant")`` reports it at the level INFO
+(``logging.basicConfig(level="INFO")`` shows it).
 """
 
 import logging
@@ -71,7 +72,7 @@ class ShapeError(FlexplantError, ValueError):
 
 
 class ModelError(FlexplantError, ValueError):
-    """The model is not physical (say, an indefinite M) or not fit for the operation."""
+    """The model is not physical (for example an indefinite M) or not suitable for the operation."""
 
 
 class AssumptionError(FlexplantError, ValueError):
@@ -156,7 +157,7 @@ def short(value: Any) -> str:
 def attempted(
     what: str, kind: type[Exception] | tuple[type[Exception], ...] = FlexplantError
 ) -> Iterator[None]:
-    """Let fail what has something else behind it; the log of "flexplant" says that it was dropped.
+    """Suppress an error of an optional attempt, and report it in the log of "flexplant".
 
     Examples
     --------

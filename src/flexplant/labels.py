@@ -47,17 +47,18 @@ class DofSet(Value):
     nodes : (n,) array of int
         Node number of each DOF.
     directions : sequence of n str
-        Each one of x, y, z [m], rx, ry, rz [rad]; rx = dz/dy and ry = -dz/dx on a plate.
+        Direction of each DOF: x, y, z [m], rx, ry or rz [rad]. On a plate rx is dz/dy
+        and ry is -dz/dx.
     xyz : (n, 3) array [m], optional
-        Coordinates of each DOF's node. None: not known, stored as zeros; places are then given by
-        labels, and rotations as a rigid body are not known.
+        Coordinates of each DOF's node. By default they are unknown and stored as zeros. Places can
+        then be given only by labels, and rotations of the whole body are not known.
     interpolation : Interpolation, optional
-        Element shape functions, or those of `interpolated`; without them only points at nodes are
-        known.
+        Element shape functions, or those of `interpolated`. Without them only points at nodes can
+        be used.
     components : sequence of str
-        The components of a joined machine: labels are `"stage/41:z"` then.
+        Names of the components of a joined machine. Labels then have the form `"stage/41:z"`.
     component_of : (n,) array of int, optional
-        Which of them (from 0) each DOF belongs to.
+        Number of the component, from 0, to which each DOF belongs.
 
     Raises
     ------
@@ -139,7 +140,7 @@ class DofSet(Value):
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """The labels `"node:direction"`, of a joined machine with its components, in order."""
+        """The labels `"node:direction"` in order; those of a joined machine name the component."""
         return tuple(self._label(row) for row in range(len(self)))
 
     def _label(self, row: int) -> str:
@@ -183,7 +184,7 @@ class DofSet(Value):
         Parameters
         ----------
         label : str
-            Such as `"41:z"`.
+            Label of the DOF, such as `"41:z"`.
         """
         row = self._index.found(label)
         if row < 0:
@@ -201,7 +202,7 @@ class DofSet(Value):
         return None if self.interpolation is None else self.interpolation.dependent(label)
 
     def location(self, label: str) -> FloatArray:
-        """Return the coordinates (3,) [m] of a DOF's node, of one that follows others too."""
+        """Return the coordinates (3,) [m] of a DOF's node, also if the DOF follows others."""
         found = None if label in self else self._dependent(label)
         return self.xyz[self.index(label)] if found is None else found[1]
 
@@ -250,11 +251,12 @@ class DofSet(Value):
         Parameters
         ----------
         nodes : int or sequence of int, optional
+            Node numbers.
         directions : str or sequence of str, optional
-            Such as `"z"`.
+            Directions, such as `"z"`.
         box : (2, 3) array [m], optional
-            Its lowest and highest corner, both belonging to it: ``[(0, 0, 0), (0, 0.6, 0)]`` is an
-            edge. Infinite entries are allowed.
+            Lowest and highest corner of the box, which belong to it. For example,
+            ``[(0, 0, 0), (0, 0.6, 0)]`` is an edge. Infinite entries are allowed.
         component : str, optional
             Component of a joined machine.
         """
@@ -299,10 +301,11 @@ class DofSet(Value):
         Parameters
         ----------
         xyz : (3,) array [m]
+            The point.
         direction : str
-            One of the directions present.
+            Direction of the DOF; at least one DOF must have it.
         component : str, optional
-            Component of a joined machine; None: all.
+            Component of a joined machine; by default all.
         """
         known = isinstance(direction, str) and direction in DIRECTIONS
         kind = DIRECTIONS.index(direction) if known else -1
@@ -324,8 +327,8 @@ class DofSet(Value):
         Parameters
         ----------
         at : str, (3,) array [m] or mapping
-            A DOF label, a point (interpolated between nodes), or a weighted sum of such,
-            {label or (x, y, z): weight}.
+            A DOF label, a point (interpolated between nodes), or a weighted sum of labels and
+            points, {label or (x, y, z): weight}.
         direction : str
             Direction of the motion at a point; labels contain a direction.
         """
@@ -385,7 +388,7 @@ class DofSet(Value):
         Parameters
         ----------
         table : path of a CSV file, or an iterable of mappings
-            One row per DOF, in the order of the matrices.
+            Table with one row for each DOF, in the order of the matrices.
         """
         return cls(*columns_of(table))
 

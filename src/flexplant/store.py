@@ -139,12 +139,12 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         return changes
 
     def save(self, path: str | Path) -> None:
-        """Write the value to one `.npz` file (arrays and JSON, no pickle), atomically.
+        """Write the value to one `.npz` file of arrays and JSON, completely or not at all.
 
         Parameters
         ----------
         path : str or Path
-            The file; `flexplant.load` reads it back.
+            Path of the file; `flexplant.load` reads it back.
         """
         save(self, path)
 
@@ -248,11 +248,12 @@ def load(path: str | Path) -> Any:
     Parameters
     ----------
     path : str or Path
+        Path of the file.
 
     Returns
     -------
     Value
-        Value of the type that was saved, arrays read-only.
+        Value of the type that was saved; its arrays are read-only.
 
     Raises
     ------
@@ -262,8 +263,9 @@ def load(path: str | Path) -> Any:
 
     Notes
     -----
-    The file names the module of each value. Where the session has not used that room of flexplant
-    yet, it is imported, and no other; modules that are not flexplant's are never imported.
+    The file contains the name of the module of each value. If this room of flexplant has not been
+    used in the session yet, it is imported. No other module is imported, in particular none from
+    outside flexplant.
 
     Examples
     --------
