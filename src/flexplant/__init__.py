@@ -1,6 +1,7 @@
 """flexplant: standard plants for flexible machines.
 
-From finite-element matrices and a measurement to the closed-loop error at a point of interest::
+The way from finite-element matrices and a measurement to the closed-loop error at a point of
+interest (POI)::
 
     FEModel --solve_modes--> Modes --reduce--> ReducedModel --update--> UpdateResult.model
       (M, D, K, dofs)                           (M*, D*, K*, T)  ^            |
@@ -15,8 +16,9 @@ From finite-element matrices and a measurement to the closed-loop error at a poi
                          close_loop(plant, *blocks) --> ClosedLoop --simulate--> Response
 
 The same `Ports` serve every model of one machine: the drawing, the updated model, and the virtual
-machine. Each room below has its own page, for example ``help(fx.plant)``: its purpose, an example,
-and the names of the same functions in other tools.
+machine. flexplant is divided into rooms, which are modules such as `fx.plant`. Each room below has
+a page, for example ``help(fx.plant)``, with its purpose, an example, and the names of the same
+functions in other tools.
 
 >>> import flexplant as fx
 >>> plant = fx.testbeds.three_masses()
@@ -50,9 +52,9 @@ and the names of the same functions in other tools.
   check raises an error.
 - Checks go beyond the design model. A plant knows its *evaluation model*, a larger model of the
   same machine. The modes that the plant lacks count as noise in the predicted error of a filter,
-  and every loop is also tested on the plant with these modes; loops that they make unstable are
-  reported. Results of a plant without evaluation model say so. For a fit, chi-square shows whether
-  the parameters explain the data.
+  and every loop is also tested on the plant with these modes. A loop that becomes unstable by them
+  is reported. If a plant has no evaluation model, its results say so. For a fit, chi-square shows
+  whether the parameters explain the data.
 - SI units need no scaling by the user. Gains of 1e-9 m/N, damping of 0.1 %, rigid-body modes at
   exactly 0 Hz and repeated modes are scaled internally.
 - Nothing is repaired silently. Error messages state what is wrong, which value was found, why
@@ -86,8 +88,9 @@ and the names of the same functions in other tools.
 
 **Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
 package (peer) in two runs of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
-above 1 means that flexplant is faster; the results are compared first. Times vary by about 20 %
-from run to run; other work on both cores made the quick calls of these up to 50 % slower.
+above 1 means that flexplant is faster. Before the times are taken, the results are compared. Times
+vary by about 20 % from run to run. In these runs other work on both cores made the quick calls up
+to 50 % slower.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
@@ -111,27 +114,32 @@ from run to run; other work on both cores made the quick calls of these up to 50
 | poles of a close pair in noise: error 5e-07 | 0.58 s | scikit-rf: 7e-07 | 0.51 s | 0.88 |
 | a sparse OUTPUT4 file of Nastran | 16 ms | pyYeti | 36 ms | 2.3 |
 
-Peers are faster where checks are not wanted. For all modes of the plate, a third of the time goes
-into residuals, and a third into the separation of rigid-body motions and the full accuracy of soft
-modes. The zero-order hold returns a checked system with names. H-infinity of 3 states is bounded
-to 1 % and its norm computed twice. mu has a lower bound too, from a perturbation that reaches it.
-With a factor of CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs, as
-fast on plates of 30 000 and 99 000, and takes twice as long on a solid of 28 000 DOFs
-(``tests/benchmarks/modes_peers.py``, whose peer is the wheel `sksparse-minimal`). ``python
--m pytest -n 0 -m benchmark -s tests/benchmarks`` times many more.
+Peers are faster for some tasks because flexplant also checks its results. For all modes of the
+plate, a third of the time goes into residuals. Another third goes into the separation of rigid-body
+motions and the full accuracy of soft modes. The zero-order hold returns a checked system with
+names. For H-infinity of 3 states, the smallest possible norm is bounded to 1 %, and the norm of
+the loop is computed twice. For mu there is also a lower bound, from a perturbation that reaches it. With a factor of
+CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs. It is as fast on
+plates of 30 000 and 99 000 DOFs, and takes twice as long on a solid of 28 000 DOFs
+(``tests/benchmarks/modes_peers.py``, whose peer is the wheel `sksparse-minimal`).
+``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` measures many more times.
 
 **Limits**
 
-- Sizes tried: models of 2 to 998 787 DOFs (24 modes of that one: 39 to 45 s and 4.8 GB on one core;
-  for a solid of 292 008 DOFs: 85 s and 4.1 GB; ``python tests/benchmarks/modes_peers.py solid 45
-  ours`` repeats it; memory settings are in `flexplant.sparse`); plants of 2 to 490 states; a Kalman
-  filter of 1000 states (18 s and 0.4 GB; time grows with their third power); H-infinity in six axes
-  with 40 modes (3 s); four of 1024 candidate places (41 s, 0.7 % above what is proven); studies of
-  10 000 machines (91 MB of memory throughout); 1e8 samples of a filter in C.
-- Dampings tried: 0.01 % to 1 %, none at all, and magnets of negative stiffness.
-- Units tried: SI, and files in mm and t or other units of length, mass and time.
-- Structures are linear and time-invariant, M, D and K symmetric: no gyroscopic terms, contact or
-  temperature. POIs may move.
+- Tested sizes of models: 2 to 998 787 DOFs. 24 modes of the largest plate take 39 to 45 s and 4.8
+  GB on one core, and those of a solid of 292 008 DOFs 85 s and 4.1 GB
+  (``python tests/benchmarks/modes_peers.py solid 45 ours`` repeats this; `flexplant.sparse`
+  explains memory settings).
+- Tested sizes of plants: 2 to 490 states. A Kalman filter of 1000 states takes 18 s and 0.4 GB; the
+  time grows with the third power of the number of states. H-infinity in six axes with 40 modes
+  takes 3 s.
+- Other tested sizes: a choice of four among 1024 candidate places (41 s; its score is 0.7 % above
+  the proven bound), studies of 10 000 machines (91 MB of memory throughout), and 1e8 samples of a
+  filter in C.
+- Tested dampings: 0.01 % to 1 %, no damping, and magnets of negative stiffness.
+- Tested units: SI, and files in mm and t or other units of length, mass and time.
+- Structures are linear and time-invariant, with symmetric M, D and K. Gyroscopic terms, contact and
+  temperature are not modelled. POIs may move.
 
 **From 0.1 to 0.2**
 
@@ -187,15 +195,15 @@ fast on plates of 30 000 and 99 000, and takes twice as long on a solid of 28 00
 | ``sparse.Pardiso`` | gone: the library's own factor was faster on solids; `sparse.Cholmod` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
-**Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,
-python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy
-(MIT), matplotlib (its own, of BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e
-'.[ansys]'``: ``hdf5`` is h5py and ``workbench`` panel (BSD-3), ``uff`` pyuff and ``ansys``
-ansys-mapdl-reader (MIT), ``docs`` pdoc (MIT-0) and latex2mathml (MIT). Their
-own dependencies have similar licences. slycot (GPL-2) and other peers are used in tests only.
-Sources are cited by the keys of `flexplant.bibliography`; the method is that of [paper]_. Its text
-says 0.1 % modal damping while its printed eigenvalues have 1 %; `examples/paper_plate.py` shows
-both.
+**Licences.** flexplant has the MIT licence. At run time it needs NumPy, SciPy, python-control,
+threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy (MIT), matplotlib
+(its own licence, similar to BSD), and tqdm (MPL-2.0 and MIT). Extras are installed as in
+``pip install -e '.[ansys]'``. The extra ``hdf5`` needs h5py and ``workbench`` needs panel (BSD-3),
+``uff`` needs pyuff and ``ansys`` needs ansys-mapdl-reader (MIT), ``docs`` needs pdoc (MIT-0) and
+latex2mathml (MIT). The dependencies of these packages have similar licences. slycot (GPL-2) and
+other peers are used in tests only. Sources are cited by the keys of `flexplant.bibliography`; the
+method is that of [paper]_. Its text says 0.1 % modal damping while its printed eigenvalues have 1
+%; `examples/paper_plate.py` shows both.
 """
 
 from importlib import import_module as _import_module
