@@ -118,9 +118,9 @@ Peers are faster for some tasks because flexplant also checks its results. For a
 plate, a third of the time goes into residuals. Another third goes into the separation of rigid-body
 motions and the full accuracy of soft modes. The zero-order hold returns a checked system with
 names. For H-infinity of 3 states, the smallest possible norm is bounded to 1 %, and the norm of
-the loop is computed twice. For mu there is also a lower bound, from a perturbation that reaches it. With a factor of
-CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs. It is as fast on
-plates of 30 000 and 99 000 DOFs, and takes twice as long on a solid of 28 000 DOFs
+the loop is computed twice. For mu there is also a lower bound, from a perturbation that reaches it.
+With a factor of CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs. It
+is as fast on plates of 30 000 and 99 000 DOFs, and takes twice as long on a solid of 28 000 DOFs
 (``tests/benchmarks/modes_peers.py``, whose peer is the wheel `sksparse-minimal`).
 ``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` measures many more times.
 

@@ -131,7 +131,7 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         return {"text/plain": repr(self), "text/html": self._repr_html_() + picture}
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked like a new one."""
+        """Return a copy with some fields changed; it is checked like a new value."""
         return replace(self, **self._completed_changes(changes))  # type: ignore[type-var]
 
     def _completed_changes(self, changes: dict[str, Any]) -> dict[str, Any]:

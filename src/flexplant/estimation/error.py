@@ -383,9 +383,9 @@ class PoiEstimator(Value):
     ) -> FigureInterval:
         """Return the interval of the ratio of this rms error to that of another estimator.
 
-        The ratio is computed on each machine that agrees with the measurement. Below 1 this
-        estimator is better. To compare two places of a sensor, design an estimator for each place,
-        on plants of the same evaluation model.
+        The ratio is computed on each machine that agrees with the measurement. If the ratio is
+        below 1, this estimator is better. To compare two places of a sensor, design an estimator
+        for each place, on plants of the same evaluation model.
 
         Parameters
         ----------
@@ -472,10 +472,10 @@ class PoiFilter(PoiEstimator):
         channel : str
             Motion of a POI under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
         on : StandardPlant or ClosedLoop, optional
-            Another sampled plant, with other modes or noises, on which the error is computed with u
-            = 0; or a closed loop around such a plant, where u also excites the differences between
-            this plant and the filter's model. The error is computed from a Lyapunov equation, not
-            by simulation. None: the predicted error.
+            Another sampled plant, with other modes or noises, on which the error is computed with
+            ``u = 0``. It may also be a closed loop around such a plant. Then u also excites the
+            differences between this plant and the filter's model. The error is computed from a
+            Lyapunov equation, not by simulation. By default the predicted error is returned.
 
         Returns
         -------

@@ -270,7 +270,7 @@ class _Spectrum(Value):
         return RigidForce(name, direction, self.asd, self.shape)
 
     def floor(self, name: str, direction: str = "z") -> BaseAcceleration:
-        """Return the base acceleration [m/s^2, rad/s^2] of this spectrum; see its class."""
+        """Return this spectrum as a `BaseAcceleration` [m/s^2, rad/s^2]."""
         return BaseAcceleration(name, direction, self.asd, self.shape)
 
 

@@ -70,10 +70,11 @@ class PartitionedSystem(Value):
         self._set(asd=asd)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked like a new one.
+        """Return a copy with some fields changed; it is checked like a new plant.
 
-        The noise of each sample follows `asd`, and so do plants that are made of this one: at
-        other places, of other modes, with other ports that have the same densities as its own.
+        If you change `asd`, the noise of each sample changes with it. Plants that are made from the
+        copy have these densities too: at other places, with other modes, or with other ports of the
+        same densities.
         """
         return super().replace(**self._all_changes(changes))
 
@@ -88,7 +89,7 @@ class PartitionedSystem(Value):
 
     @property
     def has_own_modes(self) -> bool:
-        """Whether its states have modes, each with its own frequency and damping."""
+        """Whether the states belong to modes that each have one frequency and one damping."""
         return False
 
     @property
@@ -98,12 +99,12 @@ class PartitionedSystem(Value):
 
     @property
     def done(self) -> str:
-        """Weights and blocks that were applied to the machine, as text for the repr."""
+        """Weights and blocks that were applied to the machine, as text."""
         return ""
 
     @property
     def noise_factor(self) -> FloatArray:
-        """G (n, r), G G' the covariance that white disturbances add to x in one sample."""
+        """Factor G (n, r) of the covariance G G' that white disturbances add to x in one sample."""
         raise NotImplementedError
 
     @property
@@ -142,21 +143,21 @@ class PartitionedSystem(Value):
 
     @property
     def ports(self) -> Ports:
-        """The ports of the machine; of foreign matrices the names of actuators and sensors."""
+        """The ports of the machine; for other systems, names of actuators and sensors."""
         found: Ports = self.machine.origin.ports
         return found
 
     @property
     def realisation(self) -> ModalRealisation:
-        """The modes of the machine's structure; foreign matrices have no known modes."""
+        """The modes of the machine's structure; a plant of other origin has no known modes."""
         found: ModalRealisation = self.machine.origin.realisation
         return found
 
     @property
     def assembled(self) -> Assembled:
-        """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
+        """Parts of the assembly: ports, realisation, noise, delay, and the plant before sampling.
 
-        All that needs a structure asks here: ModelError for a plant of foreign matrices.
+        ModelError when the plant was not assembled from a structure.
         """
         found = self.machine.origin
         if not isinstance(found, Assembled):
@@ -182,7 +183,7 @@ class PartitionedSystem(Value):
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of the channels, and of what its ports derive: estimates, too."""
+        """The units of the channels, and of derived ones such as estimates."""
         return self.ports.units | dict(self.system.units)
 
     @property
@@ -192,7 +193,7 @@ class PartitionedSystem(Value):
 
     @property
     def form(self) -> str:
-        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
+        """Form of A: `modal blocks`, `dense: ` with the reason, or `as given` without a structure.
 
         Weights and filters of the ports add further blocks.
         """
@@ -205,7 +206,7 @@ class PartitionedSystem(Value):
 
     @property
     def modal_blocks(self) -> FloatArray:
-        """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
+        """The (b, 2, 2) blocks of the structure's modes [rad/s] before sampling; may be empty."""
         return self.realisation.pairs
 
     @property
@@ -219,14 +220,14 @@ class PartitionedSystem(Value):
 
     @property
     def unstable_text(self) -> str:
-        """The first three of these modes in words, and how many more there are."""
+        """The first three unstable modes in words, and the number of the others."""
         listed = list(self.unstable_modes.values())
         more = f" and {len(listed) - 3} more" if len(listed) > 3 else ""
         return ", ".join(listed[:3]) + more
 
     @property
     def modal_states(self) -> IntArray:
-        """Where the states of the structure's modes are; sensors' filters stand before them.
+        """Positions of the states of the structure's modes; states of sensor filters precede them.
 
         ModelError when the plant has other states now.
         """
@@ -245,7 +246,7 @@ class PartitionedSystem(Value):
 
     @property
     def noise_direct(self) -> FloatArray:
-        """H (ny, r): what the noises of `noise_factor` add to y in the same sample."""
+        """Gain H (ny, r) from the noises of `noise_factor` to y in the same sample."""
         found = np.zeros((len(self.y), self.noise_factor.shape[1]))
         if held := self.held:
             sizes = np.array([self.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 / self.dt)
@@ -262,13 +263,13 @@ class PartitionedSystem(Value):
     def sensor_noise(self) -> FloatArray:
         """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor.
 
-        Through a static block T, ``T R T'``.
+        If R is this covariance and y is read through a static block T, it is ``T R T'``.
         """
         return self.sensor_noise_factor @ self.sensor_noise_factor.T
 
     @property
     def sensor_noise_factor(self) -> FloatArray:
-        """F (ny, sensors), F F' the covariance of a sample of y."""
+        """Factor F (ny, sensors) of the covariance F F' of a sample of y."""
         require_sampled(self, "sensors have a noise of each sample", ModelError)
         asd = [self.asd.get(f"{name}:noise", 0.0) for name in self.machine.y]
         return np.asarray(self.reading_gain * (np.array(asd) * np.sqrt(0.5 / self.dt)))
@@ -276,7 +277,7 @@ class PartitionedSystem(Value):
     def channel(self, name: str, side: str = "z") -> str:
         """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
 
-        LabelError when it means none.
+        LabelError when the name does not mean a channel.
         """
         names: tuple[str, ...] = getattr(self, side)
         if not isinstance(name, str) or name in names:
@@ -381,7 +382,7 @@ class Partition(PartitionedSystem):
         return self
 
     def around(self, machine: Self) -> Self:
-        """Return another machine as it is: a plain plant has neither weights nor blocks."""
+        """Return another machine unchanged, because this plant has neither weights nor blocks."""
         return machine
 
     def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
@@ -410,10 +411,10 @@ class Partition(PartitionedSystem):
 
     @classmethod
     def of(cls, given: Any) -> Self:
-        """Return a plant; of a system with labels when these name w, u, z and y.
+        """Return a plant, or the plant of a system whose labels name w, u, z and y.
 
-        An `UncertainPlant` gives its nominal plant, whose `uncertainty` holds what is uncertain.
-        LabelError when the labels do not, ModelError when it is neither.
+        For an `UncertainPlant` it is the nominal plant with its `uncertainty`. LabelError when the
+        labels do not name these channels, ModelError for any other value.
         """
         given = given if isinstance(given, cls) else getattr(given, "nominal", given)
         if isinstance(given, cls):
@@ -443,12 +444,12 @@ class Partition(PartitionedSystem):
         noise_factor: FloatArray | None = None,
         evaluation: Any = None,
     ) -> Self:
-        """Return the standard plant of a system made elsewhere.
+        """Return the standard plant of a system that was not assembled from a structure.
 
         Parameters
         ----------
         sys : StateSpace or control.StateSpace
-            With named channels.
+            System with named channels.
         u, y : sequences of str, optional
             Inputs that the controller drives, and outputs that it reads. Both may be
             left out when the channels are named like those of an assembled plant
@@ -459,19 +460,20 @@ class Partition(PartitionedSystem):
             One-sided amplitude spectral densities of white w channels; the noise of a sensor y1
             is the w channel `y1:noise`.
         noise_factor : (n, r) array, optional
-            G with G G' the covariance of x that disturbances add in one sample.
+            Factor G of the covariance G G' that disturbances add to x in one sample.
         evaluation : StandardPlant, optional
-            The plant that answers are judged on, with the same channels.
+            Larger plant of the same machine with the same channels, on which results are checked.
 
         Returns
         -------
         StandardPlant
-            With inputs [w; u] and outputs [z; y].
+            Plant with inputs [w; u] and outputs [z; y].
 
         Raises
         ------
         LabelError
-            When a name is unknown or on two sides, or none is given and the names do not show them.
+            When a name is unknown or on two sides. Also when no names are given and the names of
+            the channels do not show their sides.
         """
         g = as_statespace(sys)
         if u is None and y is None and w is None and z is None:
@@ -495,18 +497,18 @@ class Partition(PartitionedSystem):
 
     @property
     def continuous(self) -> Self:
-        """The plant before sampling; this plant where it is continuous, or nothing is known."""
+        """The plant before sampling; this plant if it is continuous or that is not known."""
         found: Self | None = self.origin.continuous
         return self if found is None else found
 
     @property
     def has_own_modes(self) -> bool:
-        """Whether it has modes, each with its own frequency and damping."""
+        """Whether it has modes that each have one frequency and one damping."""
         return self.form == MODAL
 
     @property
     def noise_factor(self) -> FloatArray:
-        """G (n, r), G G' the covariance that white disturbances add to x in one sample.
+        """Factor G (n, r) of the covariance G G' that white disturbances add to x in one sample.
 
         ModelError when it is not known.
         """
@@ -522,5 +524,5 @@ class Partition(PartitionedSystem):
 
     @property
     def reading_gain(self) -> FloatArray:
-        """The identity: y are the measurements of the machine."""
+        """The identity matrix, because y are the measurements of the machine."""
         return np.eye(len(self.y))

@@ -114,7 +114,7 @@ class Bench:
 
     @cached_property
     def question(self) -> Question:
-        """Results that are computed in addition to the axis."""
+        """Results that are computed in addition to those of the axis."""
         return Question(self.machines[0], self.model, self.channel, self.move)
 
     def question_of(self, index: int) -> Question:
