@@ -322,7 +322,7 @@ class DofSet(Value):
     def row(self, at: Place, direction: str = "z") -> FloatArray:
         """Return the row (n,) that picks the motion at a place from the vector of all DOFs.
 
-        Its transpose is the load vector of a unit force (moment) there.
+        The transpose of the row is the load vector of a unit force (moment) at this place.
 
         Parameters
         ----------

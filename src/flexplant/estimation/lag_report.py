@@ -300,7 +300,7 @@ def design_static(plant: AnyPlant) -> StaticEstimator:
     Parameters
     ----------
     plant : StandardPlant
-        Continuous or sampled.
+        Plant, continuous or sampled.
 
     Returns
     -------

@@ -55,7 +55,7 @@ def read_matrices(
     Parameters
     ----------
     path : str or Path
-        The file; the file of K where each matrix has a separate file.
+        Path of the file. If each matrix has a separate file, it is the file of K.
     stiffness, mass, damping, dofs, nodes, scalar_direction, rotations : optional
         As for `read_model`.
 
@@ -135,7 +135,7 @@ def read_model(
     Parameters
     ----------
     path : str or Path
-        The file; the file of K where each matrix has a separate file.
+        Path of the file. If each matrix has a separate file, it is the file of K.
     stiffness : str, optional
         Name of the variable, in files that hold several (.mat, .op4, .pch).
     mass, damping : str or Path, optional

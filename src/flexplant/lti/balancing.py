@@ -22,7 +22,7 @@ from .statespace import StateSpace, System, as_statespace
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BalancedReduction(Value):
-    """A reduced system and its error.
+    """A system of reduced order, and its error.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def balanced(
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled.
+        Continuous or sampled system.
     order : int, optional
         Number of states of the result, including those kept exactly. Give this or `tol`.
     tol : float, optional
@@ -214,7 +214,7 @@ def hankel_values(sys: System) -> FloatArray:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Strictly stable, continuous or sampled.
+        Strictly stable system, continuous or sampled.
 
     Returns
     -------
@@ -255,7 +255,7 @@ def hankel_norm(sys: System) -> float:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled; the feedthrough does not matter.
+        Continuous or sampled system; its feedthrough does not matter.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def norm_report(sys: System) -> NormReport:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled.
+        Continuous or sampled system.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> St
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
-        Sampled.
+        Sampled system.
     method : {"hold", "tustin"}
         Method with which the system was sampled, or by which a controller is to be
         converted.
@@ -94,7 +94,7 @@ def resampled(
     Parameters
     ----------
     sys : StateSpace, or a system of python-control or SciPy
-        Sampled.
+        Sampled system.
     rate : float [Hz]
         New sampling rate.
     method : {"hold", "tustin"}

@@ -350,14 +350,14 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     Parameters
     ----------
     A : (n, n) array
-        Spectral radius below one.
+        Matrix with a spectral radius below one.
     Q : (n, n) array
-        Symmetric.
+        Symmetric matrix.
 
     Returns
     -------
     (n, n) array
-        Symmetric.
+        Solution X, a symmetric matrix.
 
     Raises
     ------
@@ -399,12 +399,12 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     A : (n, n) array
         State matrix; all its eigenvalues have negative real parts.
     Q : (n, n) array
-        Symmetric.
+        Symmetric matrix.
 
     Returns
     -------
     (n, n) array
-        Symmetric.
+        Solution X, a symmetric matrix.
 
     Raises
     ------

@@ -84,7 +84,8 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous, one input, one output: a filter or a controller; for a plant use `discretized`.
+        Continuous filter or controller with one input and one output. For a plant use
+        `discretized`.
     rate : float [Hz]
         Sampling rate.
     at : float [Hz]

@@ -536,7 +536,7 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled, stable or not.
+        Continuous or sampled system, stable or not.
     freq : (n_freq,) array [Hz], optional
         Frequencies, increasing; by default a grid refined at resonances and antiresonances
         (`default_freq`).

@@ -52,7 +52,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     Returns
     -------
     (n_freq,) array [Hz]
-        Increasing, positive.
+        Frequencies, increasing and positive.
 
     Raises
     ------

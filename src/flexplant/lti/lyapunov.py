@@ -25,12 +25,12 @@ def controllability_gramian(sys: System) -> FloatArray:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Strictly stable.
+        Strictly stable system.
 
     Returns
     -------
     (n, n) array
-        Symmetric.
+        Gramian P, a symmetric matrix.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def observability_gramian(sys: System) -> FloatArray:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Strictly stable.
+        Strictly stable system.
 
     Raises
     ------

@@ -39,7 +39,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled.
+        Continuous or sampled system.
     tol : float
         Relative tolerance; it should be above rounding.
 

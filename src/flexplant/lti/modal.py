@@ -67,7 +67,7 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Any system; one with only 2 x 2 and 1 x 1 diagonal blocks is returned unchanged.
+        Any system. If A has only 2 x 2 and 1 x 1 diagonal blocks, it is returned unchanged.
     largest_condition : float
         Largest condition number of the eigenvectors; above it the system is returned unchanged with
         a `reason`.
@@ -255,7 +255,7 @@ def split_stable(sys: System) -> StableSplit:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled.
+        Continuous or sampled system.
 
     Returns
     -------

@@ -36,7 +36,7 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled, any numbers of channels.
+        Continuous or sampled system with any number of channels.
     progress : as for `peak_gain`, optional
 
     Returns
@@ -77,7 +77,7 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled, any numbers of channels.
+        Continuous or sampled system with any number of channels.
     progress : bool, optional
         Whether to show a progress bar. By default it is shown on a terminal for work of more than
         two seconds.
@@ -120,7 +120,7 @@ def linf_norm(sys: System) -> float:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled, any numbers of channels.
+        Continuous or sampled system with any number of channels.
 
     Returns
     -------
@@ -199,7 +199,7 @@ def h2_norm(sys: System) -> float:
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        Continuous or sampled.
+        Continuous or sampled system.
 
     Returns
     -------

@@ -182,8 +182,8 @@ def control_dare(
 ) -> RiccatiSolution:
     """Return X of ``X = A' X A - (A' X B + S) (B' X B + R)^-1 (A' X B + S)' + Q``.
 
-    This equation is the dual of that of `filter_dare`. The `gain` of the result is F of the law u =
-    -F x, which gives the closed loop A - B F.
+    This equation is the dual of that of `filter_dare`. The `gain` of the result is F of the law
+    ``u = -F x``, which gives the closed loop A - B F.
 
     Parameters
     ----------
@@ -222,8 +222,8 @@ def control_care(
 ) -> RiccatiSolution:
     """Return X of ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``.
 
-    This equation is the dual of that of `filter_care`. The `gain` of the result is F of the law u =
-    -F x, which gives the closed loop A - B F.
+    This equation is the dual of that of `filter_care`. The `gain` of the result is F of the law
+    ``u = -F x``, which gives the closed loop A - B F.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def step(
 ) -> TimeResponse:
     """Return the responses to a step of one unit at each input, from rest.
 
-    ``y(t) = C int_0^t e^(A s) ds B + D``, exact at the instants returned.
+    The result is ``y(t) = C int_0^t e^(A s) ds B + D``, which is exact at the instants returned.
 
     Parameters
     ----------
@@ -102,7 +102,8 @@ def step(
     Raises
     ------
     ModelError
-        When `time` does not begin at 0, is not equidistant, or is not that of a sampled system.
+        When `time` does not begin at 0 or is not equidistant, or when it does not consist of the
+        sampling instants of a sampled system.
 
     Examples
     --------
@@ -125,9 +126,9 @@ def impulse(
 ) -> TimeResponse:
     """Return the responses to an impulse of area 1 at each input, from rest.
 
-    ``y(t) = C e^(A t) B``; a direct gain D also passes the impulse itself at t = 0, which the
-    result leaves out. The input of a sampled system is a pulse of height ``1 / dt`` that lasts one
-    sample; the result then includes the effect of D.
+    The result is ``y(t) = C e^(A t) B``. A direct gain D also passes the impulse itself at t = 0;
+    this part is left out. The input of a sampled system is a pulse of the height ``1 / dt`` that
+    lasts one sample. Its response includes the effect of D.
 
     Parameters
     ----------

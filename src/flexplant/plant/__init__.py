@@ -6,7 +6,8 @@ for all models of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u =
 - `assemble_plant(model, ports)`: returns a `StandardPlant`. `standard_plant` makes one from a
   system that you built in another way.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
-- `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` proposes some.
+- `StandardPlant.weighted(z=, w=)`: the plant with weights for H-infinity, for example those of
+  `stage_weights`.
 - `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: the plant with its
   uncertainty, as Deltas for analysis and as machines drawn at random. Your own kind of uncertainty
   derives from `Uncertainty`. Two kinds describe dynamics that the model lacks: `Neglected` modes,

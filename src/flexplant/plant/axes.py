@@ -33,7 +33,7 @@ _RESTING = 1e-4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DrivenAxes(Value):
-    """Channels of a plant that its actuators move independently, and how.
+    """Channels of a plant that its actuators move independently, and their decoupling.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def driven_axes(
     Parameters
     ----------
     plant : StandardPlant
-        Continuous or sampled, of any origin.
+        Plant of any origin, continuous or sampled.
     freq : float or mapping {channel: float} [Hz], optional
         Frequency at which each axis is decoupled: its bandwidth. By default a hundredth of
         the rate, for a continuous plant a fifth of the frequency of its slowest

@@ -83,7 +83,7 @@ def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> Grav
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a free or suspended structure, continuous or sampled.
+        Plant of a free or suspended structure, continuous or sampled.
     axes : sequence of str, optional
         Selected rigid-body axes; by default all of the structure.
 

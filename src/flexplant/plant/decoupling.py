@@ -91,7 +91,7 @@ def decouple(
     Parameters
     ----------
     plant : StandardPlant
-        Continuous or sampled, assembled from a structure.
+        Plant of a structure, continuous or sampled.
     axes : sequence of str, optional
         Channels of z or y, as for `flexplant.plant.driven_axes`.
     bandwidth : float or mapping {axis: float} [Hz], optional

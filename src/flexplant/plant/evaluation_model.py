@@ -35,7 +35,8 @@ class EvaluationModel(Value):
         reduced model, the modes that it left out are included. If it is a plant, it must have the
         same channels as the plant that is judged on it.
     ports : Ports, optional
-        Ports that replaced those of the plant after its assembly; a plant as source gets them too.
+        Ports that replaced those of the plant after its assembly. A source that is a plant gets
+        these ports too.
 
     Examples
     --------

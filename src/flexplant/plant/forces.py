@@ -152,7 +152,7 @@ class BaseAcceleration(ForcePort):
 
 @dataclass(frozen=True, eq=False)
 class OutputDisturbance(ForcePort):
-    """A disturbance added to the motion that one sensor measures, before its dynamics; in w.
+    """A disturbance in w that is added to the motion of one sensor, before the sensor's dynamics.
 
     White noise needs a sensor with `dynamics` that roll off (an anti-alias filter, for example), or
     a shape that rolls off; otherwise its samples would have infinite variance. For white noise of

@@ -41,7 +41,7 @@ class GeneralizedPlant(PartitionedSystem):
     unweighted : StandardPlant
         The machine, before weights and blocks.
     steps : sequence
-        What was applied to the machine, in order: a block, or the weights of z and of w.
+        Blocks, and weights of z and w, that were applied to the machine, in this order.
 
     Examples
     --------

@@ -28,7 +28,7 @@ from .visibility import WEAK, mode_visibility
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PortPath(Value):
-    """Rows of C and D, or a column of B, of one port at many points.
+    """Rows of C and D, or columns of B and D, of one port that is placed at many points.
 
     Parameters
     ----------

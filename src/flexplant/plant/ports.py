@@ -92,7 +92,7 @@ class Sensor(SensorPort):
 
 @dataclass(frozen=True, eq=False)
 class Poi(Value):
-    """A Point Of Interest: motions to be controlled that no sensor measures, in z as `name:axis`.
+    """A point of interest (POI): motions to be controlled that no sensor measures, in z.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Poi(Value):
     absolute : bool
         Whether its motion is absolute (with that of a BaseAcceleration) or relative to the floor.
     moves : mapping {position: (3,) array} or PlaceTable, optional
-        How its point moves with the positions of `Ports`; `at` is its place when all positions are
+        Motion of its point with the positions of `Ports`; `at` is its place when all positions are
         zero.
 
     Examples

@@ -41,7 +41,7 @@ class StructureFrf(Frf):
     Parameters
     ----------
     freq, data, inputs, outputs, quantity, coherence, variance, correlation, resolution
-        As of `Frf`.
+        As for `Frf`.
     window, overlap, freedom, units : as of `Frf`
     route : str
         Method by which the responses were computed.
@@ -111,16 +111,16 @@ def frequency_response(
 ) -> Frf:
     """Return the responses of a structure between its ports, or of a system.
 
-    ``frequency_response(model, ports, freq)``: from all disturbances and actuators to all POIs and
-    sensors, through their filters and latencies. A large FEModel is not solved frequency by
-    frequency: its responses are computed in a basis of modes and static responses. The modes go up
-    to 1.5 times the last frequency of `freq`; the static responses are those to unit loads at all
-    inputs and outputs. This basis is checked by direct solutions with the full matrix
-    ``K + i omega D - omega^2 M`` at a few frequencies: at resonances, at antiresonances, at the
-    ends of the band, and at random ones. Where the two differ by more than `tolerance`, the direct
-    solution is added to the basis.
+    ``frequency_response(model, ports, freq)`` returns the responses from all disturbances and
+    actuators to all POIs and sensors, with their filters and latencies. A large FEModel is not
+    solved frequency by frequency: its responses are computed in a basis of modes and static
+    responses. The modes go up to 1.5 times the last frequency of `freq`; the static responses are
+    those to unit loads at all inputs and outputs. This basis is checked by direct solutions with
+    the full matrix ``K + i omega D - omega^2 M`` at a few frequencies: at resonances, at
+    antiresonances, at the ends of the band, and at random ones. Where the two differ by more than
+    `tolerance`, the direct solution is added to the basis.
 
-    ``frequency_response(system, freq)``: ``C (s I - A)^-1 B + D``; see
+    ``frequency_response(system, freq)`` returns ``C (s I - A)^-1 B + D``; see
     `flexplant.lti.frequency_response`.
 
     Parameters
@@ -134,8 +134,8 @@ def frequency_response(
         Frequencies, increasing. For a system, None uses those of `default_freq`.
     damping : Damping, optional
         Damping of an FEModel, in place of its D. `Rayleigh` damping is used as a matrix. Modal
-        damping applies to the modes and static shapes used; all other motions have the damping of
-        the last mode.
+        damping applies to the modes and static responses of the basis; all other motions have the
+        damping of the last mode.
     checks : int
         Number of direct solutions of an FEModel that check the modes; 0 for none.
     tolerance : float
@@ -144,7 +144,7 @@ def frequency_response(
     Returns
     -------
     Frf
-        For a structure a `StructureFrf`, with the error that was found.
+        Response; for a structure it is a `StructureFrf`, with the error that was found.
 
     Raises
     ------

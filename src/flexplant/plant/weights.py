@@ -53,7 +53,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure, with a reference and displacement sensors.
+        Plant of a structure, with a reference and displacement sensors.
     poi : str, optional
         The POI whose references the errors follow; by default all POIs that have references.
     order : int
@@ -62,8 +62,8 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
     Returns
     -------
     StateSpace
-        Static; use it as `plant.through(block)` for design, and in `close_loop`. With an order it
-        reads `die:ref:velocity`, ... too, which a set-point profile gives.
+        Static block. Use it as `plant.through(block)` for design, and in `close_loop`. If `order`
+        is above 0, it also reads `die:ref:velocity` and so on, which a set-point profile provides.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def stage_weights(
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure; continuous or sampled.
+        Plant of a structure, continuous or sampled.
     bandwidth : float [Hz]
         Frequency below which |S| shall be less than 1.
     poi : str, optional
@@ -359,27 +359,29 @@ def mixed_sensitivity(
 ) -> StandardPlant:
     """Return the plant whose H-infinity norm is that of ``[W_S S; W_KS K S; W_T T]``.
 
-    The loop is ``e = r - G u, u = K e``. The sensitivity from r to e is S = (I + G K)^-1, and T = G
-    K S is the complementary sensitivity. MATLAB's `augw` builds the same plant; `design_hinf`
-    designs K for it, as `mixsyn` does. If G has a rigid-body mode or an integrator, this plant has
-    an invariant zero on the stability limit from r to the outputs, which the standard assumptions
-    exclude. In this case add a disturbance at u, as `stage_weights` does.
+    The loop is ``e = r - G u, u = K e``. The sensitivity from r to e is ``S = (I + G K)^-1``, and
+    ``T = G K S`` is the complementary sensitivity. MATLAB's `augw` builds the same plant;
+    `design_hinf` designs K for it, as `mixsyn` does. If G has a rigid-body mode or an integrator,
+    this plant has an invariant zero on the stability limit from r to the outputs, which the
+    standard assumptions exclude. In this case add a disturbance at u, as `stage_weights` does.
 
     Parameters
     ----------
     system : StateSpace
-        G, (p, m): from u to the measured outputs; continuous or sampled.
+        System G (p, m) from u to the measured outputs, continuous or sampled.
     S, T : float or StateSpace, optional
-        Weights of the outputs: one system with one input and one output for all of them, or (p, p).
+        Weights of the outputs: a system with one input and one output that is used for all of them,
+        or a system (p, p).
     KS : float or StateSpace, optional
-        Weight of the inputs: one system with one input and one output for all of them, or (m, m).
-        Continuous weights are sampled at the rate of a sampled system (Tustin).
+        Weight of the inputs: a system with one input and one output that is used for all of them,
+        or a system (m, m). Continuous weights are sampled at the rate of a sampled system (Tustin).
 
     Returns
     -------
     StandardPlant
-        w are the references `y:ref`, z the weighted signals `S:y`, `KS:u` and `T:y`, y the errors
-        `y:error`, for each output y and input u of the system by name.
+        Plant with references as w, weighted signals as z, and errors as y. For an output y and an
+        input u of the system, their names are `y:ref`, then `S:y`, `KS:u` and `T:y`, then
+        `y:error`.
 
     Raises
     ------

@@ -33,11 +33,12 @@ _OFFSETS = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NeglectedModes(Value):
-    """``[z; y] = (G + W(s) Delta diag(1/scales)) [w; u]``, Delta stable and of gain at most 1.
+    """Bound on the effect of neglected modes, as a plant with one dynamic Delta.
 
-    One Delta describes the whole effect of the neglected modes, from disturbances and actuators to
-    points of interest and sensors. Its block from u to y acts on the loop, the other blocks on the
-    performance.
+    ``[z; y] = (G + W(s) Delta diag(1/scales)) [w; u]``, where G is the plant, and Delta is stable
+    with a gain of at most 1. This Delta describes the whole effect of the neglected modes, from
+    disturbances and actuators to points of interest and sensors. Its block from u to y acts on the
+    loop, the other blocks on the performance.
 
     Parameters
     ----------

@@ -152,7 +152,7 @@ def require_matrices(plant: Partition) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Parameters(Uncertainty):
-    """Parameters of the model, each known within an amount: they move all modes and shapes.
+    """Uncertain parameters of the model, which change all modes and mode shapes.
 
     The frequency or the damping of a mode may be uncertain at the same time. This changes K or D of
     the nominal plant: an uncertain frequency adds a fraction of ``omega^2 (M phi)(M phi)'`` to K,
@@ -167,8 +167,8 @@ class Parameters(Uncertainty):
     Raises
     ------
     ModelError
-        When it is empty, a key is not a parameter or an amount is not positive; when the plant was
-        not assembled from a model with matrices.
+        When `amounts` is empty, a key is not a parameter, or an amount is not positive. Also when
+        the plant was not assembled from a model with matrices.
 
     Examples
     --------

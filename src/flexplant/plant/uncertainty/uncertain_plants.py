@@ -283,7 +283,7 @@ class UncertainPlant(Value, Generic[P]):
         return self._closed(machine, self.drawn_blocks(rng))
 
     def drawn_blocks(self, rng: np.random.Generator, size: float | None = None) -> dict[str, Any]:
-        """Return random stable systems of the blocks, by name; its gain is `size` or at most 1."""
+        """Return random stable systems of the blocks, by name, of gain `size` or at most 1."""
         poles = self.plant.continuous.system.poles()
         return {
             one.name: drawn_delta(one, rng, poles, rng.uniform() if size is None else size)
