@@ -27,7 +27,8 @@ class BalancedReduction(Value):
     Parameters
     ----------
     system : StateSpace
-        The reduced system: balanced states, then the unchanged rigid-body and unstable ones.
+        Reduced system. Its states are the balanced ones, followed by the unchanged rigid-body and
+        unstable ones.
     hankel : (n_stable,) array [output unit / input unit]
         Hankel singular values of the stable part, the largest first. With weights they are those of
         the weighted stable part.

@@ -24,8 +24,8 @@ class Delayed(Value):
 
     The term s F is the derivative of a PD controller, or of another controller with one more zero
     than poles. Such a controller has no state-space form. Its product with a strictly proper plant
-    is an ordinary system again. `flexplant.loop.DelayedLoop` judges loops, `pade` gives a system
-    with states where one is needed.
+    is an ordinary system again. `flexplant.loop.DelayedLoop` judges loops with it, and `pade` gives
+    a system with states for methods that need one.
 
     Parameters
     ----------

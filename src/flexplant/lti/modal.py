@@ -217,7 +217,7 @@ def _balance(B: FloatArray, C: FloatArray, blocks: list[int]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StableSplit(Value):
-    """``sys = stable + rest``: add the two (`parallel`) to have the system back.
+    """A system as a sum, ``sys = stable + rest``; `parallel` of both is the system again.
 
     Parameters
     ----------

@@ -287,7 +287,7 @@ def step_info(
     sys : StateSpace, or a system of python-control or SciPy, or a ClosedLoop
         System whose response is computed.
     output, input : str, optional
-        The channel; by default the only one.
+        Names of the output and the input; by default the only ones.
     band : float
         Relative tolerance of the settling time: the response has settled when its distance from the
         value at rest stays below this fraction of that value.

@@ -43,9 +43,9 @@ White noise of the one-sided density asd has the intensity asd^2 / 2. The noise 
 sensor has the variance asd^2 rate / 2. In each sample the sensors are read, the estimate is
 updated, the controller computes u, and u is held until the next sample.
 
-**Weights of a stage.** ``plant.weighted(...)`` takes those of `stage_weights`, or your own
-weights: numbers, `fx.lti.low_pass_filter`, `fx.lti.inverse_sensitivity`, any system with one input
-and one output.
+**Weights of a stage.** ``plant.weighted(...)`` takes the weights of `stage_weights` or your own
+ones. A weight is a number or a system with one input and one output, for example
+`fx.lti.low_pass_filter` or `fx.lti.inverse_sensitivity`.
 
 The table shows the effect of the arguments of `stage_weights` for the plate of
 ``examples/wafer_stage.py`` at 0.1 % damping, 10 kHz, with a delay of 1.3 samples. The design uses a

@@ -35,11 +35,13 @@ class GravityAxes(Value):
     Parameters
     ----------
     to_actuators : StateSpace
-        T_u: forces at the centre of gravity `cog:z:force` [N, N m] to actuators, of least norm.
+        Static system T_u from forces at the centre of gravity `cog:z:force` [N, N m] to actuator
+        forces of least norm.
     to_motions : StateSpace
-        T_y: sensors to motions of the centre of gravity `cog:z` [m, rad], least squares.
+        Static system T_y from sensors to the least-squares estimate of the motions of the centre of
+        gravity `cog:z` [m, rad].
     accelerations : StateSpace
-        ``T_u mass``: accelerations `cog:z:acceleration` to actuators.
+        Static system ``T_u mass`` from accelerations `cog:z:acceleration` to actuators.
     mass : (r, r) array [kg, kg m, kg m^2]
         Inertia about the centre of gravity; a rotational block need not be diagonal.
     centre : (3,) array [m]

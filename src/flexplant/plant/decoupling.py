@@ -28,13 +28,14 @@ class Decoupling(Value):
     Parameters
     ----------
     driven : DrivenAxes
-        The axes, the actuators, and where they are decoupled.
+        Axes, actuators, and the frequencies at which the axes are decoupled.
     to_actuators : StateSpace
-        T: commands `die:z:command` of the axes [m/s^2, rad/s^2] to actuators.
+        Static system T from the commands `die:z:command` of the axes [m/s^2, rad/s^2] to the
+        actuators.
     to_motions : StateSpace
-        T_y: from the sensors to the motions of the axes `die:z` [m, rad]. It is a least-squares
-        estimate, weighted by the noise of the sensors. If an axis is a channel of y, its motion is
-        the signal of this sensor.
+        Static system T_y from the sensors to the motions of the axes `die:z` [m, rad]. Its outputs
+        are a least-squares estimate, weighted by the noise of the sensors. If an axis is a channel
+        of y, its motion is the signal of this sensor.
 
     Examples
     --------

@@ -31,9 +31,9 @@ class FigureInterval(NamedTuple):
     Parameters
     ----------
     low, high : float or None
-        Ends of the interval; None where `sentence` says what is missing.
+        Ends of the interval; None if the data for an interval are missing.
     sentence : str
-        The interval in words, or what is missing for one.
+        The interval in words, or the data that are missing for it.
 
     Examples
     --------

@@ -39,7 +39,8 @@ class PortPath(Value):
     channels : sequence of str
         Channels of z for a POI, or the one input of an actuator or disturbance.
     C : (p, channels, n) array
-        A POI's rows over the plant's states: ``z = C[i] x + D[i] [w; u]`` while it is at point i.
+        Rows of a POI over the states of the plant. While the POI is at point i,
+        ``z = C[i] x + D[i] [w; u]``.
     D : (p, channels, inputs) or (p, outputs, 1) array
         Rows of a POI, or columns of a force.
     B : (p, n, 1) array

@@ -126,7 +126,7 @@ class StandardPlant(Partition):
         z: Mapping[str, Any] | None = None,
         w: Mapping[str, Any] | None = None,
     ) -> GeneralizedPlant:
-        """Return the plant with weights on z and w absorbed into its states; names stay.
+        """Return the plant with weights on z and w, whose states are added; channel names stay.
 
         Parameters
         ----------
@@ -290,7 +290,7 @@ class StandardPlant(Partition):
         return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold"), late))
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
-        """Return what the position changes: decoupling, modes seen and reached, the user's figures.
+        """Return figures over the positions: decoupling, visibility of modes, and your own ones.
 
         Parameters
         ----------

@@ -58,7 +58,7 @@ class ModeVisibility(Value):
     Parameters
     ----------
     mode : int
-        Number, from 1, rigid-body modes included.
+        Number of the mode, counted from 1 with the rigid-body modes.
     freq : float [Hz]
         Frequency.
     zeta : float

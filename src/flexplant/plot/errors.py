@@ -194,7 +194,7 @@ def exposures(
     window : float [s]
         Exposure time of one point.
     start : float [s]
-        Time after which the whole run counts as exposed, where `exposures` is not given.
+        Time after which the whole run counts as exposed, if `exposures` is not given.
     exposures : (k, 2) array [s], optional
         Beginning and end of each exposure, such as `SetPointProfile.exposures`.
     ax : Axes, optional
@@ -260,7 +260,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     found : ErrorMap
         Map from `flexplant.simulation.exposure`, whose points span an area.
     what : str
-        "ma" or "msd".
+        Quantity to draw: "ma" (moving average) or "msd" (moving standard deviation).
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 

@@ -198,7 +198,7 @@ def estimate(
     Raises
     ------
     ModelError
-        When it is not an Estimate, or the truth or the width is not a number.
+        When `result` is not an Estimate, or the truth or the width is not a number.
 
     Examples
     --------

@@ -44,7 +44,7 @@ _RATIO = "POI error with / without a further sensor [-],\nlower is better"
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the benefit of one more sensor by place, seen from above.
+    """Draw the benefit of one more sensor over its place, seen from above.
 
     Parameters
     ----------

@@ -354,7 +354,7 @@ def layout(
     desired : iterable of str
         Labels of the desired DOFs.
     marked : mapping {text: place}, optional
-        Further places to name.
+        Further places, which are drawn with their names.
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 

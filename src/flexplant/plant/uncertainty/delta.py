@@ -70,7 +70,7 @@ class Delta(Value):
         return self.scale * drawn
 
     def of_matrices(self, plant: Partition) -> Delta:
-        """Return the Delta; a Delta of a mode as a change of M, D and K of the plant's model."""
+        """Return the Delta; one of a mode becomes a change of M, D and K of the plant's model."""
         return self
 
     def require_in_range(self, deviations: float) -> None:

@@ -92,7 +92,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def deltas(self) -> tuple[Delta, ...]:
-        """The Deltas, those of modes by number."""
+        """The Deltas, with those of modes in the order of their numbers."""
         every = [delta for known in self._known for delta in known.deltas]
         return tuple(every[i] for i in self._order)
 
