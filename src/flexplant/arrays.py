@@ -92,7 +92,7 @@ def complex_array(value: Any, name: str, shape: Shape | None = None) -> ComplexA
 
 
 def real_or_complex(value: Any, name: str, shape: Shape | None = None) -> FloatArray | ComplexArray:
-    """Return `value` as a finite array of a shape, complex where it is given so."""
+    """Return `value` as a finite array of a shape; it is complex if `value` is complex."""
     return (complex_array if np.iscomplexobj(value) else real_array)(value, name, shape)
 
 
@@ -229,7 +229,7 @@ def below_half_rate(freq: Any, name: str, rate: float) -> float:
 def frequency_band(
     band: Any, name: str = "band", least: float = 0.0, most: float = np.inf
 ) -> tuple[float, float]:
-    """Return (low, high) [Hz], rising, of which some lies between two frequencies."""
+    """Return (low, high) [Hz], increasing; the band must overlap that of two frequencies."""
     low, high = real_array(band, name, (2,)).tolist()
     if not 0 <= low < high or high < least or low > most:
         where = f"{name} must be (low, high) in Hz, within {least:g} .. {most:g}"
@@ -255,7 +255,7 @@ def positive_array(
 
 
 def spread_array(value: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """Return positive numbers of a shape; one number, or fewer axes, is spread over it."""
+    """Return positive numbers of a shape; a number or an array of fewer axes is broadcast."""
     given = positive_array(value, name)
     try:
         return np.broadcast_to(given, shape).copy()
@@ -267,7 +267,7 @@ def spread_array(value: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
-    """Return which elements of a mesh are chosen, some at least."""
+    """Return which elements of a mesh are chosen; at least one must be."""
     mask = np.asarray(_array_of(value, name))
     if mask.dtype != bool or not mask.any():
         raise ShapeError(
@@ -278,5 +278,5 @@ def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
 
 
 def divisor(size: Any) -> FloatArray:
-    """Return sizes to divide by, and 1 in the place of zero."""
+    """Return sizes to divide by, with 1 in place of zero."""
     return np.asarray(np.where(size > 0, size, 1.0))

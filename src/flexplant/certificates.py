@@ -118,12 +118,12 @@ class Certificate(Value, Mapping[str, float]):
 
 
 def stability_name(sampled: Any) -> str:
-    """Return what stability is measured by: the spectral radius, or the largest real part."""
+    """Return the name of the measure of stability: spectral radius, or largest real part."""
     return "spectral radius" if sampled else "largest real part"
 
 
 def stability(poles: ComplexArray, sampled: Any) -> float:
-    """Return that number of poles: a loop is stable below 1 (sampled) or 0."""
+    """Return this measure for some poles: a loop is stable below 1 (sampled) or 0."""
     size = np.abs(poles) if sampled else poles.real
     return float(np.max(size, initial=0.0 if sampled else -np.inf))
 
@@ -134,7 +134,7 @@ def stability_check(least: float, sampled: Any, of: str = "") -> Verified:
 
 
 def one_line(found: Mapping[str, Any]) -> str:
-    """Return the numbers of a certificate as one line; what is None is left out."""
+    """Return the numbers of a certificate as one line; those that are None are left out."""
     return ", ".join(_worded(name, value) for name, value in found.items() if value is not None)
 
 
@@ -145,7 +145,7 @@ def _worded(name: str, value: Any) -> str:
 
 
 def figure(name: str, value: Any) -> str:
-    """Return a number of a certificate in words: four digits, of a radius what is left to 1."""
+    """Return a number of a certificate: four digits, or enough to tell a radius from 1."""
     if not isinstance(value, int | float | np.number) or isinstance(value, bool):
         return str(value)
     if "radius" not in name and "radii" not in name:

@@ -23,7 +23,7 @@ Place: TypeAlias = "str | Sequence[float] | FloatArray | Mapping[Any, float]"
 
 
 class Interpolation(Value):
-    """How displacements between nodes follow from those at the nodes (element shape functions)."""
+    """Interpolation of displacements between nodes by element shape functions."""
 
     @abstractmethod
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
@@ -37,7 +37,8 @@ class Interpolation(Value):
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        A joint makes DOFs follow: they are not rows of the matrices, but their labels stay known.
+        A joint makes DOFs follow others. These DOFs are not rows of the matrices, but their labels
+        can still be used.
         """
         return None
 
@@ -212,7 +213,7 @@ class DofIndex:
         return None
 
     def found(self, label: object) -> int:
-        """Return the row of a label, or -1: by its number, so that a million need no dictionary."""
+        """Return the row of a label, or -1; it is found by numbers, without a dictionary."""
         if not isinstance(label, str):
             return -1
         component, _, rest = label.rpartition("/")
@@ -232,7 +233,7 @@ class DofIndex:
 
 
 def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) -> LabelError:
-    """Return the error for a label that is not there, without comparing it with a million."""
+    """Return the error for an unknown label, without comparing it with all labels."""
     number = re.match(r"-?\d{1,15}", str(label).rpartition("/")[2])
     if number is not None:
         own = [label_of(row) for row in np.flatnonzero(nodes == int(number.group())).tolist()]
@@ -250,7 +251,7 @@ def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) 
 
 
 def rotation_hint(wanted: Iterable[str], there: Iterable[str]) -> str:
-    """Return where rotations are had of nodes that only have displacements, as of solids."""
+    """Return a hint where rotations come from if nodes only have displacements (solids)."""
     present = set(there)
     if not present or present & _ROTATIONS or not set(wanted) & _ROTATIONS:
         return ""

@@ -118,7 +118,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def some_names(names: Sequence[str], most: int = 6, *, total: bool = True) -> str:
-    """Return the first names in a row, and the number of all where it is not said otherwise."""
+    """Return the first names as text, and, if there are more, the number of all."""
     more = f", ...{f' ({len(names)} in all)' if total else ''}" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -134,7 +134,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def plain_repr(value: Any) -> str:
-    """Return the repr of a value, which is the same in each process: without addresses."""
+    """Return the repr of a value without addresses, so that it is equal in each process."""
     if isinstance(value, BuiltinFunctionType | FunctionType | MethodType):
         return f"{value.__module__}.{value.__qualname__}"
     if isinstance(value, set | frozenset):
@@ -225,7 +225,7 @@ def _similar_names(name: str, listed: list[str]) -> list[str]:
 
 
 def only_one(kind: str, names: Iterable[str], given: Any, how: str) -> str:
-    """Return the one of some names that is given, or the only one; LabelError where it is open."""
+    """Return the given one of some names, or the only one; LabelError if there are several."""
     known = list(names)
     if given is not None:
         require_known(kind, [given], known)

@@ -1,4 +1,4 @@
-"""A hash of values by their contents: results in a file belong to the values they were made of."""
+"""A hash of values by their contents; it shows to which values the results of a file belong."""
 
 from __future__ import annotations
 

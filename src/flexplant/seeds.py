@@ -44,7 +44,7 @@ def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
 def seed_of(sequence: np.random.SeedSequence) -> int | tuple[int, ...]:
     """Return the number, or numbers, that give the same draws as a SeedSequence when passed as rng.
 
-    A spawned one mixes the key of its place in after four words of entropy, so that a list does.
+    For a spawned SeedSequence it is a list: four words of entropy, then the key of its place.
     """
     entropy: Any = sequence.entropy
     given = entropy if isinstance(entropy, Sequence | np.ndarray) else (entropy,)

@@ -1,4 +1,4 @@
-"""The base of all values, and their files: .npz with a JSON header, no pickle, atomic."""
+"""The base of all values, and their files: .npz with a JSON header, without pickle."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def save(value: Value, path: str | Path) -> None:
 
 
 def named_file(path: Any, name: str = "path") -> Path:
-    """Return the path of a file; its absence is left to what opens it."""
+    """Return the path of a file; whether it exists is checked when it is opened."""
     if not isinstance(path, str | Path) or not Path(path).name or "\0" in str(path):
         raise FlexplantError(
             f"{name} must name a file, got {path!r:.80}. Pass a text such as 'plant.npz' or a Path."
@@ -223,7 +223,7 @@ def named_file(path: Any, name: str = "path") -> Path:
 
 @contextmanager
 def written(path: str | Path) -> Iterator[IO[bytes]]:
-    """Open a new file that takes the place of `path` when all is on the disk, not before."""
+    """Open a new file that replaces `path` only when all its data are on the disk."""
     target = named_file(path)
     part = target.with_name(f"{target.name}.{uuid.uuid4().hex}.part")
     try:

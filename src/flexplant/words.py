@@ -58,7 +58,7 @@ def with_unit(value: float, unit: str | None) -> str:
 
 
 def with_deviation(value: float, deviation: float | None) -> str:
-    """Return a number in words, without the figures that its standard deviation leaves open."""
+    """Return a number in words, without digits below its standard deviation."""
     if deviation is None:
         return f"{value:.7g}"
     known = 7
@@ -75,7 +75,7 @@ def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4
 
 
 def flag(value: Any, name: str) -> bool:
-    """Return `value` as a bool: True or False, nothing that merely counts as one."""
+    """Return `value` as a bool; it must be True or False, not a number."""
     if not isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be True or False, got {short(value)}. Pass one of them.")
     return bool(value)
@@ -93,7 +93,7 @@ def instance(
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
-    """Return the one of some texts that `value` is; an underscore counts as a space."""
+    """Return the allowed text that `value` is equal to; an underscore counts as a space."""
     listed = list(choices)
     if isinstance(value, str) and value in listed:
         return value
@@ -118,7 +118,7 @@ def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tu
 
 
 def several(value: Any) -> bool:
-    """Return whether there is something to go through: a list, a generator, an array; no text."""
+    """Return whether a value is iterable (a list, a generator, an array), but not a text."""
     if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and not value.ndim):
         return False
     return isinstance(value, Iterable)
@@ -142,7 +142,7 @@ def name_list(names: Any, name: str) -> tuple[str, ...]:
 
 
 def inner_names(names: Iterable[str], taken: Iterable[str]) -> tuple[str, ...]:
-    """Return names of our own, lengthened by '|' until none equals one that a user has taken."""
+    """Return internal names, lengthened by '|' until they differ from all names of the user."""
     found, known = tuple(names), set(taken)
     while not known.isdisjoint(found):
         found = tuple(f"{name}|" for name in found)
@@ -201,7 +201,7 @@ def mapping(
 
 
 def why_not_called(function: Any, *arguments: Any) -> str:
-    """Return why a function does not take such arguments; empty when it does, or is of C."""
+    """Return why a function does not take such arguments; empty if it does, or cannot be told."""
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError as error:
@@ -212,7 +212,7 @@ def why_not_called(function: Any, *arguments: Any) -> str:
 
 
 def function(value: Any, name: str, hint: str) -> Any:
-    """Return what can be called."""
+    """Return `value`, which must be callable."""
     if not callable(value):
         raise ModelError(f"{name} must be a function, got {short(value)}. {hint}")
     return value

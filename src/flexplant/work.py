@@ -1,4 +1,4 @@
-"""What long work runs on: an executor, a bar, and a file from which it goes on when stopped."""
+"""Means of long work: an executor, a progress bar, and a file from which it can continue."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 
 class Work:
-    """Steps of long work: each is `mapped` on the executor, and what a file has is not repeated.
+    """Steps of long work; each is `mapped` on the executor, except for results in a file.
 
     As a context it closes the file.
 
@@ -50,7 +50,7 @@ class Work:
 
     @property
     def rng(self) -> np.random.SeedSequence:
-        """Seeds of what is random."""
+        """The SeedSequence of random draws."""
         entropy, key = self._log.header["rng"]
         return np.random.SeedSequence(entropy, spawn_key=tuple(key))
 
@@ -98,11 +98,11 @@ _FAR = 2**40
 
 
 class Checkpoint:
-    """A file of JSON lines: what the work is, then ``[number, result, sum]`` of each item.
+    """A file of JSON lines: a description of the work, then ``[number, result, sum]`` of each item.
 
-    Each line is written at once and reaches the disk before the next item is counted. Of a file
-    that was damaged all results are taken whose check sum is right; the rest is computed again.
-    As a context it closes the file, which one process at a time can write to.
+    Each line is written at once and reaches the disk before the next item is counted. If a file was
+    damaged, all results with a correct check sum are used, and the others are computed again. As a
+    context manager it closes the file. Only one process at a time can write to it.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class Checkpoint:
         self._file = self._key = None
 
     def add(self, number: int, result: Any) -> None:
-        """Keep what came out for an item."""
+        """Store the result of an item."""
         self.rows[number] = result
         if self._file is not None:
             text = _dumped([number, result])
