@@ -133,10 +133,10 @@ def descriptor(
 ) -> StateSpace:
     """Return the state space of a descriptor system; equations without a derivative are solved.
 
-    ``E dx/dt = A x + B u, y = C x + D u`` (or ``E x[k+1]``). A singular value decomposition of E
-    divides the states into x_1, whose derivatives occur in the equations, and x_2, whose
-    derivatives do not occur. The equations without a derivative,
-    ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, give x_2.
+    The system is ``E dx/dt = A x + B u, y = C x + D u``; if it is sampled, ``E x[k+1]`` replaces
+    ``E dx/dt``. A singular value decomposition of E divides the states into x_1, whose derivatives
+    occur in the equations, and x_2, whose derivatives do not occur. The equations without a
+    derivative, ``0 = A_21 x_1 + A_22 x_2 + B_2 u``, give x_2.
 
     Parameters
     ----------

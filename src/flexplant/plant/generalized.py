@@ -28,7 +28,7 @@ _OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GeneralizedPlant(PartitionedSystem):
-    """The plant of a synthesis: ``W_z P W_w`` with y read through a block.
+    """The plant of a synthesis: ``W_z P W_w``, whose y may be the outputs of a block.
 
     Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Once
     weights are applied, w and z are no longer physical channels. The attribute `unweighted` is the
@@ -78,7 +78,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def reading(self) -> StateSpace | None:
-        """The block from the measurements of the machine to y; None when y are the measurements."""
+        """The block from the measurements of the machine to y; None if there is no such block."""
         return self._reading
 
     @cached_property
@@ -100,7 +100,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def reading_gain(self) -> FloatArray:
-        """The gain (ny, ny of the machine) of the static block that it is read through.
+        """The gain (ny, ny of the machine) from the measurements of the machine to y.
 
         ModelError when the block has dynamics.
         """

@@ -75,7 +75,7 @@ def fitted_response(plant: Any) -> MeasuredResponse | None:
 
 
 class PlantMachines:
-    """The machines that a plant may be, with its channels and sampled like it.
+    """Possible machines of a plant; they have its channels and its sampling.
 
     If the plant has a fit (`flexplant.updating.Machines`) and an evaluation model, the modes of
     these machines come from the fit. Otherwise they come from the uncertainty that the user states:
@@ -195,7 +195,7 @@ class PlantMachines:
 
     @property
     def densities(self) -> str:
-        """Remark for an interval of noise when no density has a deviation; otherwise empty."""
+        """Remark for intervals of noise figures if no density is uncertain; otherwise empty."""
         return "" if self._unsure else ", densities as given"
 
     def _of_fit(self, rng: np.random.Generator) -> DrawnModes:

@@ -68,7 +68,7 @@ def predictions(
     Raises
     ------
     ModelError
-        When a mapping is not given, or an error is not positive.
+        When `rows` is neither a mapping nor a sequence of comparisons, or an error is not positive.
     ShapeError
         When a row has not four columns, or there are not as many names as cases.
 

@@ -29,7 +29,7 @@ _TYPED_POLES = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Fit(Uncertainty):
-    """Uncertainty of frequencies and dampings that a fit or a measurement of modes leaves.
+    """Remaining uncertainty of frequencies and dampings after a fit or a measurement of modes.
 
     An `UpdateResult`, `ModalUncertainty` or `MeasuredModes` that is passed directly to
     ``plant.uncertain`` is understood as ``Fit(source)``. If C is the covariance of the parameters,

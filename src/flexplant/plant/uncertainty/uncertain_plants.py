@@ -98,7 +98,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def delta_blocks(self) -> tuple[Block, ...]:
-        """The Deltas that are not numbers of the machine: unmodelled dynamics, your own blocks."""
+        """The Deltas that are dynamic or matrices: unmodelled dynamics, and your own blocks."""
         found = [block for kind in self.kinds for block in kind.delta_blocks(self.plant)]
         names = [delta.name for delta in self.deltas] + [block.name for block in found]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -185,7 +185,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @property
     def nominal(self) -> P:
-        """The nominal plant, whose `uncertainty` is this value; weights and blocks keep it.
+        """The nominal plant. Its `uncertainty` is this value, also after weights and blocks.
 
         Designs and loops use it when they are given an uncertain plant. For an H-infinity design
         write ``uncertain.nominal.through(errors).weighted(z=..., w=...)``.
@@ -218,7 +218,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @property
     def channels(self) -> dict[str, str]:
-        """The Delta of each of its channels: {`mode6:freq:rate`: `mode6:freq`, ...}, in order."""
+        """The Delta of each channel, in order: {`mode6:freq:rate`: `mode6:freq`, ...}."""
         names = iter(self.opened.system.inputs)
         return {
             next(names).removesuffix(":w"): name
