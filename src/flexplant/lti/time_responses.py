@@ -97,7 +97,7 @@ def step(
     Returns
     -------
     TimeResponse
-        Its `data` is (n_out, n_in, n_time).
+        Response whose `data` has the shape (n_out, n_in, n_time).
 
     Raises
     ------

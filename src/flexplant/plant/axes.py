@@ -76,18 +76,18 @@ def driven_axes(
 ) -> DrivenAxes:
     """Return the axes of a plant and their decoupling on the real axis.
 
-    ``T = pinv(G(sigma)) / sigma^2``. G is the plant from the actuators to the channels, at a real
-    frequency s = sigma instead of an imaginary one. No mode resonates there: each mode with shape
-    phi contributes phi phi' / (sigma^2 + omega^2), which has the same sign below and above its
-    frequency omega. T is therefore real.
+    The decoupling is ``T = pinv(G(sigma)) / sigma^2``. G is the plant from the actuators to the
+    channels, at a real frequency s = sigma instead of an imaginary one. No mode resonates there:
+    each mode with shape phi contributes phi phi' / (sigma^2 + omega^2), which has the same sign
+    below and above its frequency omega. T is therefore real.
 
     Parameters
     ----------
     plant : StandardPlant
         Plant of any origin, continuous or sampled.
     freq : float or mapping {channel: float} [Hz], optional
-        Frequency at which each axis is decoupled: its bandwidth. By default a hundredth of
-        the rate, for a continuous plant a fifth of the frequency of its slowest
+        Frequency at which each axis is decoupled, about its bandwidth. By default it is a hundredth
+        of the sampling rate. For a continuous plant it is a fifth of the frequency of the slowest
         oscillation.
     axes : sequence of str, optional
         Channels of z or y. By default these are all axes of the POIs, if the actuators can move

@@ -301,7 +301,7 @@ class PositionMap(Value):
 
     @property
     def visible(self) -> FloatArray:
-        """The share (..., m) of each mode in the loop: the smaller of what is seen and reached."""
+        """The share (..., m) of each mode in the loop: the smaller one of `seen` and `reached`."""
         return np.minimum(self.seen, self.reached)
 
     @property

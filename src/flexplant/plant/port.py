@@ -177,8 +177,8 @@ class SensorPort(Value):
     def unit(self) -> str | None:
         """Unit of the channel: that of the motion at its place; None for a sum of m and rad.
 
-        A kind that measures something else has a field `unit` instead; one that overrides `see`
-        has no unit unless it states one.
+        A kind of sensor that measures another quantity states its unit in a field `unit`. A kind
+        that overrides `see` has no unit without this field.
         """
         if type(self).see is not SensorPort.see:
             return None

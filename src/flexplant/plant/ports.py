@@ -33,9 +33,9 @@ class Sensor(SensorPort):
     at, direction, moves : as for `Disturbance`
     quantity : {"displacement", "velocity", "acceleration"}
         Measured quantity. An acceleration responds to forces at once (D21, D22). A white
-        disturbance that reaches it would give its samples infinite variance, which Kalman
-        filters and simulation refuse: shape the disturbance, let it be held over each
-        sample (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
+        disturbance that reaches it would give its samples infinite variance. Kalman filters and
+        simulation refuse this. Give the disturbance a `shape`, hold it over each sample
+        (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has the variance ``asd^2
         rate / 2``. It is added to the samples, after dynamics and latency; use an OutputDisturbance
@@ -169,7 +169,7 @@ class Poi(Value):
             ) from error
 
     def see(self, realisation: ModalRealisation, axis: str) -> MeasuredRow:
-        """Return the coefficients of an axis: of states, and of forces that act directly."""
+        """Return the coefficients of states, and of directly acting forces, for one axis."""
         along = None
         if self.absolute:
             along = place_motion(realisation.model.full_dofs, self._at(axis), axis)
@@ -188,9 +188,9 @@ _KINDS = {"w": "disturbance", "u": "Actuator", "z": "Poi", "y": "Sensor", "refer
 class Reference(Value):
     """Set-points for the axes of a POI.
 
-    Each adds `die:ref` to w, the error `die:error` (reference minus POI) to z, and a noise-free
-    `die:ref` to y, so that a controller that uses it has two degrees of freedom. The names for the
-    other axes of the POI are `die:rx:ref` and `die:rx:error`.
+    Each set-point adds `die:ref` to w, the error `die:error` (reference minus POI) to z, and a
+    noise-free `die:ref` to y, so that a controller that uses it has two degrees of freedom. The
+    names for the other axes of the POI are `die:rx:ref` and `die:rx:error`.
 
     Parameters
     ----------

@@ -154,12 +154,12 @@ class PlaceTable(Value):
 class PlaceMotion(Value):
     """Motion of a place with the positions: ``start + sum_i along_i value_i``, or a table.
 
-    Made from what is given as `moves` of a port: the mapping {position: direction}, or a table.
+    It is made from the argument `moves` of a port: a mapping {position: direction}, or a table.
 
     Parameters
     ----------
     start : (3,) array [m] or mapping {point: weight}
-        The place where all positions are zero.
+        Place at which all positions are zero.
     along : mapping {name: (3,) array} or PlaceTable
         Displacement of the place per unit of each position. A place with (1, 0, 0) moves with the
         stage's x. A place with (-1, 0, 0) moves against it, like the point of the stage below a

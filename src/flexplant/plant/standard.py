@@ -102,8 +102,9 @@ class StandardPlant(Partition):
         Returns
         -------
         StandardPlant
-            Efforts are the commands (not delayed); sensor noises and references act as sample
-            values; `process_noise` and `sensor_noise` hold the exact covariances.
+            The sampled plant. Its efforts are the commands without delay. Sensor noises and
+            references act as sample values. `process_noise` and `sensor_noise` are the exact
+            covariances.
 
         Raises
         ------
@@ -133,11 +134,11 @@ class StandardPlant(Partition):
         weights : StageWeights, optional
             Result of `stage_weights`, with z and w; the arguments `z` and `w` replace its entries.
         z, w : mapping {name: weight}
-            A weight is a number or a system with one input and one output, with the plant's dt or
-            continuous (then it is sampled at the plant's rate by Tustin). None removes the channel;
-            channels that are not named are unchanged. A weight of `u1:disturbance` of w adds this
-            disturbance at the actuator u1 if the actuator has no noise; a weight of `y1:signal` of
-            z adds the signal of the sensor y1 without its noise.
+            Weights by channel. A weight is a number or a system with one input and one output. A
+            continuous weight of a sampled plant is sampled at the plant's rate by Tustin. None
+            removes the channel; channels that are not named are unchanged. If the actuator u1 has
+            no noise, a weight of `u1:disturbance` in w adds this disturbance. A weight of
+            `y1:signal` in z adds the signal of the sensor y1 without its noise.
 
         Returns
         -------
@@ -155,13 +156,13 @@ class StandardPlant(Partition):
     def through(self, block: System) -> GeneralizedPlant:
         """Return the plant whose measurements are the outputs of a block that reads y.
 
-        The controller may then read errors, decoupled motions or filtered sensors; close the loop
-        with the same block before the controller.
+        The controller may then read errors, decoupled motions or filtered sensors. When you close
+        the loop, put the same block before the controller.
 
         Parameters
         ----------
         block : StateSpace
-            Its inputs are channels of y; its outputs become y.
+            Block whose inputs are channels of y. Its outputs become y.
 
         Raises
         ------
@@ -222,8 +223,8 @@ class StandardPlant(Partition):
         Parameters
         ----------
         poi : (3,) array [m] or mapping {name: place}, optional
-            A new point of the POI; a mapping when there are several POIs, or to move other ports
-            too: actuators (columns of B), disturbances, sensors.
+            New point of the POI. Give a mapping if there are several POIs, or to move actuators
+            (columns of B), disturbances or sensors too.
         **positions : float [m or rad]
             Values of the positions by name; positions not named stay.
 
@@ -268,8 +269,8 @@ class StandardPlant(Partition):
             Response from actuators to sensors of this plant, which are found by name. It may
             contain only some of them.
         hold : bool
-            False for a response that was measured from sample to sample: it has the zero-order
-            hold in it.
+            False for a response that was measured from sample to sample, so that it contains the
+            zero-order hold.
         delay : float [samples]
             Delay that the response contains, for example that of the controller which measured it.
             Loops are judged with the delay of the plant in its place.
@@ -334,25 +335,25 @@ class StandardPlant(Partition):
     ) -> UncertainPlant[StandardPlant]:
         """Return the plant with its uncertainty, of one or several kinds.
 
-        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``: each kind gives
-        Deltas with ``|delta| <= 1``, and random values for drawn machines. The order does not
-        matter.
+        An example is ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``. Each
+        kind gives Deltas with ``|delta| <= 1``, and random values for drawn machines. The order of
+        the kinds does not matter.
 
         Parameters
         ----------
         *kinds : Uncertainty, UpdateResult, ModalUncertainty or MeasuredModes
-            `Frequencies`, `Dampings`, `Shapes` of modes, `Parameters` of the model, `Gains`,
-            `Delay`, `Neglected` modes, `UnmodelledDynamics`, or the remaining uncertainty of a
-            `Fit`: a fit, its uncertainty or measured modes may be given directly. Your own kind
-            derives from `Uncertainty`.
+            Kinds of uncertainty: `Frequencies`, `Dampings` and `Shapes` of modes, `Parameters` of
+            the model, `Gains`, `Delay`, `Neglected` modes, `UnmodelledDynamics`, or the remaining
+            uncertainty of a `Fit`. In place of a `Fit` you may give a fit, its uncertainty or
+            measured modes directly. Your own kind derives from `Uncertainty`.
         frequency, damping : float, (m,) array or {mode: float}, optional
             The same as `Frequencies(frequency)` and `Dampings(damping)`.
 
         Returns
         -------
         UncertainPlant
-            `.system`, `.deltas`, `.lft(values)`, `.machines`. Functions that take a plant take it
-            too: designs and loops then report the allowed error of each mode.
+            Plant with `.system`, `.deltas`, `.lft(values)` and `.machines`. Functions that take a
+            plant accept it too. Designs and loops then report the allowed error of each mode.
 
         Raises
         ------

@@ -42,7 +42,7 @@ class StructureFrf(Frf):
     ----------
     freq, data, inputs, outputs, quantity, coherence, variance, correlation, resolution
         As for `Frf`.
-    window, overlap, freedom, units : as of `Frf`
+    window, overlap, freedom, units : as for `Frf`
     route : str
         Method by which the responses were computed.
     check_freq : (c,) array [Hz]

@@ -117,10 +117,10 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     Parameters
     ----------
     model : FEModel, ReducedModel or Modes
-        Modes and reduced models keep their own mode shapes when they are suspended. The relative
-        error of this is about the ratio of the stiffness of the springs to that of the structure,
-        so springs should be much softer than the structure. Modes that a reduced model left out are
-        stiffened and damped one by one.
+        The structure. Modes and reduced models keep their own mode shapes when they are suspended.
+        The relative error of this is about the ratio of the stiffness of the springs to that of the
+        structure, so springs should be much softer than the structure. Modes that a reduced model
+        left out are stiffened and damped one by one.
     springs : GroundSpring or sequence of GroundSpring
         Springs and dampers to ground.
 

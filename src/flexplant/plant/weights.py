@@ -158,9 +158,9 @@ def stage_weights(
     bandwidth : float [Hz]
         Frequency below which |S| shall be less than 1.
     poi : str, optional
-        POI whose errors are weighted. By default these are all axes that the actuators move
-        independently (`driven_axes`). Other axes are left out of z, because they move together with
-        these. The scale of the weights is that of the first axis.
+        POI whose errors are weighted. By default the errors of all axes that the actuators move
+        independently (`driven_axes`) are weighted. Other axes are left out of z, because they move
+        together with these. The scale of the weights is that of the first axis.
     peak : float
         Value of the bound 1/W_S on |S| at high frequencies; at the frequency `bandwidth` the bound
         is 1. If gamma is 1, this is also a bound on |T| at u.

@@ -53,7 +53,7 @@ class Neglected(Uncertainty):
         self._set(resonances=whole(self.resonances, "resonances"))
 
     def bound(self, plant: Partition) -> NeglectedModes:
-        """Return the weights that bound what the modes do."""
+        """Return the weights that bound the effect of the modes."""
         if isinstance(self.model, NeglectedModes):
             return self.model
         return neglected_modes(plant, self._whole(plant), resonances=self.resonances)

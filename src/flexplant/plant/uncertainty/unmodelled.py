@@ -47,8 +47,9 @@ class UnmodelledDynamics(Uncertainty):
         "inverse"       u or y is (I - W Delta)^-1 of what it was
         "coprime"       y = (M + W Delta_M)^-1 (N + W Delta_N) u,  G = M^-1 N normalised
 
-    The Delta is one full matrix of dynamics over all channels that are named, so that it may couple
-    them. For dynamics that are independent of each other, pass several values:
+    In the last form M and N are the normalised coprime factors of G. The Delta is one full matrix
+    of dynamics over all channels that are named, so that it may couple them. For dynamics that are
+    independent of each other, pass several values:
     ``plant.uncertain(UnmodelledDynamics(W, at="u1"), UnmodelledDynamics(W, at="u2"))``.
 
     Parameters
