@@ -80,7 +80,7 @@ checked: it must be stable, and its norm is computed by two methods.
 **tune_loops.** Each axis gets the law
 ``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)``, where F contains a low-pass and
 notches. w_b is the crossover of the loop of the rigid body alone. It is made as large as the limit
-``|1 + L| >= 1 / peak`` allows, also at and above resonances. The values of a and b, the corner of
+``|1 + L| >= 1 / peak`` allows, and may lie above resonances. The values of a and b, the corner of
 the low-pass, and the frequency, depth and width of the notches are optimised from many starting
 points. The best result is used, but it is not proven that no other law is better. w_i is w_b / 10.
 No zero lies below w_i, and no corner lies above 0.45 of the rate or above the last line.
@@ -103,10 +103,10 @@ line remain unknown, so the lines have to be closer than a mode is wide. Above t
 plant is unknown, and the loop gain may be at most 0.1 there.
 
 **stage_weights.** Let Y = G_yu T be the motions of the sensors for unit motions of the decoupled
-axes, at the real frequency sigma = 2 pi f_c. The frequency f_c is 1.6 times the bandwidth. The
-error of axis i is multiplied by d_i = rms(Y_i) / rms(Y_1). Actuator j has the size
-f0_j = (m / r)^(1/2) |(T / d)_j| for m actuators and r axes. The noise of a sensor is proportional
-to its signal for unit motions of all axes. In these units the blocks are
+axes, at the real frequency sigma = 2 pi f_c. The frequency f_c is 1.6 times the bandwidth. Axis i
+is multiplied by d_i = rms(Y_i) / rms(Y_1). Actuator j has the size f0_j = (m / r)^(1/2) |(T / d)_j|
+for m actuators and r axes. The noise of a sensor is proportional to its signal for unit motions of
+all axes. In these units the blocks are
 
 .. math:: \begin{bmatrix} W_S S & W_S P W_d \\ W_u K S & W_u K P W_d \end{bmatrix}
 

@@ -232,8 +232,8 @@ def frf(
     LabelError
         When the reference or channel is unknown, or `also` names something else.
     ModelError
-        When a mapping is not given, the responses are of different units, one has no line in the
-        band, or none has the requested coherence or variance.
+        When `responses` is not a mapping, the responses have different units, one has no line in
+        the band, or none has the requested coherence or variance.
 
     Examples
     --------

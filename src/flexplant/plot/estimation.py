@@ -299,8 +299,8 @@ def consistency(
     Raises
     ------
     ModelError
-        When the kinds are wrong, there are fewer than 200 samples with all innovations, or not
-        three axes.
+        When an argument has a wrong type, there are fewer than 200 samples with all innovations, or
+        `ax` does not hold three axes.
 
     References
     ----------

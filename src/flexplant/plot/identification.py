@@ -92,7 +92,7 @@ def identified(
     frf : Frf
         Measured frequency responses.
     modes : IdentifiedModes
-        Identified from it.
+        Modes that were identified from it.
     output, input : str
         Names of the output and the input that are drawn.
     ax : Axes, optional

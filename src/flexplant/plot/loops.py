@@ -301,7 +301,7 @@ def sensitivity(
     Raises
     ------
     ModelError
-        When one of them is something else, or the weight has several channels.
+        When a curve has another type, or the weight has several channels.
 
     Examples
     --------

@@ -54,9 +54,9 @@ def mode_shape(
 ) -> Any:
     """Draw a mode of a plate, a solid or a frame in three dimensions (paper, Figs. 5 and 6).
 
-    The surface is found from the nodes; a solid has two such surfaces. If the nodes form no
-    surface, lines are drawn between neighbouring nodes, or between those that are `joined`. The
-    colour shows the magnitude of the displacement vector. Dashed lines are the edges at rest.
+    The surface is found from the nodes; for a solid it has two sides. If the nodes form no surface,
+    lines are drawn between neighbouring nodes, or between those that are `joined`. The colour shows
+    the magnitude of the displacement vector. Dashed lines are the edges at rest.
 
     Parameters
     ----------
