@@ -8,8 +8,7 @@ forces act, by residual attachment vectors. Modes are numbered from 1.
 
 - `solve_modes(model, count=, damping=, compliance_at=)`: small and large models.
 - `Modes.at`: shapes at a label or a point.
-- `Modes.freq`, `Modes.zeta` and the field ``phi``: frequencies [Hz], damping ratios and shapes at all
-  DOFs.
+- `Modes.freq`: frequencies [Hz]. Damping ratios are ``zeta``, and shapes at all DOFs are ``phi``.
 - `Modes.calibrated`: the modes with measured frequencies and damping ratios.
 - `Modes.mesh_error`: error of each frequency of a mesh, estimated from a second mesh (`MeshError`).
 - `normal_form`: poles and shapes for any matrices M, D and K.
