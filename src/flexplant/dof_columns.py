@@ -37,8 +37,9 @@ class Interpolation(Value):
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        A joint makes DOFs follow others. These DOFs are not rows of the matrices, but their labels
-        can still be used.
+        A joint makes DOFs follow others. Such a DOF is not a row of the matrices, but its label can
+        still be used: its displacement is the product of the row and the other DOFs. The result is
+        None for each label that is not such a DOF.
         """
         return None
 

@@ -225,8 +225,9 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
 
     Here R is the number of repetitions, G^(r) is repetition r, and o and i number the outputs and
-    inputs. The noise of an output does not depend on which input is excited. The true variance is
-    therefore a product of a factor of the output and a factor of the input. The variance from a few
+    inputs. The noise of an output does not depend on which input is excited, and the FRF is the
+    output divided by the input. The true variance is therefore the product of a factor of the
+    output (its noise) and a factor of the input (the inverse of its power). The variance from a few
     repetitions is smoothed to such a product, which is ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) /
     mean(sigma^2)``. The correlation of the errors of two outputs is a mean over the inputs. The
     degrees of freedom of the variance (`freedom`) follow from R, the number of inputs, and the

@@ -49,8 +49,8 @@ def structural_modes(
       satisfy :math:`\Phi_r \Phi_r^T = A` and are combinations of the rigid-body motions of the
       geometry. The residual vectors v satisfy :math:`\sum v v^T/\omega_v^2 = G`. Their frequency
       :math:`\omega_v` lies above the band. The index c denotes the places that were both driven and
-      measured, and o the other places. The vectors are found from the entries with c. Between two
-      places o, they give :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`.
+      measured, and o the other places. The vectors are found from the entries of G with at
+      least one index c. Between two places o, they give :math:`G_{oo} = G_{oc} G_{cc}^{-1} G_{co}`.
     - Modes just outside the band. They become residual vectors with their own frequency and damping
       if they can be modes of a structure. For this, their shapes must be real, and the shapes at
       inputs and outputs must agree.
@@ -75,11 +75,11 @@ def structural_modes(
     -------
     Modes
         Modes of the structure, rigid-body modes first. The entry "imaginary" of `certificate` is
-        the size of the neglected imaginary parts. With `over`, its entry "expansion" is the
-        relative error of the measured shapes as combinations of the model's shapes. A warning is
-        given if this error is above 0.1. ``plant.uncertain(numbered(measured, modes))`` passes the
-        covariance of the poles to the plant. A further argument passes the covariance of the
-        shapes, ``Shapes(shape_deviations(measured, dofs), measured.modes)``.
+        the size of the neglected imaginary parts. With `over`, the measured shapes are fitted by
+        combinations of the model's shapes. The entry "expansion" is the relative error of this fit.
+        A warning is given if this error is above 0.1. ``plant.uncertain(numbered(measured,
+        modes))`` passes the covariance of the poles to the plant. A further argument passes the
+        covariance of the shapes, ``Shapes(shape_deviations(measured, dofs), measured.modes)``.
 
     Raises
     ------
@@ -332,11 +332,11 @@ def shape_deviations(
 ) -> FloatArray:
     r"""Return the principal standard deviations of shapes from `structural_modes`.
 
-    The identified shape and participation vector of a mode have the error n. The mode shape then
-    has the error :math:`A n`. The matrix A takes the mean at places that were both driven and
-    measured. If the modes of a model are given, A also expands the shape to all its DOFs. The noise
-    is assumed circular: real and imaginary parts have the same variance and are not correlated. The
-    real part of the error then has the covariance
+    The vector n contains the error of the identified shape of a mode, followed by the error of its
+    participation vector. The mode shape then has the error :math:`A n`. The matrix A takes the mean
+    at places that were both driven and measured. If the modes of a model are given, A also expands
+    the shape to all its DOFs. The noise is assumed circular: real and imaginary parts have the same
+    variance and are not correlated. The real part of the error then has the covariance
     :math:`C = \mathrm{Re}(A\,E[n n^H] A^H)/2 = \sum_j v_j v_j^T`. The vectors v_j are the
     eigenvectors of C, scaled by the square roots of their eigenvalues. The largest v_j are kept and
     scaled so that the sum of all variances is preserved.

@@ -189,10 +189,10 @@ class PlacedShape(Interpolation):
         return np.asarray((self.C @ np.asarray(found).T).T)
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None.
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        After a rotation of the component, the DOF combines several directions of its node. The
-        motions of the node in all these directions must be known.
+        After a rotation of the component, the DOF combines several directions of its node. If the
+        component lacks one of these directions, the result is None.
         """
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
@@ -279,7 +279,7 @@ class JoinedShape(Interpolation):
         return rows[0]
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None."""
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
         for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
             rest = label.removeprefix(f"{name}/")
             if rest == label:

@@ -48,7 +48,8 @@ class Joint(Value):
         rotation of the end adds to the displacement of the point. None: the point is the first end.
         An end that is given as a DOF has no lever arm. At a node without rotations, the rotation
         follows from the displacements of neighbouring nodes. This is allowed for lever arms of up
-        to 1e-4 of the machine's size. Such short arms occur when coordinates have few digits.
+        to 1e-4 of the machine's size. Such short arms occur when the
+        coordinates are rounded, so that two ends at one place do not coincide exactly.
 
     Examples
     --------
@@ -228,7 +229,7 @@ class Patch(Value):
         return f"<Patch of {self.component}, {where}>"
 
     def rows(self, dofs: DofSet) -> IntArray:
-        """Return the positions (m,) of the nodes' displacements among the component's DOFs."""
+        """Return the indices (m,) of the nodes' displacements among the component's DOFs."""
         inner = [name for name in dofs.components if self.component.endswith(f"/{name}")]
         if self.nodes is not None and dofs.components and not inner:
             raise LabelError(

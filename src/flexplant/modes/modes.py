@@ -249,8 +249,9 @@ class Modes(Placed, Value):
         Damping ratios: the diagonal of ``2 Z Omega``, divided by ``2 |omega|``.
     phi : (n, k) array [1/sqrt(kg)]
         Mode shapes. They are complex where the damping is not proportional. They are then scaled
-        so that ``phi^T (2 lambda M + D) phi = 2i Im(lambda)`` with the pole lambda. The two real
-        poles of an unstable mode have the shapes ``Re phi +- Im phi``, scaled as in `NormalForm`.
+        so that ``phi^T (2 lambda M + D) phi = 2i Im(lambda)`` with the pole lambda. An unstable
+        mode has two real poles. The shape of the growing pole is ``Re phi + Im phi`` and that of
+        the decaying pole is ``Re phi - Im phi``, both scaled as in `NormalForm`.
     dofs : DofSet
         DOFs of the n rows.
     n_rigid : int
@@ -546,9 +547,9 @@ class Modes(Placed, Value):
     def orthonormal_basis(self) -> FloatArray:
         """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
-        For complex modes, B is found without M: ``B B'`` is the initial acceleration under a unit
-        force, a sum over the modes. Elastic modes add ``Re(phi phi' lambda / (i Im lambda))``,
-        rigid ones ``phi phi'``, unstable ones ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
+        For complex modes, ``B B'`` is found without M as a sum over the modes. An elastic mode adds
+        ``Re(phi phi' lambda / (i Im lambda))`` to it and a rigid-body mode ``phi phi'``. An unstable
+        mode with poles s1, s2 and shapes v1, v2 adds ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
@@ -568,7 +569,7 @@ class Modes(Placed, Value):
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return loads (n, r) that have the same modal forces as ``M motions``.
+        """Return loads (n, r) with the same modal forces as the product ``M @ motions``.
 
         The motions (n, r) must be combinations of the shapes.
         """

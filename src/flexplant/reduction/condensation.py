@@ -514,7 +514,8 @@ class MacNeal(_FreeInterface):
     In contrast to `Rubin`, the truncated modes contribute only their static response. The boundary
     coordinates have no mass: their rows of the reduced mass matrix are zero. The poles are only
     those of the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model
-    has a feedthrough. The boundary gets mass when the model is joined to others or updated.
+    has a feedthrough. The boundary gets mass when the model is joined to others, or when `update`
+    adds a mass there.
 
     Parameters
     ----------

@@ -219,7 +219,8 @@ class DofSelection(Value):
     labels : tuple of str
         The DOFs, required ones first.
     condition : float
-        Condition number of the rows of modes and vectors at these DOFs (phi_kk).
+        Condition number of phi_kk. These are the rows, at these DOFs, of the mode shapes and of the
+        attachment vectors if the basis has any.
     values : (count,) array, optional
         Value of the criterion for each DOF, in the order of the labels.
     criterion : SelectionCriterion

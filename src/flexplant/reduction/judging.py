@@ -366,9 +366,10 @@ class ReductionQuality(Value):
         channel. Rows are outputs, and columns are inputs.
     silent : (p, q) array of bool
         True for channels whose response in the full model is only rounding, below 1e-9 of a
-        reference. The reference is the geometric mean of two largest responses: at the input to a
-        force at the input, and at the output to a force at the output. The errors of such a channel
-        are relative to the reference. These channels are left out when the worst one is printed.
+        reference. The reference is the geometric mean of two responses: the largest response at the
+        input to a force at the same place, and the largest response at the output to a force at
+        that place. The errors of such a channel are relative to the reference. These channels are
+        left out when the worst one is printed.
     resonance_error : (p, q) array
         Largest error at a resonance of either model, relative to the largest response of any
         channel of both models at this frequency. NaN without a resonance in the band, and for
@@ -379,8 +380,8 @@ class ReductionQuality(Value):
         antiresonance. For silent channels it is relative to the reference of `silent`.
     static_error : (p, q) array
         Error of the elastic static compliance G_ij from input j to output i, relative to
-        ``sqrt(G_ii G_jj)``. If this root is only rounding, the error is relative to the responses
-        of both places at the upper end of the band.
+        ``sqrt(G_ii G_jj)``. If this root is only rounding, G_ii and G_jj are taken at the upper
+        end of the band instead of 0 Hz.
     true_error : float [m/N]
         Largest singular value of the error of the response, over the check frequencies.
     orthogonality : float

@@ -210,7 +210,7 @@ class HeldShape(Interpolation):
         return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return weights (n,) and coordinates (3,) of a DOF that others determine, or None."""
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
         found = self.free.dependent(label)
         return None if found is None else (found[0][self.rows_left], found[1])
 

@@ -90,7 +90,7 @@ class PlateShape(GridShape):
 
     Examples
     --------
-    In a translation in z, the weights of the deflections add up to one:
+    The weights of the deflections add up to one, so that a translation in z is exact:
 
     >>> import flexplant as fx
     >>> shape = fx.structure.PlateShape((1.0, 1.0), 0.01, (2, 2))

@@ -148,7 +148,7 @@ class ThickPlateShape(PlateShape):
 
     Examples
     --------
-    In a translation in z, the weights of the deflections add up to one:
+    The weights of the deflections add up to one, so that a translation in z is exact:
 
     >>> import flexplant as fx
     >>> shape = fx.structure.ThickPlateShape((1.0, 1.0), 0.1, (2, 2), softness=3e-3)

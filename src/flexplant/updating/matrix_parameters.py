@@ -62,7 +62,7 @@ class _GivenParameter(Parameter):
         return part if isinstance(part, tuple) else () if part is None else (part,)
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices of all powers in the DOFs of the model."""
+        """Return the matrices that p, p^2 and so on multiply, in the DOFs of the model."""
         project = partial(_projected_matrix, model=model, name=self.name)
         powers = zip_longest(*(self._powers(label) for label in PARTS))
         return [(project(M), project(D), project(K)) for M, D, K in powers]
@@ -464,7 +464,10 @@ class PolynomialParameter(_GivenParameter):
         return np.asarray(value**k), np.asarray(k * value ** (k - 1))
 
     def about(self, value: float) -> PolynomialParameter:
-        """Return the parameter as a change from a value that the model already includes."""
+        """Return the parameter of a model that already has this value of it.
+
+        The value of the new parameter counts from there: it is zero for the model as it is.
+        """
         moved: dict[str, Any] = {}
         for label in PARTS:
             parts = self._powers(label)

@@ -54,7 +54,7 @@ class Parameter(Value):
         return [self.matrices(model)]
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
-        """Return the factors g_j of the terms at a value of p, and their derivatives."""
+        """Return the factors g_j(p) of the matrices of `terms`, and their derivatives by p."""
         return np.array([value]), np.ones(1)
 
     def change(self, model: FEModel | ReducedModel, value: float) -> Derivatives:
@@ -67,7 +67,10 @@ class Parameter(Value):
         return total[0], total[1], total[2]
 
     def about(self, value: float) -> Parameter:
-        """Return the parameter as a change from a value that the model already includes."""
+        """Return the parameter of a model that already has this value of it.
+
+        The value of the new parameter counts from there: it is zero for the model as it is.
+        """
         return self
 
     def _check_known(self) -> None:

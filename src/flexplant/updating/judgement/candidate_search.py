@@ -245,8 +245,9 @@ class Localisation(Value):
         BIC of `next_best`. It is infinite if no other set was fitted.
     alike_sets : sequence of tuples of str
         Sets of the same size as the chosen one that explain the data equally well, the best first.
-        Their BIC is at most 2 above the least one. On a symmetric structure these are all
-        combinations of mirror images that the data do not distinguish.
+        Their BIC is at most 2 above the least one. On a symmetric structure the data may
+        not distinguish a place from its mirror image. Then all sets are listed in which places are
+        replaced by their mirror images.
     """
 
     candidates: tuple[str, ...]

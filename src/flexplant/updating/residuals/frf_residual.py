@@ -139,7 +139,7 @@ class FrfResidual(Residual):
         return self.replace(lines=lines)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return _BoundFrf(self, family)
 
 

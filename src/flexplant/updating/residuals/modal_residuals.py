@@ -97,7 +97,7 @@ class Eigenvalues(_ModalResidual):
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When weights are not positive, one for each pole, or the poles have no mode numbers.
+        When the weights are not one positive number for each pole, or the poles have no numbers.
 
     References
     ----------
@@ -147,7 +147,7 @@ class Eigenvalues(_ModalResidual):
         return self.replace(measured=chosen, weights=weights)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return BoundEigenvalues(self)
 
 
@@ -319,7 +319,7 @@ class ModeShapes(_ModalResidual):
         return self.replace(measured=chosen, shapes=shapes, std=std, covariance=covariance)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return BoundShapes(self, family)
 
 
@@ -516,7 +516,7 @@ class ShapeCorrelation(ModeShapes):
     """
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return _BoundMac(self, family)
 
 

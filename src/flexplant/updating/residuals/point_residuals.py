@@ -114,7 +114,7 @@ class Antiresonances(_PointResidual):
         return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return _BoundZeros(self, family)
 
 
@@ -236,7 +236,7 @@ class StaticCompliance(_PointResidual):
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
         return _BoundStatic(self, family)
 
 

@@ -31,7 +31,7 @@ class Residual(Value):
 
     @property
     def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions between which the residual compares responses, empty for modes."""
+        """Places and directions of the compared responses. Empty if modes are compared."""
         return ()
 
     @property
@@ -42,7 +42,7 @@ class Residual(Value):
 
     @abstractmethod
     def bound(self, family: Family) -> Bound:
-        """Return the residual for one family of models, as a `Bound`."""
+        """Return the residual as `update` uses it, for one model with its parameters."""
 
 
 class Kind(NamedTuple):
