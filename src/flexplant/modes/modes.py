@@ -548,8 +548,8 @@ class Modes(Placed, Value):
         """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
         For complex modes, ``B B'`` is found without M as a sum over the modes. An elastic mode adds
-        ``Re(phi phi' lambda / (i Im lambda))`` to it and a rigid-body mode ``phi phi'``. An unstable
-        mode with poles s1, s2 and shapes v1, v2 adds ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
+        ``Re(phi phi' lambda / (i Im lambda))`` to it, and a rigid-body mode ``phi phi'``. Unstable
+        poles s1, s2 with shapes v1, v2 add ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
