@@ -54,7 +54,8 @@ class Machines(Value):
     - The deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
       from their posterior distribution (`Trend`).
     - The trend is ``t = sign(b) log(1 + 2 |b| g) / 2``, where g is the frequency of a mode divided
-      by the largest measured frequency. A fraction r of the trend changes the mass, and the rest
+      by the largest measured frequency. In matrix equations t is the diagonal matrix of these
+      values. A fraction r of the trend changes the mass, and the rest
       changes the stiffness. The fraction is uniformly distributed between 0 and 1.
     - The matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
       ``K' = Omega exp(E) Omega + sum dp dK``. The matrix E is symmetric. Its diagonal elements are
@@ -114,7 +115,7 @@ class Machines(Value):
 
     @cached_property
     def damping_changes(self) -> FloatArray:
-        """Logarithms ``ln(zeta_measured / zeta_model)`` of the damped modes."""
+        """Values of ``ln(zeta_measured / zeta_model)`` of the measured modes with damping."""
         poles = self.measured.poles
         found = -poles.real / np.abs(poles)
         return np.log(found[found > TYPED] / self._own_damping[found > TYPED])
@@ -127,7 +128,7 @@ class Machines(Value):
         return np.where(zeta > TYPED, zeta, 1.0)
 
     def draw(self, rng: np.random.Generator) -> Draw:
-        """Return one machine that agrees with the measurement, without negative masses."""
+        """Return a random draw of one machine. Draws with a negative added mass are repeated."""
         for _ in range(REFUSED):
             s, moved, b = self.trend.posterior(rng)
             dp = np.zeros(self.fit.values.size)
@@ -163,7 +164,7 @@ class Machines(Value):
         return np.minimum(found.real, 0.0) + 1j * found.imag
 
     def located(self) -> list[Parameter]:
-        """Return the parameters with points in place of labels, so that they fit other meshes."""
+        """Return the parameters with points in place of DOF labels, for use with other meshes."""
         model = self.fit.model
         dofs = getattr(model, "full_dofs", None) or model.dofs
         return [_located(q, dofs) for q in self.fit.unknowns]

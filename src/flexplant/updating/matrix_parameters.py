@@ -62,13 +62,16 @@ class _GivenParameter(Parameter):
         return part if isinstance(part, tuple) else () if part is None else (part,)
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices that p, p^2 and so on multiply, in the DOFs of the model."""
+        """Return (dM, dD, dK) of each power of p, converted to the DOFs of the model.
+
+        A `MatrixParameter` has only the first power. None stands for a zero matrix.
+        """
         project = partial(_projected_matrix, model=model, name=self.name)
         powers = zip_longest(*(self._powers(label) for label in PARTS))
         return [(project(M), project(D), project(K)) for M, D, K in powers]
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return the derivatives (dM, dD, dK) at p = 0; see `terms`."""
+        """Return the derivatives (dM, dD, dK) with respect to p at p = 0, None where zero."""
         return self.terms(model)[0]
 
 
@@ -237,6 +240,9 @@ class MatrixParameter(_GivenParameter):
 class ModeDamping(Parameter):
     """A change of the damping ratio of one mode: ``D + p 2 omega (M phi)(M phi)^T``.
 
+    The parameter p is the change of the ratio. The mode has the frequency omega and the
+    mass-normalised shape phi.
+
     Parameters
     ----------
     mode : int
@@ -272,7 +278,10 @@ class ModeDamping(Parameter):
         return f"<ModeDamping: {self.name}>"
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (None, dD, None), or raise a LabelError if the model does not have the mode."""
+        """Return the derivatives (dM, dD, dK) with respect to p, of which only dD is not None.
+
+        A LabelError is raised if the model does not have the mode.
+        """
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         k, r = rigid.shape
         if not r < self.mode <= k:
@@ -459,14 +468,14 @@ class PolynomialParameter(_GivenParameter):
         return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
-        """Return the powers of a value of p, and their derivatives."""
+        """Return the powers p, p^2, ... at a value of p, and their derivatives 1, 2 p, ..."""
         k = np.arange(1, max(len(self._powers(label)) for label in PARTS) + 1, dtype=np.float64)
         return np.asarray(value**k), np.asarray(k * value ** (k - 1))
 
     def about(self, value: float) -> PolynomialParameter:
-        """Return the parameter of a model that already has this value of it.
+        """Return the same parameter for a model whose matrices already include a value of it.
 
-        The value of the new parameter counts from there: it is zero for the model as it is.
+        The new parameter is the change from this value. It is zero if the matrices stay the same.
         """
         moved: dict[str, Any] = {}
         for label in PARTS:

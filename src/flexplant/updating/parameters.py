@@ -27,9 +27,9 @@ Derivatives: TypeAlias = tuple[Matrix | None, Matrix | None, Matrix | None]
 class Parameter(Value):
     """One unknown p on which the mass, damping and stiffness matrices M, D and K depend.
 
-    The dependence is affine (M(p) = M + p dM) unless stated otherwise. A subclass has a unique
-    `name`, a `unit` and its `matrices`. Prior knowledge of p may be given by `bounds` (lowest,
-    highest) and by a `prior` (mean, standard deviation).
+    The matrices depend on p linearly, ``M(p) = M + p dM``, unless stated otherwise. A subclass has
+    a unique `name`, a `unit` and its `matrices`. Prior knowledge of p may be given by `bounds`
+    (lowest, highest) and by a `prior` (mean, standard deviation).
 
     Examples
     --------
@@ -47,18 +47,29 @@ class Parameter(Value):
 
     @abstractmethod
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero."""
+        """Return the derivatives (dM, dD, dK) of the model's matrices with respect to p.
+
+        None stands for a derivative that is zero.
+        """
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and those for D and K."""
+        """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and those for D and K.
+
+        The functions g_j are those of `curve`. If the matrices depend on p linearly, there is only
+        one term, with g_1 = p.
+        """
         return [self.matrices(model)]
 
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
-        """Return the factors g_j(p) of the matrices of `terms`, and their derivatives by p."""
+        """Return the functions g_j of ``M(p) = M + sum_j g_j(p) M_j``, and their derivatives.
+
+        They are evaluated at the given value of p. The matrices M_j are those of `terms`. If the
+        matrices depend on p linearly, the only function is g_1 = p, with the derivative 1.
+        """
         return np.array([value]), np.ones(1)
 
     def change(self, model: FEModel | ReducedModel, value: float) -> Derivatives:
-        """Return the matrices that the parameter adds to M, D and K for a given value."""
+        """Return the changes of M, D and K for a value of the parameter, None where zero."""
         total: list[Any] = [None, None, None]
         for size, parts in zip(self.curve(value)[0].tolist(), self.terms(model), strict=True):
             for i, part in enumerate(parts):
@@ -67,9 +78,9 @@ class Parameter(Value):
         return total[0], total[1], total[2]
 
     def about(self, value: float) -> Parameter:
-        """Return the parameter of a model that already has this value of it.
+        """Return the same parameter for a model whose matrices already include a value of it.
 
-        The value of the new parameter counts from there: it is zero for the model as it is.
+        The new parameter is the change from this value. It is zero if the matrices stay the same.
         """
         return self
 
@@ -122,13 +133,17 @@ class PointParameter(Parameter):
 
     @property
     def unit(self) -> str:  # type: ignore[override]
-        """Return the unit: of a rotation where all motions of the place are rotations."""
+        """Unit of the parameter. It is the unit for rotations if the place is a rotation."""
         labels = [self.at] if isinstance(self.at, str) else self.at
         along = labels if isinstance(labels, Mapping | list) else [f":{self.direction}"]
         return self.units[all(str(label).split(":")[-1].startswith("r") for label in along)]
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (dM, dD, dK) of the model: r r^T in one of them, sparse where M is."""
+        """Return the derivatives (dM, dD, dK) of the model's matrices with respect to p.
+
+        One of them is ``r r^T``, as a sparse matrix if the model is sparse. The others are None.
+        With several directions, it is the sum of ``r r^T`` over the directions.
+        """
         found = np.array(self.rows(model)).T
         if not np.any(found):
             raise ModelError(
@@ -140,7 +155,11 @@ class PointParameter(Parameter):
         return parts[0], parts[1], parts[2]
 
     def rows(self, model: FEModel | ReducedModel) -> list[FloatArray]:
-        """Return r of each motion along which it acts; of several, those that the model has."""
+        """Return the vectors r (n,) of the place on the DOFs of the model, one for each direction.
+
+        There is one direction, except with "xyz". Directions that the model does not have are left
+        out of "xyz".
+        """
         of = model if hasattr(model, "row") else model.dofs
         along: tuple[str, ...] = (self.direction,)
         if self.direction in self.together:
@@ -170,8 +189,8 @@ class AddedMass(PointParameter):
     name : str, optional
         Name of the parameter in results. None: the name is made from the place.
     to : str, (3,) array [m] or mapping, optional
-        Place of the other end, for a parameter that acts between two places. By default the other
-        end is the ground.
+        Second place, for an inertia against the relative motion of two places. The vector r is
+        then that of `at` minus that of `to`. None: the inertia acts against the absolute motion.
     bounds : (lowest, highest), optional
         Limits of the parameter. None or infinity: there is no limit.
     prior : (mean, standard deviation), optional
@@ -196,10 +215,17 @@ class AddedMass(PointParameter):
 class AddedDamping(PointParameter):
     """A viscous damper [N s/m] from a place to the ground or to another place: D + p r r^T.
 
+    The vector r contains the interpolation weights of the place on the DOFs of the model. Between
+    two places it is the difference of their vectors. On rotations the unit is [N m s/rad].
+
     Parameters
     ----------
-    at, direction, name, to, bounds, prior
+    at, direction, name
         As for `AddedMass`. With ``at={a: 1, b: -1}``, the damper acts between the DOFs a and b.
+    to : str, (3,) array [m] or mapping, optional
+        Place of the other end of the damper. None: the ground.
+    bounds, prior
+        As for `AddedMass`.
 
     Examples
     --------
@@ -217,14 +243,21 @@ class AddedDamping(PointParameter):
 class AddedStiffness(PointParameter):
     """A spring [N/m] from a place to the ground or to another place: K + p r r^T.
 
+    The vector r contains the interpolation weights of the place on the DOFs of the model. Between
+    two places it is the difference of their vectors. On rotations the unit is [N m/rad].
+
     On a free structure, a spring to the ground turns the rigid-body modes that move it into
     suspension modes with a frequency proportional to sqrt(p). The derivative of sqrt(p) is infinite
     at zero. These modes can therefore only be fitted from a start value that is not zero.
 
     Parameters
     ----------
-    at, direction, name, to, bounds, prior
+    at, direction, name
         As for `AddedMass`. With ``at={a: 1, b: -1}``, the spring acts between the DOFs a and b.
+    to : str, (3,) array [m] or mapping, optional
+        Place of the other end of the spring. None: the ground.
+    bounds, prior
+        As for `AddedMass`.
 
     Examples
     --------

@@ -81,9 +81,10 @@ def eigenvalue_sensitivities(
     By equation (11) of the paper, the derivative is
     ``d lambda/d p = - y^H (lambda^2 dM + lambda dD + dK) x / (y^H (2 lambda M + D) x)``. Here x and
     y are right and left eigenvectors of ``lambda^2 M + lambda D + K``. When a parameter changes,
-    exactly repeated modes may split into different frequencies. Their eigenvectors are first
-    replaced by the combinations that these split modes have. The modes are sorted by the
-    frequencies that they have when the parameter increases.
+    exactly repeated modes may split into modes of different frequencies. The eigenvectors of
+    repeated modes are not unique. The derivatives use those to which the eigenvectors of the split
+    modes tend when the parameter tends to its given value. The modes are sorted by the frequencies
+    that they have when the parameter increases.
 
     Parameters
     ----------

@@ -49,13 +49,15 @@ class Trend(Value):
     S : (m, q) array [1/unit]
         Derivatives of the logarithms of the model's frequencies with respect to q parameters.
     moves : sequence of int
-        Positions of the q parameters that change frequencies among all parameters of the fit.
+        Indices of the q parameters that change frequencies, in the list of all parameters of the
+        fit. They count from 0.
     shaped : bool
         Whether the modes were numbered by measured shapes.
     unmeasured : sequence of int
-        Numbers of the model's modes below `highest` that were not measured.
+        Numbers of the model's modes below `highest` that were not measured. Empty if an FEModel
+        was updated.
     unmeasured_freq : array [Hz]
-        Frequencies of the model's modes that were not measured.
+        Frequencies of the modes in `unmeasured`.
     noise : (m,) array
         Relative standard deviations of the measured frequencies caused by noise. Empty: not known.
 
@@ -221,7 +223,7 @@ class Trend(Value):
 
     @property
     def text(self) -> str:
-        """Slope in words."""
+        """Text with the slope, its standard deviation and the highest measured frequency."""
         return (
             f"{100 * self.slope:+.2g} +- {100 * self.slope_deviation:.1g} % at "
             f"{self.highest:.4g} Hz"

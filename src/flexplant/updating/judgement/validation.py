@@ -410,7 +410,7 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     Raises
     ------
     ModelError
-        When the residual has no parts, or one side would be empty.
+        When the residual has neither modes nor lines, or one of the two results would be empty.
 
     Examples
     --------

@@ -44,10 +44,11 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]. `measured.quantity` is displacement, velocity
         or acceleration. None: displacement.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        Variance ``E|noise|^2`` of each entry. None: the variance of the Frf. If that was estimated
-        with nu degrees of freedom (`freedom`), it is multiplied by ``nu / (nu - 1)``. The
-        correlation of neighbouring lines follows from the window of the Frf. If no variance is
-        known, each entry is divided by the rms of its channel pair.
+        Variance ``E|noise|^2`` of each entry. None: the variance of `measured`. If
+        `measured.freedom` gives the number nu of degrees of freedom with which this variance was
+        estimated, the variance is multiplied by ``nu / (nu - 1)``. The correlation of neighbouring
+        lines follows from the window of the Frf. If no variance is known, each entry is divided by
+        the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: the lines at which the median of ``|H|^2 / variance`` over the
         channels is above 9. Without a variance, these are all lines. The line 0 Hz is not used.
@@ -128,7 +129,7 @@ class FrfResidual(Residual):
 
     @property
     def top(self) -> float:
-        """The highest frequency [rad/s] of the lines, or of the hold if there is one."""
+        """Highest frequency [rad/s] of the lines. With a hold, it is the rate of the hold."""
         highest = float(np.max(self.measured.freq[self.lines]))
         return 2 * np.pi * max(highest, self.hold or 0.0)
 

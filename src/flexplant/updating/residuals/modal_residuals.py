@@ -79,7 +79,8 @@ class _ModalResidual(Residual):
 class Eigenvalues(_ModalResidual):
     """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
 
-    The error is ``e = d lambda^H W d lambda`` with the residuals d lambda. W is a real, positive
+    Here lambda_exp are the measured poles, and lambda_num are those of the model. The error is
+    ``e = d lambda^H W d lambda`` with the vector d lambda of the residuals. W is a real, positive
     and diagonal matrix of weights (equations (10) and (12) of the paper).
 
     Parameters
@@ -369,7 +370,7 @@ class BoundShapes(Bound):
         return f"the shape of mode {self.numbers[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
-        """Return the point with modes relabelled by the measured shapes."""
+        """Return the point with its modes paired with the measured ones by their shapes."""
         if not self.assign:
             return point
         eigen = point.eigen

@@ -49,11 +49,12 @@ class _PointResidual(Residual):
 class Antiresonances(_PointResidual):
     """Residuals of complex transmission zeros of one response, ``z_exp - z``.
 
-    The zeros z of the response ``c P(s)^-1 b`` with ``P(s) = s^2 M + s D + K`` are the eigenvalues
-    of ``[P(s) b; c 0]``. Their derivatives with respect to a parameter p are
-    ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``. Here P_p is the derivative of P, and x and y are
-    right and left eigenvectors. Each measured zero is paired with a different zero of the model,
-    the nearest if possible.
+    The response is ``c P(s)^-1 b`` with ``P(s) = s^2 M + s D + K``. The row c gives the motion at
+    the output, and the column b is a unit force at the input. The zeros z of the response are the
+    values of s at which ``[P(s) b; c 0]`` is singular. Their derivatives with respect to a
+    parameter p are ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``. Here P_p is the derivative of P,
+    and x and y are right and left eigenvectors. Each measured zero is paired with a different zero
+    of the model, the nearest if possible.
 
     Parameters
     ----------
@@ -68,8 +69,9 @@ class Antiresonances(_PointResidual):
         Standard deviation of each zero, with ``E|noise|^2 = std^2``. None: not known.
     hold : float, optional [Hz]
         Rate of the zero-order hold of a sampled measurement. The zeros are then those of the
-        sampled response, converted by ``ln(z) hold`` from the unit disk. They differ from the zeros
-        of the continuous response. A delay of whole samples does not change them.
+        sampled response. A zero z_d in the z-plane is given as ``hold ln(z_d)``. The zeros differ
+        from those of the continuous response. A delay of whole samples does not change them.
+        None: the zeros are those of the continuous response.
 
     Examples
     --------
@@ -110,7 +112,7 @@ class Antiresonances(_PointResidual):
 
     @property
     def top(self) -> float:
-        """The highest frequency [rad/s] of the zeros, or of the hold if there is one."""
+        """Highest frequency [rad/s] of the zeros. With a hold, it is the rate of the hold."""
         return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
 
     def bound(self, family: Family) -> Bound:

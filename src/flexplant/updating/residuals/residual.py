@@ -36,7 +36,7 @@ class Residual(Value):
 
     @property
     def top(self) -> float:
-        """The highest frequency [rad/s] of the measurement."""
+        """Highest frequency [rad/s] of the measurement."""
         measured: Any = getattr(self, "measured", None)
         return float(np.max(np.abs(getattr(measured, "poles", [0.0]))))
 
@@ -59,8 +59,9 @@ class Bound(ABC):
     """A residual for one family of models: its values, and their exact gradients.
 
     A family is a model with its possible values of the parameters. This is the base class of the
-    objects that `Residual.bound` returns. If the noise of the measurement is known, the values are
-    scaled to unit covariance (whitened).
+    objects that `Residual.bound` returns. The argument "point" is a model of the family, with
+    its modes, at given values of the parameters. A row is one real number of the residual. If the
+    noise of the measurement is known, the rows are scaled to unit covariance (whitened).
     """
 
     #: numbers of the modes that it follows
@@ -80,30 +81,34 @@ class Bound(ABC):
 
     @property
     def has_noise(self) -> bool:
-        """Whether the covariance of the rows is known."""
+        """Whether the covariance of the measurement noise is known."""
         return self.noisy or self.noise is not None
 
     @abstractmethod
     def values(self, point: Point) -> FloatArray:
-        """Return the whitened residuals (m,) as real numbers, for given parameter values."""
+        """Return the m rows of the residual at a point, whitened if the noise is known."""
 
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
-        """Return the derivatives (m, q) of `values` with respect to the parameters."""
+        """Return the derivatives (m, q) of `values` with respect to the q parameters."""
 
     def kinds(self) -> list[Kind]:
-        """Return the kinds of model errors that affect the rows.
+        """Return the kinds of model error that are assumed when noise does not explain the rows.
 
-        By default each row has one independent error, relative to its measured value.
+        By default there is one kind: each row has an independent error that is proportional to its
+        measured value.
         """
         return [Kind(self.kind, np.diag(np.atleast_1d(self.size)), self.usual)]
 
     def row_name(self, row: int) -> str:
-        """Return what is measured in a row, for messages."""
+        """Return the name of what was measured in a row, for messages."""
         return self.name
 
     def assigned(self, point: Point) -> Point:
-        """Return the point with its modes paired with the measured ones, if shapes allow it."""
+        """Return the point with its modes paired with the measured ones by their shapes.
+
+        A residual without shapes returns the point unchanged.
+        """
         return point
 
 

@@ -76,7 +76,7 @@ class TrustRegion(UpdateMethod):
 
     @property
     def least_squares(self) -> bool:
-        """Whether the loss is that of least squares."""
+        """Whether the sum of squares is minimised, which is the loss "linear"."""
         return self.loss == "linear"
 
     def search(
@@ -87,7 +87,7 @@ class TrustRegion(UpdateMethod):
         most: int | None = None,
         tolerance: float = 1e-10,
     ) -> SearchEnd:
-        """Return where the search from `start` ends; see `UpdateMethod.search`."""
+        """Return the end of a search from start values; see `UpdateMethod.search`."""
         most = whole(most or self.steps, "most")  # the step counter raises it
         return self._fitted(objective, start, objective.lower, objective.upper, most, tolerance)
 
@@ -251,7 +251,7 @@ class GaussNewton(UpdateMethod):
 
     @property
     def penalised(self) -> bool:
-        """Whether the result stays at the start in some directions, which are left out."""
+        """Whether singular values are left out, so that the result depends on the start."""
         return self.truncate > 0
 
     def search(
@@ -262,7 +262,7 @@ class GaussNewton(UpdateMethod):
         most: int | None = None,
         tolerance: float = 1e-10,
     ) -> SearchEnd:
-        """Return where Gauss-Newton steps from `start` end; see `UpdateMethod.search`."""
+        """Return the end of a search by Gauss-Newton steps; see `UpdateMethod.search`."""
         trail = Trail()
         p, point = start, objective.begin(start)
         r, size = objective.values(point), objective.size(point)
@@ -391,7 +391,7 @@ class Auto(UpdateMethod):
         most: int | None = None,
         tolerance: float = 1e-10,
     ) -> SearchEnd:
-        """Return where the search from `start` ends; see `UpdateMethod.search`."""
+        """Return the end of a search from start values; see `UpdateMethod.search`."""
         path, way, trouble = list(objective.path), [start], None
         before: Trail | None = None
         try:

@@ -294,7 +294,7 @@ class SearchEnd:
 
 
 class UpdateMethod(Value):
-    """The base class of methods that minimise the residuals.
+    """The base class of methods that minimise the sum of squares of the residuals.
 
     A new method is a subclass that defines `search`.
 
@@ -316,12 +316,12 @@ class UpdateMethod(Value):
 
     @property
     def least_squares(self) -> bool:
-        """Whether the result is that of least squares: no penalty, no robust loss, all data."""
+        """Whether the result is the exact minimum of the sum of squares of all residuals."""
         return not self.penalised
 
     @property
     def penalised(self) -> bool:
-        """Whether the result depends on the start, so that its covariance is not known."""
+        """Whether the result depends on the start values, so that its covariance is not known."""
         return False
 
     @abstractmethod
@@ -333,12 +333,15 @@ class UpdateMethod(Value):
         most: int | None = None,
         tolerance: float = 1e-10,
     ) -> SearchEnd:
-        """Return where the search from `start` ends.
+        """Return the end of a search that starts from given values of the parameters.
+
+        The result contains the parameters at the end and half the sum of squares there. It also
+        contains all steps, whether the search converged, and the reason why it ended.
 
         Parameters
         ----------
         objective : Objective
-            Objective to minimise.
+            Half the sum of squares of the whitened residuals, as a function of the parameters.
         start : (q,) array
             Start values of the parameters.
         most : int, optional
