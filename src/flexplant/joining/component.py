@@ -189,10 +189,13 @@ class PlacedShape(Interpolation):
         return np.asarray((self.C @ np.asarray(found).T).T)
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
+        """Return the weights (n,) and the coordinates (3,) [m] of a DOF that joints removed.
 
-        After a rotation of the component, the DOF combines several directions of its node. If the
-        component lacks one of these directions, the result is None.
+        A component has such DOFs if it is itself a joined machine. The weights give the
+        displacement of the DOF from those of the n DOFs that remain. The result is None if the
+        label is not that of a removed DOF. After a rotation of the component, the DOF combines
+        several directions of its node. If the component lacks one of these directions, the result
+        is None.
         """
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
@@ -279,7 +282,11 @@ class JoinedShape(Interpolation):
         return rows[0]
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        """Return the weights (n,) and the coordinates (3,) [m] of a DOF that joints removed.
+
+        The weights give its displacement from those of the n DOFs of the machine. The result is
+        None if no component has a DOF with this label.
+        """
         for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
             rest = label.removeprefix(f"{name}/")
             if rest == label:

@@ -48,8 +48,8 @@ class Joint(Value):
         rotation of the end adds to the displacement of the point. None: the point is the first end.
         An end that is given as a DOF has no lever arm. At a node without rotations, the rotation
         follows from the displacements of neighbouring nodes. This is allowed for lever arms of up
-        to 1e-4 of the machine's size. Such short arms occur when the
-        coordinates are rounded, so that two ends at one place do not coincide exactly.
+        to 1e-4 of the machine's size. Such short arms occur when the coordinates are rounded, so
+        that two ends at one place do not coincide exactly.
 
     Examples
     --------
@@ -173,14 +173,16 @@ class Patch(Value):
         Name of the component that has the nodes. If this component belongs to a machine that was
         itself joined, both names are given, such as "machine/stage".
     nodes : sequence of int, optional
-        Node numbers. None: all nodes of the component in the box.
+        Node numbers. Either `nodes` or `box` must be given.
     box : (2, 3) array [m], optional
-        Lowest and highest corner of a box, in the coordinates of the machine.
+        Lowest and highest corner of a box, in the coordinates of the machine. The patch has all
+        nodes of the component in this box.
     at : (3,) array [m], optional
         Point about which the patch rotates, in the coordinates of the machine. None: the mean of
         the positions of the nodes.
     weights : (m,) array, optional
-        Weights of the nodes in the order of `nodes`, for example their areas. None: equal weights.
+        Weights of the nodes in the order of `nodes`, for example their areas. None: equal weights,
+        as always with a box.
 
     Examples
     --------
@@ -229,7 +231,10 @@ class Patch(Value):
         return f"<Patch of {self.component}, {where}>"
 
     def rows(self, dofs: DofSet) -> IntArray:
-        """Return the indices (m,) of the nodes' displacements among the component's DOFs."""
+        """Return the indices (m,) of the displacements of the patch in the list `dofs`.
+
+        `dofs` are the DOFs of the component.
+        """
         inner = [name for name in dofs.components if self.component.endswith(f"/{name}")]
         if self.nodes is not None and dofs.components and not inner:
             raise LabelError(
@@ -244,7 +249,10 @@ class Patch(Value):
         return np.asarray(rows[dofs.kinds[rows] < 3])
 
     def point(self, dofs: DofSet) -> FloatArray:
-        """Return the reference point (3,) [m] of the motion."""
+        """Return the point (3,) [m] about which the patch rotates.
+
+        `dofs` are the DOFs of the component.
+        """
         if self.at is not None:
             return np.asarray(self.at, dtype=np.float64)
         rows = self.rows(dofs)
@@ -252,12 +260,13 @@ class Patch(Value):
         return np.asarray(dofs.xyz[rows[first]].mean(axis=0))
 
     def mean(self, dofs: DofSet, point: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
-        """Return the mean motions of the patch at a point.
+        """Return the matrices of the mean motions of the patch at a point.
 
-        The method returns three things. The first is the matrix (6, m) that computes the six mean
-        motions from the displacements of the nodes. Its rows are zero for motions that the nodes do
-        not determine. The second is the matrix A (m, 6) of the displacements in the six rigid-body
-        motions. The third is the list of the motions that are determined.
+        `dofs` are the DOFs of the component. The method returns three things. The first is the
+        matrix (6, m) that computes the six mean motions from the displacements of the nodes. Its
+        rows are zero for motions that the nodes do not determine. The second is the matrix A (m, 6)
+        of the displacements in the six rigid-body motions. The third is the list of the motions
+        that are determined.
         """
         rows = self.rows(dofs)
         return mean_motions(dofs._taken(rows), point, self._weight_of(dofs, rows))

@@ -400,7 +400,7 @@ class Modes(Placed, Value):
     def poles(self) -> ComplexArray:
         """Poles (k,) [rad/s] in the upper half plane; those of rigid-body modes are exactly 0.
 
-        A pole is ``-zeta omega + i omega sqrt(1 - zeta^2)``, or the positive real one if unstable.
+        A pole is ``-zeta omega + i omega sqrt(1 - zeta^2)``. An unstable mode has its growing pole.
         """
         return pole_pairs(self.omega, self.zeta)[0]
 
@@ -547,9 +547,9 @@ class Modes(Placed, Value):
     def orthonormal_basis(self) -> FloatArray:
         """M-orthonormal real shapes B (n, b) that span the shapes of modes and attachment vectors.
 
-        For complex modes, ``B B'`` is found without M as a sum over the modes. An elastic mode adds
-        ``Re(phi phi' lambda / (i Im lambda))`` to it, and a rigid-body mode ``phi phi'``. Unstable
-        poles s1, s2 with shapes v1, v2 add ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)``.
+        Complex modes give ``B B^T`` as a sum over modes. A mode of pole s adds ``phi phi^T`` if it
+        is a rigid-body mode, and else ``Re(phi phi^T s / (i Im s))``. An unstable mode of poles a
+        and b with shapes v and w (see `phi`) adds ``(a v v^T - b w w^T) / (a - b)``.
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
@@ -569,9 +569,9 @@ class Modes(Placed, Value):
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return loads (n, r) with the same modal forces as the product ``M @ motions``.
+        """Return loads f (n, r) with the modal forces ``phi^T f`` of the product ``M @ motions``.
 
-        The motions (n, r) must be combinations of the shapes.
+        M is not needed. The motions (n, r) must be combinations of the shapes.
         """
         # any load with these modal forces will do: B' f = c, where motions = B c
         basis = self.orthonormal_basis
@@ -579,15 +579,15 @@ class Modes(Placed, Value):
         return np.asarray(np.linalg.lstsq(basis.T, share, rcond=None)[0])
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the fraction (6,) of each rigid-body motion that the shapes cannot make.
+        """Return the relative error (6,) of each rigid-body motion as a combination of the shapes.
 
-        Rotations turn about the point `about` [m].
+        The rotations are about the point `about` [m].
         """
         wanted, basis = self.rigid_motions(about), self.orthonormal_basis
         return relative_miss(basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0], wanted)
 
     def at(self, place: Place, direction: str = "z") -> FloatArray | ComplexArray:
-        """Return the modes' motion (k,) at a place.
+        """Return the values (k,) of the mode shapes at a place.
 
         Parameters
         ----------

@@ -96,7 +96,10 @@ class NormalForm(Value):
         return np.asarray(rate / divisor(omega))
 
     def overdamped_below(self, rate: float) -> str:
-        """Return a note on overdamped poles with magnitudes up to `rate` [1/s]; "" without any."""
+        """Return a note on overdamped poles with magnitudes up to `rate` [1/s].
+
+        The note is an empty text if there are no such poles.
+        """
         slow = self.overdamped[np.abs(self.overdamped) <= rate]
         if not slow.size:
             return ""
