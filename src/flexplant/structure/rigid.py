@@ -464,7 +464,10 @@ class Placed:
         return self.dofs
 
     def row(self, at: Place, direction: str = "z") -> FloatArray:
-        """Return the row (n,) that gives the motion at a place; see `DofSet.row`."""
+        """Return the row (n,) whose product with all n displacements is the motion at a place.
+
+        See `DofSet.row` for the arguments.
+        """
         return self.dofs.row(at, direction)
 
     def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:

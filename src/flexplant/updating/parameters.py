@@ -142,7 +142,7 @@ class PointParameter(Parameter):
         """Return the derivatives (dM, dD, dK) of the model's matrices with respect to p.
 
         One of them is ``r r^T``, as a sparse matrix if the model is sparse. The others are None.
-        With several directions, it is the sum of ``r r^T`` over the directions.
+        An `AddedMass` with the direction "xyz" has the sum of ``r r^T`` over the translations.
         """
         found = np.array(self.rows(model)).T
         if not np.any(found):
@@ -155,10 +155,9 @@ class PointParameter(Parameter):
         return parts[0], parts[1], parts[2]
 
     def rows(self, model: FEModel | ReducedModel) -> list[FloatArray]:
-        """Return the vectors r (n,) of the place on the DOFs of the model, one for each direction.
+        """Return the vector r (n,) of the place on the DOFs of the model, in a list.
 
-        There is one direction, except with "xyz". Directions that the model does not have are left
-        out of "xyz".
+        An `AddedMass` with the direction "xyz" has a vector for each translation of the model.
         """
         of = model if hasattr(model, "row") else model.dofs
         along: tuple[str, ...] = (self.direction,)

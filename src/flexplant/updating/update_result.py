@@ -147,16 +147,20 @@ class UpdateResult(Value):
     values : (q,) array
         Values of the parameters.
     covariance : (q, q) array or None
-        Covariance of the estimate. It follows from ``J = [Re S; Im S]`` with the sensitivities S,
-        and from the weights W. If the covariance C of the measurement is known, the result is
-        ``G C G^T`` with the linear estimator ``G = (J^T W J)^-1 J^T W``. If C is not known, it is
-        ``s^2 (J^T W J)^-1``. The residual variance ``s^2 = e / (2 m - q)`` of m poles then includes
-        the model error. None: 2 m = q, so that s^2 is not known. If C is known for some residuals
-        only, s^2 is the variance of the others. If `chi2` exceeds noise (`p_value` below 1e-4), C
-        includes the discrepancy. With responses, C is multiplied by ``chi2 / dof`` instead.
+        Covariance of the estimate. For m poles it is computed from their derivatives S with respect
+        to the parameters, written as real numbers ``J = [Re S; Im S]``, and from their weights W.
+        If the covariance C of the measurement is known, the result is ``G C G^T``. The matrix
+        ``G = (J^T W J)^-1 J^T W`` converts errors of the poles into errors of the parameters. If C
+        is not known, the result is ``s^2 (J^T W J)^-1``. The residual variance
+        ``s^2 = e / (2 m - q)``, with the weighted sum of squares e, then includes the model error.
+        If C is known for some residuals only, s^2 is the variance of the others. If the residual
+        exceeds noise (`p_value` below 1e-4), C includes the model error (see `discrepancy`). If
+        responses are fitted, C is multiplied by ``chi2 / dof`` instead. None: the data do not
+        determine all parameters, the result depends on the start values, or ``2 m = q``, so that
+        s^2 is not known.
     correlation : (q, q) array
         Correlation matrix of the estimate. It follows from `covariance` if the noise of all
-        residuals is known. Otherwise errors with the covariance W^-1 are assumed.
+        residuals is known. Otherwise it is computed for errors with the covariance W^-1.
     model : ReducedModel or FEModel
         Updated model of the same type, with changed M, D and K.
     history : History
@@ -240,7 +244,7 @@ class UpdateResult(Value):
 
     @property
     def discrepancy_text(self) -> str:
-        """Description of the discrepancy in words."""
+        """Text that describes the model error in each kind of residual (see `discrepancy`)."""
         return ", ".join(f"{d.deviation:.2g} of {d.kind}" for d in self.discrepancy)
 
     @property
@@ -453,7 +457,7 @@ class UpdateResult(Value):
         return applied(model, self.unknowns, self.values)
 
     def calibrated(self, measured: Any) -> Any:
-        """Return the updated model with the measured poles of some modes; see `ReducedModel`.
+        """Return the updated reduced model with the measured poles of some modes.
 
         The measured poles replace those of the updated model. Shapes, motions of points of interest
         and unmeasured modes stay those of the updated model. If the model is an FEModel, a

@@ -97,7 +97,7 @@ def identifiability(
     *,
     start: Sequence[float] | FloatArray | None = None,
 ) -> IdentifiabilityReport:
-    """Return which parameters the residuals determine at their start values, before solving.
+    """Return which parameters the residuals determine, to first order at the start values.
 
     The report contains the singular values of the weighted sensitivities S. It also contains the
     correlation of the estimate, from ``(S^T S)^-1``, and the numbers of modes that should be

@@ -140,7 +140,11 @@ class FrfResidual(Residual):
         return self.replace(lines=lines)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters."""
+        """Return the residual as `update` uses it, for one model with its parameters.
+
+        The argument `family` is this model with its parameters. The result computes the values of
+        the residual and their derivatives; see `Bound`.
+        """
         return _BoundFrf(self, family)
 
 

@@ -148,7 +148,11 @@ class Eigenvalues(_ModalResidual):
         return self.replace(measured=chosen, weights=weights)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters."""
+        """Return the residual as `update` uses it, for one model with its parameters.
+
+        The argument `family` is this model with its parameters. The result computes the values of
+        the residual and their derivatives; see `Bound`.
+        """
         return BoundEigenvalues(self)
 
 
@@ -320,7 +324,11 @@ class ModeShapes(_ModalResidual):
         return self.replace(measured=chosen, shapes=shapes, std=std, covariance=covariance)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters."""
+        """Return the residual as `update` uses it, for one model with its parameters.
+
+        The argument `family` is this model with its parameters. The result computes the values of
+        the residual and their derivatives; see `Bound`.
+        """
         return BoundShapes(self, family)
 
 
@@ -517,7 +525,11 @@ class ShapeCorrelation(ModeShapes):
     """
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters."""
+        """Return the residual as `update` uses it, for one model with its parameters.
+
+        The argument `family` is this model with its parameters. The result computes the values of
+        the residual and their derivatives; see `Bound`.
+        """
         return _BoundMac(self, family)
 
 

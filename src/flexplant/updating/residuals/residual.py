@@ -19,6 +19,8 @@ from ..family import Family, Point
 class Residual(Value):
     """The base class of residuals: a measurement that the model should reproduce.
 
+    A new residual is a subclass that defines `bound`.
+
     Examples
     --------
     The library's residuals are instances of this class:
@@ -42,7 +44,11 @@ class Residual(Value):
 
     @abstractmethod
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters."""
+        """Return the residual as `update` uses it, for one model with its parameters.
+
+        The argument `family` is this model with its parameters. The result computes the values of
+        the residual and their derivatives; see `Bound`.
+        """
 
 
 class Kind(NamedTuple):
