@@ -55,8 +55,8 @@ class Machines(Value):
       from their posterior distribution (`Trend`).
     - The trend is ``t = sign(b) log(1 + 2 |b| g) / 2``, where g is the frequency of a mode divided
       by the largest measured frequency. In matrix equations t is the diagonal matrix of these
-      values. A fraction r of the trend changes the mass, and the rest
-      changes the stiffness. The fraction is uniformly distributed between 0 and 1.
+      values. A fraction r of the trend changes the mass, and the rest changes the stiffness. The
+      fraction is uniformly distributed between 0 and 1.
     - The matrices are ``M' = exp(-r t) (I + sum dp dM) exp(-r t)`` and
       ``K' = Omega exp(E) Omega + sum dp dK``. The matrix E is symmetric. Its diagonal elements are
       ``2 (s e + (1 - r) t)`` with standard normal numbers e, and its other elements have the

@@ -475,7 +475,7 @@ class PolynomialParameter(_GivenParameter):
     def about(self, value: float) -> PolynomialParameter:
         """Return the same parameter for a model whose matrices already include a value of it.
 
-        The new parameter is the change from this value. It is zero if the matrices stay the same.
+        The new parameter is the change from this value. Its value zero stands for these matrices.
         """
         moved: dict[str, Any] = {}
         for label in PARTS:

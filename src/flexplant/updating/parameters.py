@@ -80,7 +80,7 @@ class Parameter(Value):
     def about(self, value: float) -> Parameter:
         """Return the same parameter for a model whose matrices already include a value of it.
 
-        The new parameter is the change from this value. It is zero if the matrices stay the same.
+        The new parameter is the change from this value. Its value zero stands for these matrices.
         """
         return self
 

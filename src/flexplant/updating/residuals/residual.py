@@ -65,9 +65,9 @@ class Bound(ABC):
     """A residual for one family of models: its values, and their exact gradients.
 
     A family is a model with its possible values of the parameters. This is the base class of the
-    objects that `Residual.bound` returns. The argument "point" is a model of the family, with
-    its modes, at given values of the parameters. A row is one real number of the residual. If the
-    noise of the measurement is known, the rows are scaled to unit covariance (whitened).
+    objects that `Residual.bound` returns. The argument "point" is a model of the family, with its
+    modes, at given values of the parameters. A row is one real number of the residual. If the noise
+    of the measurement is known, the rows are scaled to unit covariance (whitened).
     """
 
     #: numbers of the modes that it follows
