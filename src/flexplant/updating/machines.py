@@ -75,7 +75,7 @@ class Machines(Value):
     measured : MeasuredModes
         Measured modes, with the mode numbers of the updated model.
     count : int
-        Number of machines that are drawn for an interval.
+        Number of machines that are drawn for the interval of a result.
     seed : int
         Seed of the random draws. Machine i is the same for every `count`.
 
@@ -105,12 +105,12 @@ class Machines(Value):
 
     @cached_property
     def trend(self) -> Trend:
-        """Trend of the residual of measured frequencies."""
+        """Test for a residual of measured frequencies that grows with frequency; see `Trend`."""
         return trend_of(self.fit, self.measured)
 
     @cached_property
     def missing(self) -> str:
-        """Reason why no interval can be computed, or an empty text if it can."""
+        """Reason why no interval of a result can be computed. It is empty if this is possible."""
         return self.trend.missing or next(iter(self.fit.unlike_shapes(self.measured)), "")
 
     @cached_property

@@ -251,7 +251,7 @@ class GaussNewton(UpdateMethod):
 
     @property
     def penalised(self) -> bool:
-        """Whether singular values are left out, so that the result depends on the start."""
+        """Whether singular values are left out, so that the result depends on the start values."""
         return self.truncate > 0
 
     def search(
