@@ -326,7 +326,7 @@ class Localisation(Value):
 
     @property
     def table(self) -> str:
-        """Table of the leading candidates: value, explained fraction and BIC above the least BIC."""
+        """Table of the leading candidates: value, explained fraction, BIC minus the least BIC."""
         least, rows = float(np.min(self.bic)), []
         for name in self.leading:
             i = self.candidates.index(name)
