@@ -211,6 +211,19 @@ def test_the_largest_scaled_size_is_found_by_its_bounds(n):
         assert np.all(found <= every * (1.0 + 1e-6))
 
 
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_what_acts_one_way_is_scaled_away(n):
+    """Triangular S, loops in any order, couplings from 1e-6 to 1e6: the diagonal is left."""
+    rng = np.random.default_rng(n)
+    S = np.triu(10.0 ** rng.uniform(-6.0, 6.0, (20, n, n)) * np.exp(2j * rng.random((20, n, n))))
+    S[:, range(n), range(n)] = rng.uniform(0.5, 2.0, (20, n))
+    order = rng.permutation(n)
+    S = S[:, order][:, :, order]
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        found = scaled_size(S)
+    assert found.max() == pytest.approx(np.abs(np.einsum("fii->fi", S)).max(), rel=1e-3)
+
+
 def body_with_modes(rng, axes):
     """Free bodies and lightly damped modes of any sign on them, PID with roll-off; coarse lines."""
     count, spacing = rng.integers(1, 4), rng.choice([0.1, 0.25, 0.5, 1.0, 2.0])

@@ -9,14 +9,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..arrays import COLUMNS, ComplexArray, FloatArray
+from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, short
 from ..lti.frequency_sweep import SOUGHT, climbed_grid, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..tolerances import MOST_STEPS, RANK, TINY
+from ..tolerances import MOST_STEPS, RANK, TINY, TYPED
 from ..words import instance
 from .blocks import references
 
@@ -43,6 +43,8 @@ class BrokenLoop:
     dt: float
     measured: FloatArray | None = None
     units: Mapping[str, str] = field(default_factory=dict)
+    #: units of the actuators that are much unlike, as multiples of their own
+    forces: Callable[[], Mapping[str, str]] = dict
 
     def respond(self, freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Return K (n_freq, nu, ny) and P (n_freq, ny, nu)."""
@@ -88,9 +90,13 @@ class BrokenLoop:
 
     def mixed(self, at: Side = "u") -> tuple[str, ...]:
         """Return the units of the channels where it is broken if they have several, else none."""
-        # a largest singular value would mix different units
+        # a largest singular value would mix different units, also those of unlike actuators: 1 N at
+        # a tool of 0.5 kg asks 130 N of the slide of 60 kg that carries it
         names = self.u if at == "u" else self.y
-        known = tuple(dict.fromkeys(self.units.get(name, "unknown") for name in names))
+        units = self.units
+        if at == "u" and len(names) > 1 and len({units.get(name) for name in names}) == 1:
+            units = {**units, **self.forces()}
+        known = tuple(dict.fromkeys(units.get(name, "unknown") for name in names))
         return known if len(known) > 1 else ()
 
     @cached_property
@@ -109,7 +115,7 @@ class BrokenLoop:
 
     def margin(self, at: Side = "u", scaled: bool | None = None) -> float:
         """Return ``1 / max_f |S|``; 0 when unstable."""
-        # with scaled axes where channels have several units, unless chosen otherwise
+        # with scaled axes where `mixed` says so, unless chosen otherwise
         if self.is_unstable:
             return 0.0
         return 1.0 / self.worst(at, bool(self.mixed(at)) if scaled is None else scaled)[0]
@@ -184,6 +190,9 @@ def movable_outputs(g: StateSpace) -> tuple[str, ...]:
 #: powers of singular values whose sum is minimised in turn, and steps for each: the largest value
 #: is within n^(1/p) of the power mean, 2 % for 4 axes at 64
 _POWERS, _STEPS = (1, 2, 4, 8, 16, 32, 64), 12
+#: points that are optimised at once, in falling order of their bounds; and the ratio of the upper
+#: to the lower bound at which a point needs no further steps
+_AT_ONCE, _SETTLED = 4, 1.001
 #: largest step of a logarithm, where a loop acts on others but no loop acts on it
 _LARGEST = 1.0
 
@@ -193,15 +202,13 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     # it is the upper bound of the structured singular value of one perturbation for each axis
     # [Skogestad2005]_, section 8.8, independent of the units of the axes. Where it cannot be the
     # maximum, an upper bound is returned
-    log = _log_scaling(S)
+    log = log_scaling(S)
     size = np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
         return size
     best, order = 0.0, np.argsort(-size, kind="stable")
-    for begin in range(0, order.size, COLUMNS):
-        some = order[begin : begin + COLUMNS]
-        if size[some[0]] <= best:
-            break
+    while order.size and size[order[0]] > best:
+        some, order = order[:_AT_ONCE], order[_AT_ONCE:]
         size[some] = _optimised(S[some], log[some], size[some])
         best = max(best, float(size[some].max()))
     return size
@@ -219,7 +226,7 @@ def peaking_size(S: ComplexArray) -> FloatArray:
     each step of the scaling lowers, it is at most the norm of [[a, e], [e, d + e]].
     """
     n, size = S.shape[-1], least_scaled(S)
-    rest = _d_scaled(S, _log_scaling(S, 2))
+    rest = _d_scaled(S, log_scaling(S, 2))
     second = np.sort(np.abs(np.einsum("fii->fi", S)), axis=1)[:, -2]
     rest[:, range(n), range(n)] = 0.0
     e = np.linalg.norm(rest, axis=(1, 2))
@@ -234,7 +241,7 @@ def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
     return np.asarray(S * np.exp(log[:, :, None] - log[:, None, :]))
 
 
-def _log_scaling(S: ComplexArray, steps: int = MOST_STEPS) -> FloatArray:
+def log_scaling(S: ComplexArray, steps: int = MOST_STEPS) -> FloatArray:
     """Return log D (k, n) of the least Frobenius norm: rows and columns have equal size."""
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
@@ -242,23 +249,28 @@ def _log_scaling(S: ComplexArray, steps: int = MOST_STEPS) -> FloatArray:
     # a coupling of 1e-12 of the whole is rounding; all sums are squares
     least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + TINY
     for _ in range(steps if n > 1 else 0):
+        before = log.copy()
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
             # it acts on others, and no loop acts on it
             one_way = np.minimum(row, column) <= least * 1e-6
-            step = 0.25 * np.log((column + TINY) / (row + TINY))
+            step = 0.25 * (np.log(column + TINY) - np.log(row + TINY))
             step = np.where(one_way, np.clip(step, -_LARGEST, _LARGEST), step)
             # no loop at all: sums of squares
             step = np.where(np.maximum(row, column) <= 1e-290, 0.0, step)
             log[:, i] += step
             power[:, i] *= np.exp(2.0 * step)[:, None]
             power[:, :, i] *= np.exp(-2.0 * step)[:, None]
+        if np.abs(log - before).max() < TYPED:
+            break
     return log
 
 
 def _optimised(S: ComplexArray, log: FloatArray, size: FloatArray) -> FloatArray:
     """Return the size after log D has gone down the slope of ``sum sigma^(2 p)``, p growing."""
     for power in _POWERS:
+        if np.all(size <= _SETTLED * _unscalable(_d_scaled(S, log))):
+            break
         for _ in range(_STEPS):
             left, sigma, right = np.linalg.svd(_d_scaled(S, log))
             size = np.minimum(size, sigma[:, 0])
@@ -268,6 +280,15 @@ def _optimised(S: ComplexArray, log: FloatArray, size: FloatArray) -> FloatArray
             # of singular vectors, of length one
             log = log + np.log((columns + 1e-12) / (rows + 1e-12)) / (4.0 * power)
     return size
+
+
+def _unscalable(S: ComplexArray) -> FloatArray:
+    """Return a lower bound of sigma_max(D S D^-1) for all diagonal D."""
+    # the largest eigenvalue of S Q, Q diagonal and unitary, does not depend on D. With these phases
+    # it is sigma_max where the entries of both singular vectors have equal sizes [Skogestad2005]_
+    left, _, right = np.linalg.svd(S)
+    phase = np.exp(-1j * np.angle(left[:, :, 0] * right[:, 0, :]))
+    return np.asarray(np.abs(np.linalg.eigvals(S * phase[:, None, :])).max(axis=1))
 
 
 def reference_pair(loop: Any, reference: str | None, error: str | None) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from ..lti.modal_map import Obstacle, obstacle
 from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
+from ..plant.axes import force_units
 from ..plant.machine_plants import FigureInterval, fitted_response
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
@@ -232,6 +233,7 @@ class ClosedLoop(Value):
             self.poles,
             self.plant.dt,
             units=self.units,
+            forces=lambda: force_units(self.machine),
         )
 
     @property
@@ -303,8 +305,9 @@ class ClosedLoop(Value):
         """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances. If actuators have different units, axes are scaled as in
-        `LoopReport.scaled_margin`. It is 0 for an unstable loop.
+        loop's resonances; 0 for an unstable loop. If actuators have different units, or need forces
+        that differ by more than a factor of 4 for equal motions of the axes, axes are scaled as in
+        `LoopReport.scaled_margin`.
         """
         return self.broken.margin()
 
@@ -316,10 +319,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def on_machines(self) -> MachineLoops:
-        """The same controller around machines that agree with the measurement.
-
-        A plant that knows no such machines raises ModelError.
-        """
+        """The same controller around machines of the same measurement; ModelError if not known."""
         known = self.plant.machine.machines
         if known is None:
             raise ModelError(
@@ -367,9 +367,8 @@ class ClosedLoop(Value):
     def tolerances(self) -> ModeTolerances | None:
         """Tolerances to errors of single modes; None if modes are coupled or the loop is unstable.
 
-        If the plant has uncertain frequencies, truncated modes are included where they are known.
-        `interval` covers simultaneous changes of all modes. Frequencies are changed by up to 1 %,
-        or up to 2.5 times their uncertainty.
+        Known truncated modes are included if frequencies are uncertain. Changes go up to 1 %, or to
+        2.5 times their uncertainty. `interval` covers simultaneous changes of all modes.
         """
         return reported_tolerances(self)
 
@@ -381,9 +380,9 @@ class ClosedLoop(Value):
         """Return the tolerance of the loop to errors of frequency and damping of each mode.
 
         One mode changes at a time. The results are the exact changes at which a pole crosses the
-        stability boundary, and at which the modulus margin falls to `margin`. A loop with a gain
-        above 1 at a mode of 0.1 % damping may tolerate less than 0.2 %, while the frequencies of
-        unmeasured modes of a model are seldom that accurate.
+        stability boundary, and at which the modulus margin falls to `margin` (at least, where axes
+        are scaled). A loop with a gain above 1 at a mode of 0.1 % damping may tolerate less than
+        0.2 %, while the frequencies of unmeasured modes are seldom that accurate.
 
         Parameters
         ----------
@@ -442,8 +441,8 @@ class ClosedLoop(Value):
     def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
         """Return the one-sided power spectral density that all white noises together cause.
 
-        For a sampled loop it is that of the samples, up to half the rate: motion above half the
-        rate is included by aliasing, so that its integral is the variance ``rms(channel)^2``.
+        For a sampled loop it is that of the samples, up to half the rate. Its integral is the
+        variance ``rms(channel)^2``, which includes motion above half the rate by aliasing.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ from ..plant import AnyPlant
 from ..plant.building import sampled_motions
 from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs
 from ..tolerances import SAME, SETTLED, SPLIT, TINY
-from .broken import BrokenLoop, inverted
+from .broken import BrokenLoop, inverted, log_scaling
 
 #: largest relative change of a frequency whose polynomials are exact
 LIMIT = 0.05
@@ -143,17 +143,22 @@ class ModeLoops:
         K, P = self.broken.respond(freq)
         S = inverted(K @ P)
         x = np.moveaxis(self.states(freq), 2, 0)
+        D = np.ones(S.shape[:2])
+        if self.broken.mixed():  # a bound of the least |D S D^-1|: the same D for changed modes
+            D = np.exp(log_scaling(S))
         shown = None
         if self.behind is not None:
             late = self.behind(freq).transpose(2, 1, 0).reshape(freq.size, len(self.own), 2, -1)
             shown = self.seen[0] + late.swapaxes(2, 3)
-        return SweptLoop(self, points(self.plant.system, freq), S, S @ K, x, shown)
+        left, right = D[:, :, None], 1.0 / D[:, None, :]
+        z = points(self.plant.system, freq)
+        return SweptLoop(self, z, left * S * right, left * (S @ K), x * right, right, shown)
 
 
 class SweptLoop(NamedTuple):
     """S, S K and the states' responses x (n, states, m) at points z of the stability boundary.
 
-    `shown`: c_i (n, modes, p, 2) where it changes along it.
+    Each u is divided by `unit` (n, 1, m). `shown`: c_i (n, modes, p, 2) where it changes along it.
     """
 
     loops: ModeLoops
@@ -161,15 +166,14 @@ class SweptLoop(NamedTuple):
     S: ComplexArray
     SK: ComplexArray
     x: ComplexArray
+    unit: FloatArray
     shown: ComplexArray | None = None
 
     def swept_modes(self, at: IntArray, mode: IntArray) -> SweptModes:
         """Return the terms of a mode's equation, for pairs of a point and a mode."""
         loops = self.loops
         m = self.S.shape[1]
-        others = np.concatenate(
-            [self.x[:, loops.fed], np.broadcast_to(np.eye(m), (self.z.size, m, m))], axis=1
-        )
+        others = np.concatenate([self.x[:, loops.fed], np.eye(m) * self.unit], axis=1)
         Y = np.concatenate(
             [self.x[at[:, None], loops.own[mode]], loops.sums[mode].astype(complex) @ others[at]],
             axis=1,

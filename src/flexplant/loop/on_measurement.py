@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ def judged(loop: Any, known: MeasuredResponse) -> OnMeasurement | None:
         frf = frf.replace(data=frf.data * turn)
         frf = in_axes(frf, rate=1.0 / plant.dt, delay=plant.delay, hold=known.hold)
     law = loop.controller.select(loop.driven, loop.fed_back)
-    parts = measured_between(frf, law, {})
+    parts = replace(measured_between(frf, law, {}), forces=loop.broken.forces)
     count = broken_count(parts, None, 0)
     peak, freq = parts.worst("u", bool(parts.mixed("u")))
     added = plant.delay if plant.dt and not (known.hold or known.delay) else 0.0

@@ -14,7 +14,6 @@ from ...certificates import Certificate, Verified, stability_check
 from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
-from ...loop.broken import axis_sensitivities
 from ...loop.other_machines import growing_modes, modes_in_words
 from ...lti.interconnection import connect, loop_poles
 from ...lti.statespace import StateSpace
@@ -42,6 +41,7 @@ from .servo_loops import (
     reading_of,
     seeing,
     servo_loop,
+    suppressed_up_to,
 )
 
 
@@ -191,17 +191,6 @@ def _in_words(law: ServoLaw) -> str:
     return ", ".join(f"{f:g} Hz of {name}" for name, f in each.items())
 
 
-def suppressed_up_to(closed: ClosedLoop) -> float:
-    """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
-    found = []
-    for freq, size in axis_sensitivities(closed).values():
-        below = np.flatnonzero(size < 1.0)
-        above = np.flatnonzero(size >= 1.0)
-        later = above[above > below[0]] if below.size else above
-        found.append(float(freq[later[0]]) if later.size else float(freq[-1]))
-    return min(found, default=0.0)
-
-
 @one_thread()
 def servo_bandwidth(
     plant: StandardPlant,
@@ -227,7 +216,8 @@ def servo_bandwidth(
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Upper bound on the largest singular value of S at u; 2 is 6 dB.
+        Upper bound on the largest singular value of S at u; 2 is 6 dB. Axes are scaled where
+        `ClosedLoop.modulus_margin` scales them.
 
     Returns
     -------
@@ -552,24 +542,30 @@ class ServoTask:
         if found is None:
             raise SolverError(
                 f"no bandwidth from {trials[-1]:.3g} to {trials[0]:.3g} Hz holds |S| at u below "
-                f"{20 * np.log10(peak):.2g} dB{self._why(*best)}"
+                f"{20 * np.log10(peak):.2g} dB{self._why(peak, *best)}"
             )
         return found
 
-    def _why(self, size: float, at: float, bandwidth: float) -> str:
+    def _why(self, peak: float, size: float, at: float, bandwidth: float) -> str:
         """Return what is nearest to holding a peak, what stops it and what to change, in words."""
         if not np.isfinite(size):
             return (
                 ": none gives a stable loop. Check the observer's signs and units, or design it "
                 "on this plant."
             )
-        margins = np.rad2deg(self.phase_margins(self.law(bandwidth)))
+        left = float(np.rad2deg(self.phase_margins(self.law(bandwidth)).min()))
+        asked = float(np.rad2deg(2.0 * np.arcsin(0.5 / peak)))
+        cause = (
+            f"rate and delay leave a phase margin of {left:.2g} deg on the axes' lines, and this "
+            f"peak needs at least {asked:.2g} deg. Raise the rate, or lower the delay"
+            if left < asked
+            else "the cause is the flexible modes or the observer, since rate and delay leave a "
+            f"phase margin of {left:.2g} deg on the axes' lines. Place a notch at that frequency, "
+            "change the observer's noise intensities, give each axis its bandwidth in design_servo"
+        )
         return (
             f"; the least is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at {at:.4g} Hz. "
-            f"There rate and delay leave a phase margin of {margins.min():.2g} deg on the axes' "
-            "lines; what is lacking beyond that is due to the flexible modes and the observer. "
-            "Raise the rate or lower the delay, place a notch at that frequency, change the "
-            "observer's noise intensities, or raise peak=."
+            f"There {cause}, or raise peak=."
         )
 
 

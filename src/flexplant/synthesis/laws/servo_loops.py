@@ -11,14 +11,21 @@ import numpy as np
 
 from ...arrays import ComplexArray, FloatArray
 from ...errors import LabelError, warn
+from ...loop import ClosedLoop
 from ...loop.blocks import as_block
-from ...loop.broken import inverted, least_scaled, peaking_size, sensitivity_size
+from ...loop.broken import (
+    axis_sensitivities,
+    inverted,
+    least_scaled,
+    peaking_size,
+    sensitivity_size,
+)
 from ...lti.blocks_of_states import Matrices
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
-from ...plant.axes import DrivenAxes, complex_gain, oscillations
+from ...plant.axes import DrivenAxes, complex_gain, force_units, oscillations
 from .controller_elements import Integrator, LowPass, Notch, Pid
 from .law import Law, decoupled, tustin_s
 
@@ -228,7 +235,8 @@ class ServoLoop:
 
     @cached_property
     def _mixed(self) -> bool:
-        return len({self.plant.units.get(name) for name in self.plant.u}) > 1
+        units = self.plant.units | force_units(self.plant)
+        return len({units.get(name) for name in self.plant.u}) > 1
 
     def _sizes(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> FloatArray:
         """Return sigma_max(S_u) at some points, a lower bound where it is not the largest.
@@ -483,3 +491,14 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
+
+
+def suppressed_up_to(closed: ClosedLoop) -> float:
+    """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
+    found = []
+    for freq, size in axis_sensitivities(closed).values():
+        below = np.flatnonzero(size < 1.0)
+        above = np.flatnonzero(size >= 1.0)
+        later = above[above > below[0]] if below.size else above
+        found.append(float(freq[later[0]]) if later.size else float(freq[-1]))
+    return min(found, default=0.0)
