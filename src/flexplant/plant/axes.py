@@ -16,7 +16,7 @@ from ..tolerances import SAME, TYPED
 from ..words import name_list
 from .assumptions import axes_in_words
 from .building import rigid_shapes
-from .partitioned import Partition
+from .partitioned import Partition, PartitionedSystem
 from .ports import Poi
 from .realisation import natural
 
@@ -314,7 +314,7 @@ class EqualMotion(NamedTuple):
     forces: FloatArray
 
     @classmethod
-    def of(cls, plant: Partition, driven: DrivenAxes, sigma: float) -> EqualMotion:
+    def of(cls, plant: PartitionedSystem, driven: DrivenAxes, sigma: float) -> EqualMotion:
         """Return the motions at s = sigma [rad/s]."""
         # Y = G_yu T of unit axes, d_i = rms(Y_i) / rms(Y_1); T / d are forces of equal motion
         T = sigma**2 * driven.T
