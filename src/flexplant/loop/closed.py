@@ -233,7 +233,7 @@ class ClosedLoop(Value):
             self.poles,
             self.plant.dt,
             units=self.units,
-            forces=lambda: force_units(self.machine),
+            forces=lambda: force_units(self.plant.machine),
         )
 
     @property
