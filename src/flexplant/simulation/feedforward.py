@@ -208,7 +208,9 @@ def design_feedforward(
         Whether filters invert stable slow zeros. In trials, the isolators of the machine differed
         from the model by 3 % in frequency or by a factor of 2 in damping. In 93 % of 448 trials the
         peak error was smaller than with gains alone. In the other trials it was below 0.3 % of the
-        error without feedforward.
+        error without feedforward. If the frame modes of `testbeds.gantry` are off by 0, 0.3, 1, 3
+        or 10 %, the largest peak error of its axes is 0.3, 0.3, 0.7, 2.3 or 7.6 % of that without
+        feedforward, with gains alone 10 to 13 %.
 
     Returns
     -------
