@@ -331,7 +331,7 @@ def test_gains_of_a_move(capsys):
     fed = {
         "none": (),
         "at rest": (design_feedforward(loop, reference="die:ref"),),
-        "of the move": (design_feedforward(loop, reference="die:ref", move=move),),
+        "of the move": (design_feedforward(loop, move, reference="die:ref"),),
     }
     for name, blocks in fed.items():
         whole = fx.close_loop(plant, *loop.blocks, *blocks)
@@ -342,7 +342,9 @@ def test_gains_of_a_move(capsys):
     assert peak["of the move"] < 0.2 * peak["none"]
     assert peak["of the move"] < peak["at rest"]
     with pytest.raises(ModelError, match="a move needs a ClosedLoop"):
-        design_feedforward(plant, reference="die:ref", move=move)
+        design_feedforward(plant, move, reference="die:ref")
+    with pytest.raises(LabelError, match="2 errors"):
+        loop.budget()
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from flexplant.errors import InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis.robustness.guarantees import _quick
+from judge import judged
 from plates import make_plate
 from stages import RATE, ports, sampled, some_modes
 
@@ -240,3 +241,43 @@ def swinging(P):
     """The frequencies [Hz] of the elastic modes, from the eigenvalues of A."""
     poles = np.linalg.eigvals(P.continuous.system.A)
     return np.abs(poles[poles.imag > 1.0]) / (2.0 * np.pi)
+
+
+def cable_carrier(seed):
+    """A linear axis whose cable carrier, a chain of links, swings from 0.2 Hz on."""
+    rng = np.random.default_rng([4, seed])
+
+    def drawn(size):
+        return size * np.exp(rng.uniform(-0.2, 0.2))
+
+    masses = np.array([drawn(12.0), drawn(1.5), *(drawn(0.35) for _ in range(5))])
+    K, C = np.zeros((7, 7)), np.zeros((7, 7))
+    tool = masses[1] * (2.0 * np.pi * drawn(140.0)) ** 2
+    links = [(i, i - 1 if i > 2 else 0, drawn(150.0), drawn(0.5)) for i in range(2, 7)]
+    for i, j, k, c in [(1, 0, tool, 20.0), *links, (6, 6, drawn(150.0), drawn(0.5))]:
+        row = np.zeros(7)
+        row[j] = -1.0
+        row[i] = 1.0
+        K += k * np.outer(row, row)
+        C += c * np.outer(row, row)
+    dofs = fx.DofSet(np.arange(1, 8), ["x"] * 7, np.zeros((7, 3)))
+    channels = fx.Ports(
+        w=[fx.Disturbance("cable", at="3:x", asd=0.02)],
+        u=[fx.Actuator("motor", at="1:x", asd=1e-2)],
+        z=[fx.Poi("tool", at="2:x", axes=("x",))],
+        y=[fx.Sensor("encoder", at="1:x", asd=1e-9)],
+        references=[fx.Reference("tool")],
+    )
+    modes = solve_modes(FEModel(np.diag(masses), K, C, dofs=dofs))
+    return fx.assemble_plant(modes, channels).discretized(4e3, delay=1.4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
+def test_slow_modes_that_limit_nothing_end_no_search(seed):
+    """The stage follows as far as the servo does, not to 17 times the slowest mode."""
+    plant = cable_carrier(seed)
+    servo = fx.servo_bandwidth(plant, observer=fx.design_kalman(plant))
+    found = judged(plant, fx.design_stage(plant, progress=False))
+    assert found.serves(0.7 * servo)
+    assert np.interp(0.7 * servo, found.freq, found.S[0]) < 1.0

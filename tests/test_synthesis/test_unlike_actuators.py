@@ -10,6 +10,7 @@ from flexplant.plant.uncertainty.delta import with_changes
 from flexplant.plant.uncertainty.mode_delta import FrequencyDelta
 from judge import closed, gain, judged, through
 
+
 @cache
 def machine(seed):
     """A slide on a base with a tool on flexures, 6 to 150 times lighter, and a holder on it."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray
 from ..certificates import one_line
-from ..errors import ModelError, require_known, warn
+from ..errors import ModelError, only_one, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
 from ..lti.modal_map import Obstacle, obstacle
@@ -454,12 +454,14 @@ class ClosedLoop(Value):
         grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)
         return Spectrum(grid, densities(self.monitored, row, noises)(grid).sum(axis=0))
 
-    def budget(self, channel: str, *, residue: Any = None, start: float = 0.0) -> ErrorBudget:
+    def budget(
+        self, channel: str | None = None, *, residue: Any = None, start: float = 0.0
+    ) -> ErrorBudget:
         """Return the error budget of a signal: variance and cumulative spectrum of each source.
 
         Parameters
         ----------
-        channel : as for `rms`
+        channel : as for `rms`; by default the only error, such as `die:error`
         residue : Response, mapping {channel: samples} or (n_time,) array, optional
             A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``.
             The error in it is an additional source, whose variance is the mean square.
@@ -474,16 +476,15 @@ class ClosedLoop(Value):
         Raises
         ------
         LabelError, AssumptionError, ModelError, CertificateError
-            As for `rms`; also when the residue does not match the loop, or when the integral of the
-            spectrum differs from the variance.
+            As for `rms`; when the residue does not match, or two ways to the variance differ.
         """
-        row, noises = self._noises(channel)
-        left_out, whole = float("nan"), self.completed
+        errors = [name for name in self.plant.z if name.endswith(":error")]
+        channel = channel or only_one("error", errors, None, "channel=")
+        row, white = self._noises(channel)
+        out, whole = float("nan"), self.completed
         if whole is not None:
-            left_out = whole.rms(channel) if whole.is_stable else float("inf")
-        found = error_budget(
-            self.monitored, row, noises, residue=residue, start=start, left_out=left_out
-        )
+            out = whole.rms(channel) if whole.is_stable else float("inf")
+        found = error_budget(self.monitored, row, white, residue=residue, start=start, left_out=out)
         known = self.plant.machine.machines is not None
         return found.replace(interval=self.interval(channel).sentence) if known else found
 

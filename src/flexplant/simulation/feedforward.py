@@ -150,10 +150,10 @@ class Feedforward(Value):
 
 def design_feedforward(
     given: StandardPlant | ClosedLoop,
+    move: SetPointProfile | None = None,
     *,
     reference: str | None = None,
     order: int = 4,
-    move: SetPointProfile | None = None,
     along: npt.ArrayLike | None = None,
     elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
     slow_zeros: bool = True,
@@ -193,12 +193,12 @@ def design_feedforward(
     given : StandardPlant or ClosedLoop
         Plant that was assembled from a structure, or a closed loop around a model, without
         feedforward. The plant is sampled if the feedforward is for a sampled loop.
+    move : SetPointProfile, optional
+        Move for which the errors of a loop are minimised. Its order limits the order of the gains.
     reference : str, optional
         Channel of the reference; by default the only one of the plant.
     order : int
         Order of the highest derivative: 2 (acceleration), 3 (jerk) or 4 (snap).
-    move : SetPointProfile, optional
-        Move for which the errors of a loop are minimised. Its order limits the order of the gains.
     along : (p, 3) array [m], optional
         Places of a POI that moves (`simulate(moving=)`). Gains are computed for each place.
     elements : mapping {name: element, or a list of some}, optional
