@@ -308,7 +308,7 @@ def modulus_margin(loop: Loop) -> float:
         counts as a free rigid-body motion. For a measured plant, S is evaluated at its frequencies,
         and between them at the modes that are visible in the data. If the actuators have several
         units (N and N m), or those of a ClosedLoop need forces that differ by more than a factor of
-        4 for equal motions, the result is the margin with scaled axes, `LoopReport.scaled_margin`.
+        5 for equal motions, the result is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------
