@@ -296,7 +296,7 @@ def test_a_structured_loop_that_is_not_stable_has_no_h2_norm():
 def test_the_proven_tolerance_ends_where_the_stiffness_of_the_mode_does():
     """By hand: the lead damps the mode as long as there is one, 10 units of 5 % either way."""
     deltas = off_by(0.05)
-    found = fx.synthesis.robust_stability(deltas, lead(), quick=False)
+    found = fx.synthesis.robust_stability(deltas, lead(), resolution=0.05)
     size = 1.0 / found.upper
     for sign in (-0.98, 0.98):
         machine = deltas.lft({"mode2:freq": sign * size})

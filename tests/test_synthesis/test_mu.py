@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError, ShapeError
 from flexplant.lti import StateSpace, append, discretized, lft, series
 from flexplant.synthesis import FullBlock, RepeatedScalar, mu
+from flexplant.synthesis.robustness.mu_bounds import Cover
 from flexplant.synthesis.robustness.power_starts import power_iterations
 from flexplant.synthesis.robustness.uncertainty_blocks import block_places, matrix_of
 
@@ -294,3 +296,28 @@ def test_refusals():
         mu(np.eye(3), [FullBlock(), FullBlock()])
     with pytest.raises(ModelError, match="RepeatedScalar"):
         mu(np.eye(3), ["real"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_one_scaling_holds_for_many_light_modes(seed):
+    """Springs of eight modes on a chain of masses, off by what the damping cannot cover alone."""
+    rng = np.random.default_rng(seed)
+    n, size = 8, 0.02
+    omega, zeta = np.geomspace(10.0, 300.0, n) * rng.uniform(0.9, 1.1, n), 1e-3
+    shapes = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    B = np.vstack([np.zeros((n, n)), np.eye(n)])
+    damper = 1e-3 * np.outer(shapes[0], shapes[0]) * omega.min()
+    A = np.block([[np.zeros((n, n)), np.eye(n)],
+                  [-np.diag(omega**2), -np.diag(2 * zeta * omega) - damper]])  # fmt: skip
+    C = np.hstack([-2.0 * size * np.diag(omega**2), np.zeros((n, n))])
+    M = StateSpace(A, B, C, np.zeros((n, n)))
+    cover = Cover(M, [RepeatedScalar()] * n, least=0.25)
+    found = cover.run()
+    assert np.sqrt(found.level) == 0.5
+    assert found.intervals <= 4
+    # complex Deltas of a tenth of the size would do
+    assert fx.hinf_norm(M) > 5.0
+    for _ in range(200):
+        deltas = 2.0 * rng.choice([-1.0, 1.0], n) * rng.uniform(0.0, 1.0, n) ** 0.1
+        assert np.linalg.eigvals(A + B @ np.diag(deltas) @ C).real.max() < 0.0

@@ -176,7 +176,7 @@ def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
         machine = deltas.lft(dict(zip(names, corner, strict=True)))
         weighted = machine.weighted(w=w, z={name: z.get(name) for name in machine.z})
         assert fx.hinf_norm(lft(weighted.system, found.system)) <= found.gamma * 1.001
-    assert robust_stability(deltas, found).upper < found.gamma
+    assert robust_stability(deltas, found, resolution=0.1).upper < found.gamma
 
 
 @pytest.mark.long
@@ -236,6 +236,6 @@ def test_real_deltas_of_light_modes_are_covered_in_a_few_intervals():
     known = sampled_plate.uncertain(frequency=dict.fromkeys(range(4, 9), 0.001))
     static = fx.design_static(sampled_plate)
     servo = fx.design_servo(sampled_plate, bandwidth=60.0, observer=static)
-    found = robust_stability(known, static, servo)
+    found = robust_stability(known, static, servo, resolution=0.05)
     assert found.upper <= 0.05  # what need not be resolved
     assert 0 < found.certificate["intervals by Hamiltonians"] < 100

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, whole
+from ...arrays import ComplexArray, FloatArray, positive, whole
 from ...certificates import Certificate, Verified, stability
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
@@ -30,8 +30,6 @@ from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
 from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
-#: mu below this is not resolved
-_RESOLVED = 0.05
 #: starts of a search at each frequency
 _STARTS = 3
 #: largest multiple of an uncertainty that the quick bound tries
@@ -51,7 +49,8 @@ class RobustStability(Value):
     upper : float
         Upper bound of the structured singular value mu. A Delta is an uncertainty that is scaled to
         size 1. Every machine whose Deltas are smaller than ``1 / upper`` is stable. If `upper` is
-        below 1, all machines of the uncertainty are stable. Values below 0.05 are not refined.
+        below 1, all machines of the uncertainty are stable. If mu is below the `resolution` of the
+        search, `upper` is that resolution.
     lower : float
         Lower bound of mu. A machine with Deltas of size ``1 / lower`` is not stable. The bound is 0
         if no such machine was found. It is also 0 if none was searched for, because all machines of
@@ -120,6 +119,7 @@ def robust_stability(
     uncertain: UncertainPlant[Any],
     *blocks: Any,
     quick: bool = False,
+    resolution: float = 0.25,
     machines: int = 20,
     rng: Any = 0,
     progress: bool | None = None,
@@ -146,7 +146,12 @@ def robust_stability(
         bound uses one channel for each mode, is valid to first order in the changes, and is
         computed on a frequency grid through the resonances. If it is below 1, it is the result.
         Otherwise the full search follows. For twenty modes the simpler bound takes less than a
-        second, and the full search takes ten.
+        second. The full search takes as long if mu is below `resolution`, otherwise ten seconds or
+        more.
+    resolution : float
+        Smallest mu that is computed to 0.5 %. If mu is smaller, the search ends with this number as
+        `upper`: 0.25 proves that all machines of four times the uncertainty are stable. At 0.9 the
+        search only decides whether the loop is robust, and takes less time.
     machines : int
         Number of machines drawn. Each Delta of a machine is at an end of its interval.
     rng : int, SeedSequence, Generator or None
@@ -183,14 +188,14 @@ def robust_stability(
     True
     """
     count = whole(machines, "machines", minimum=0, maximum=MOST)
-    chance = generator(rng)
+    least, chance = positive(resolution, "resolution"), generator(rng)
     if quick:
         first = _quick(uncertain, blocks, count, chance)
         if first is not None:
             return first
     loop = uncertain_loop(uncertain, blocks)
     with Progress(None, INTERVALS, progress=progress):
-        found = Cover(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2).run()
+        found = Cover(loop.system, loop.blocks, heights=loop.heights, least=least**2).run()
     upper = float(np.sqrt(found.level))
     # below 1 the upper bound is the answer: the worst machine lies outside of the uncertainty
     worst = None if upper < 1.0 else _worst(loop, found, upper, chance)
@@ -205,7 +210,7 @@ def robust_stability(
     return RobustStability(
         upper,
         min(lower, upper),
-        float(loop.freq(found.omega)) if upper > _RESOLVED else float("nan"),
+        float(loop.freq(found.omega)) if upper > least else float("nan"),
         values,
         machine,
         loop.freq(found.frequencies),

@@ -13,6 +13,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, ModelError, SolverError
@@ -28,8 +29,9 @@ from ...store import Value
 from ...tolerances import ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
 from .power_starts import power_iterations
+from .shared_multipliers import shared_scalings
 from .uncertainty_blocks import Perturbation, Place, Scalings, block_places, evened, matrix_of
-from .upper import WIDE, centred, reached_level, upper_level
+from .upper import WIDE, centred, reached_level, reached_levels, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
 _SOUGHT, _STARTS = 8, 10
@@ -44,6 +46,8 @@ _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
 _OFFSETS = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
 _POINTS = 24  # evenly, and by the logarithm
+#: fraction of the level that scalings reach at a frequency, so that they hold around it
+_LEFT = 0.995
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -253,6 +257,12 @@ class Cover:
         self.respond = responder(g)
         poles = g.poles()
         self.poles = poles[poles.imag >= 0]
+        light = poles[poles.imag > 0]
+        light = light[np.argsort(light.imag)]
+        #: poles that swing; of those with one peak, as of a mode and its observer, the first
+        self.swinging = light[np.diff(light.imag, prepend=-np.inf) > _OFFSETS[1] * -light.real]
+        #: whether some scalings hold for many resonances: with G, all blocks at the level
+        self.shares = bool(np.any(self.scalings.of_G)) and not self.scalings.skewed
         self.level = self.least
         self.omega = 0.0
         self.found: list[tuple[float, float]] = []
@@ -298,8 +308,15 @@ class Cover:
         tried = np.unique(np.concatenate([[0.0], swing, size]))
         # sigma_max of the evened M: a bound without optimisation, reals taken as complex
         M = self.at(tried) * np.array([self.tall(w, w) for w in tried])[:, None]
-        simple = np.linalg.norm(evened(M, self.where), 2, axis=(1, 2))
-        for i in np.argsort(-simple)[:6]:
+        bounds = np.linalg.norm(evened(M, self.where), 2, axis=(1, 2)) ** 2
+        if self.shares:
+            W = self._with_identity(M)
+            bounds = np.minimum(
+                bounds, reached_levels(W, self.scalings, shared_scalings(M, self.scalings))
+            )
+        for i in np.argsort(-bounds)[:6]:
+            if self.found and bounds[i] <= _LEFT * self.level:
+                break
             self._raise(M[i], float(tried[i]))
 
     def _raise(self, M: ComplexArray, omega: float) -> FloatArray:
@@ -330,8 +347,12 @@ class Cover:
         for growth in _GROWTH[-1:] if self.heights is None else _GROWTH:
             tried = self._tried(gap, omega, growth)
             tall = self.tall(*tried)
+            shared = self._shared(tried, tall)
+            if shared is not None:
+                omega, x = shared
+                break
             W = np.vstack([np.eye(self.scalings.w), M * tall])
-            if near is not None and reached_level(W, self.scalings, near) < 0.995 * self.level:
+            if near is not None and reached_level(W, self.scalings, near) < _LEFT * self.level:
                 x = near
                 break
         if x is None:
@@ -347,6 +368,27 @@ class Cover:
         if ends.low > tried.low or ends.high < tried.high:
             self.last = [*self.last[-30:], (omega, x)]
         return ends
+
+    def _shared(self, tried: Interval, tall: FloatArray) -> tuple[float, FloatArray] | None:
+        """Return scalings that hold at several resonances of an interval, and one of these."""
+        swing = self.swinging.imag
+        omegas = swing[(swing > tried.low) & (swing < tried.high)]
+        if not self.shares or omegas.size < 2:
+            return None
+        M = self.at(omegas) * tall
+        x = shared_scalings(M, self.scalings)
+        holds = reached_levels(self._with_identity(M), self.scalings, x) < _LEFT * self.level
+        # the longest run of frequencies at which they hold
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
+        if not ends.size:
+            return None
+        first, last = max(ends.reshape(-1, 2), key=lambda run: run[1] - run[0])
+        return (float(omegas[(first + last) // 2]), x) if last - first > 1 else None
+
+    def _with_identity(self, M: ComplexArray) -> ComplexArray:
+        """Return [I; M] of each response (n, w + z, w)."""
+        w = self.scalings.w
+        return np.concatenate([np.broadcast_to(np.eye(w), (len(M), w, w)), M], axis=1)
 
     def _chosen(self, gap: Interval) -> float:
         """Return a frequency inside a gap: a resonance, or its middle."""
@@ -386,15 +428,9 @@ class Cover:
             low = max([low, *crossings[crossings < omega * (1 - ROUNDING)]])
             high = min([high, *crossings[crossings > omega * (1 + ROUNDING)]])
         points = self._points(low, high, omega)
-        M = self.at(points) * tall
-        W = np.concatenate(
-            [np.broadcast_to(np.eye(tall.size), (points.size, tall.size, tall.size)), M], axis=1
-        )
-        F = W.conj().swapaxes(1, 2) @ S @ W
-        # relative to the sizes of its entries
-        size = np.sqrt(np.abs(np.einsum("nii->ni", F)) + TINY)
-        least = np.linalg.eigvalsh(F / size[:, :, None] / size[:, None, :])[:, 0]
-        bad = points[least <= 0.0]
+        M, w = self.at(points) * tall, tall.size
+        half = (0.5 * S[w:, w:] @ M + S[:w, w:].conj().T).conj().swapaxes(1, 2) @ M
+        bad = points[_indefinite(S[:w, :w] + half + half.conj().swapaxes(1, 2))]
         below, above = bad[bad < omega], bad[bad > omega]
         if below.size:
             good = points[(points > below[-1]) & (points <= omega)]
@@ -406,7 +442,9 @@ class Cover:
 
     def _points(self, low: float, high: float, omega: float) -> FloatArray:
         """Return frequencies in an interval, at and around the resonances."""
-        swing, width = self.poles.imag, np.abs(self.poles.real)
+        real = self.poles[self.poles.imag == 0]
+        kept = np.concatenate([real, self.swinging])
+        swing, width = kept.imag, np.abs(kept.real)
         offsets = np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
         near = (swing[:, None] + width[:, None] * offsets).ravel()
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
@@ -430,3 +468,14 @@ class Cover:
         H = np.block([[F, -B @ RB], [-Q + Y @ RY, -F.conj().T]])
         swing = axis_frequencies(H)
         return np.sort(swing[swing > 0])
+
+
+def _indefinite(F: ComplexArray) -> NDArray[np.bool_]:
+    """Return which of Hermitian matrices (n, w, w) are not positive definite."""
+    try:
+        np.linalg.cholesky(F)
+    except np.linalg.LinAlgError:
+        # relative to the sizes of its entries
+        size = np.sqrt(np.abs(np.einsum("nii->ni", F)) + TINY)
+        return np.asarray(np.linalg.eigvalsh(F / size[:, :, None] / size[:, None, :])[:, 0] <= 0.0)
+    return np.zeros(len(F), dtype=bool)

@@ -128,6 +128,14 @@ def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
     return float(la.eigh(schur, grows[np.ix_(moving, moving)], eigvals_only=True)[-1])
 
 
+def reached_levels(W: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArray:
+    """Return the smallest level for which F(x) >= 0 of each W (n, w + z, w); not skewed."""
+    S0, S1 = scalings.matrix(x, 0.0), scalings.matrix(x, 1.0)
+    root = np.linalg.cholesky((S1 - S0)[: scalings.w, : scalings.w])
+    even = W @ np.linalg.inv(root).conj().T
+    return np.asarray(np.linalg.eigvalsh(-(even.conj().swapaxes(1, 2) @ S0 @ even))[:, -1])
+
+
 def centred(
     W: ComplexArray,
     scalings: Scalings,
