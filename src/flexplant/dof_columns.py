@@ -30,7 +30,7 @@ class Interpolation(Value):
         """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`."""
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one."""
+        """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""
         places = real_array(points, "points", (None, 3))
         return np.array([self.row(point, direction) for point in places])
 

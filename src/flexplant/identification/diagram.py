@@ -85,9 +85,11 @@ class PoleSelection(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StabilisationDiagram(Value):
-    """Poles of all model orders, and whether each was present at the previous order.
+    """Poles of models of rising order, and whether each was present at the previous order.
 
-    A track is a sequence of poles at successive model orders that belong together.
+    `stabilisation_diagram` fits models of several orders to an FRF. A pole of the machine appears
+    at nearly all orders, and a pole that fits noise changes from order to order. A track is a
+    sequence of poles at successive model orders that belong together.
 
     Parameters
     ----------
@@ -145,8 +147,8 @@ class StabilisationDiagram(Value):
         """Return the poles that are stable over the orders.
 
         A track is accepted if its pole is stable at four or more orders. It must also be stable at
-        the fraction `presence` of the orders, counted from the first one of the track to the
-        highest one. All poles are taken from one order, the one with most accepted tracks. The
+        no less than the fraction `presence` of the orders from the first order of the track to the
+        highest order. All poles are taken from one order, the one with most accepted tracks. The
         participation vectors of repeated poles therefore belong together.
 
         Parameters

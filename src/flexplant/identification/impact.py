@@ -85,7 +85,7 @@ class ImpactTest(Value):
 
     Examples
     --------
-    The resonance decays with 2 1/s. The window adds 2 1/s, and `corrected` subtracts them:
+    The decay rate of the resonance is 2 1/s. The window adds 2 1/s, and `corrected` subtracts it:
 
     >>> import flexplant as fx
     >>> import numpy as np
@@ -128,17 +128,19 @@ class ImpactTest(Value):
 
         Poles whose remaining damping is smaller than its standard deviation are moved to
         `rejected`. Force and responses that are multiplied by the window ``w = exp(-t/tau)`` have
-        the FRF ``H(s + 1/tau)``. Poles move by exactly -1/tau, and residues do not change. The
-        covariance is corrected too, for white noise and segments of length T. For a pole with the
-        real part -a on the machine, the derivative of the response with respect to the pole has the
-        envelope ``g = t exp(-(a + 1/tau) t)``. The variance of the pole for independent lines is
-        multiplied by
+        the FRF ``H(s + 1/tau)``. Poles move by exactly -1/tau, and residues do not change.
+
+        The covariance is corrected too. The noise is assumed white, and T is the length of a
+        segment. For a pole with the real part -a on the machine, the derivative of the response
+        with respect to the pole has the envelope ``g = t exp(-(a + 1/tau) t)``. The fit assumes
+        independent errors of the lines. The variance of the pole that follows from this assumption
+        is multiplied by
 
         .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
             \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
 
-        and divided by `dependence`, by which the variance of `frf` was multiplied. For residues the
-        exponent is 1 in place of 3.
+        where the bar denotes the mean over a segment. It is then divided by `dependence`, by which
+        the variance of `frf` was multiplied. For residues the exponent is 1 in place of 3.
 
         Parameters
         ----------

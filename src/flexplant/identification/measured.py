@@ -361,9 +361,10 @@ def numbered(
     model : Modes, or a model with `.modes()`
         Model whose modes are numbered from 1, rigid-body modes included.
     at : Ports, or mapping {label of a shape's row: place or sensor}, optional
-        Places on the model of the rows of the shapes. Ports give the places of their sensors and
-        actuators. A mapping gives the place of each row, as a sensor or a point. A sensor has a
-        direction, and a point has the direction z. None: the labels are those of DOFs of the model.
+        Places on the model where the shapes were measured, one for each row. Ports give the places
+        of their sensors and actuators. A mapping gives the place of each row, as a sensor or a
+        point. A sensor contains its direction, and at a point the direction is z. None: the labels
+        of the rows are labels of DOFs of the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float

@@ -286,16 +286,16 @@ class IdentifiedModes(MeasuredModes):
         Delay of the measurement, in samples of the hold.
     segment : float [s], optional
         Length of the Hann-windowed segments of the measurement, whose effect the fit includes.
-    unreported : complex array
-        Poles just outside the band that improve the fit, with their shapes and participation
-        vectors.
+    unreported : three complex arrays (p,), (n_out, p), (n_in, p)
+        Poles of modes just outside the band that are part of the fit, their shapes, and their
+        participation vectors.
     mass_normalised : bool
         Whether the shapes are scaled as those of a model, with ``phi^T (2 lambda M + D) phi = 2i
         Im(lambda)``. This needs an input and an output at the same DOF. Otherwise the largest entry
         of each shape is 1.
     misfit : float
-        Weighted squared error of the fit per degree of freedom. It is 1 if the error is only noise
-        with the stated variance.
+        Weighted squared error of the fit, relative to its expected value if the error is only noise
+        with the stated variance. A value of 1 is therefore good.
     diagram : StabilisationDiagram, optional
         Diagram from which the poles were chosen.
     channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
@@ -304,7 +304,7 @@ class IdentifiedModes(MeasuredModes):
         correlation between the errors of outputs. If this correlation is not known, the errors of
         outputs are assumed independent.
     rejected : sequence of (frequency [Hz], damping ratio, reason)
-        Poles and mains lines that are not reported.
+        Poles that are not reported, and frequencies of mains hum that the fit leaves out.
     first_answer : str
         Reason why the poles were not refined by maximum likelihood. Empty: they were refined.
     inconsistency : float, optional
@@ -368,7 +368,7 @@ class IdentifiedModes(MeasuredModes):
 
     @property
     def shape_covariance(self) -> ComplexArray | None:
-        """Covariance E[n n^H] (m, n_out, n_out) of the error n of each shape, or None."""
+        """Covariance E[n n^H] (m, n_out, n_out) of the error n of each shape; None: not known."""
         count, spread = len(self.outputs), self.channel_covariance
         return None if spread is None else spread[:, :count, :count]
 

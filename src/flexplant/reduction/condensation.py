@@ -152,7 +152,8 @@ class Guyan(ReductionMethod):
 class Irs(ReductionMethod):
     """Improved reduced system: static condensation with the inertia of the condensed DOFs.
 
-    `Guyan` gives the matrix T_s and the reduced matrices M_s and K_s. The first iteration is the
+    `Guyan` gives the matrix T_s and the reduced matrices M_s and K_s. Kss is the block of K of the
+    condensed DOFs. The first iteration is the
     IRS of O'Callahan, ``T_1 = T_s + S M T_s M_s^-1 K_s`` with ``S = diag(0, Kss^-1)``. In further
     iterations, the previous T and its reduced mass and stiffness replace T_s, M_s and K_s in the
     second term. The iterations converge to `Serep`, in which the lowest k modes are exact.
@@ -475,10 +476,11 @@ class Rubin(_FreeInterface):
 
     The motions are combinations of the modes of the structure with a free boundary and of residual
     attachment vectors. Such a vector is the static displacement under a unit force at a boundary
-    DOF, minus the part that the modes describe. The coordinates are the boundary DOFs, then the
-    modal coordinates ("mode 1", ...). The modes are exact. The response to loads on the boundary is
-    exact up to order omega^2. All other frequencies are above the true ones. In a free structure,
-    the inertia forces of the rigid-body acceleration balance the unit force (inertia relief).
+    DOF, minus the part that the modes describe (the residual flexibility). The coordinates are the
+    boundary DOFs, then the modal coordinates ("mode 1", ...). The modes are exact. The response to
+    loads on the boundary is exact up to order omega^2. All other frequencies are above the true
+    ones. In a free structure, the inertia forces of the rigid-body acceleration balance the unit
+    force (inertia relief).
 
     Parameters
     ----------
@@ -511,7 +513,9 @@ class Rubin(_FreeInterface):
 class MacNeal(_FreeInterface):
     """Free modes and the residual flexibility of the boundary, without inertia.
 
-    In contrast to `Rubin`, the truncated modes contribute only their static response. The boundary
+    The residual flexibility is the static displacement that the truncated modes contribute under
+    unit forces on the boundary. In contrast to `Rubin`, they contribute only this static response.
+    The boundary
     coordinates have no mass: their rows of the reduced mass matrix are zero. The poles are only
     those of the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model
     has a feedthrough. The boundary gets mass when the model is joined to others, or when `update`

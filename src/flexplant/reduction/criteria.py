@@ -42,14 +42,14 @@ class SelectionCriterion(Value):
 
     @abstractmethod
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of the rows of `pool` (p, k) that are chosen.
+        """Return the positions of the `count` rows of the array `pool` (p, k) that are chosen.
 
-        The number of chosen rows is `count`. The rows `required` (q, k) are kept in any case.
+        The rows of `required` (q, k) are chosen already and are not counted.
         """
 
     @abstractmethod
     def values(self, rows: Rows) -> FloatArray:
-        """Return the value of the criterion for each of the chosen rows, in their order."""
+        """Return the value of the criterion for each of the chosen rows (n, k), in their order."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,7 +74,10 @@ class PivotedQr(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of the chosen rows of `pool`."""
+        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
+
+        The rows of `required` are chosen already.
+        """
         if not count:
             return []
         if required.shape[0]:
@@ -92,8 +95,9 @@ class PivotedQr(SelectionCriterion):
 class EffectiveIndependence(SelectionCriterion):
     """Effective independence: drop the DOF that adds least to the information on the modes.
 
-    The search starts with all candidates. Their information on the modes is ``Q = phi^H phi``. Row
-    i of phi has the share ``E_i = phi_i Q^-1 phi_i^H`` in it, a number from 0 to 1. If the share is
+    The matrix phi has a row for each candidate DOF, with its motion in each mode. The search starts
+    with all candidates. Their information on the modes is ``Q = phi^H phi``. Row i of phi has the
+    share ``E_i = phi_i Q^-1 phi_i^H`` in it, a number from 0 to 1. If the share is
     1, the modes cannot be distinguished without this row. The row with the lowest share is dropped,
     Q^-1 is updated, and this is repeated. If fewer DOFs than modes are wanted, the search stops
     when as many rows as modes are left. `PivotedQr` then chooses among these rows.
@@ -113,7 +117,10 @@ class EffectiveIndependence(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of the chosen rows of `pool`."""
+        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
+
+        The rows of `required` are chosen already.
+        """
         if not count:
             return []
         fixed, p = required.shape[0], pool.shape[0]
@@ -174,7 +181,10 @@ class Greedy(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of the chosen rows of `pool`."""
+        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
+
+        The rows of `required` are chosen already.
+        """
         taken: Any = np.array(required)
         free = np.ones(pool.shape[0], dtype=bool)
         found: list[int] = []
@@ -187,7 +197,7 @@ class Greedy(SelectionCriterion):
         return found
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return the smallest singular value of each row together with all rows before it."""
+        """Return, for each row, the smallest singular value of the matrix of all rows up to it."""
         return np.array([la.svdvals(rows[: i + 1])[-1] for i in range(rows.shape[0])])
 
 

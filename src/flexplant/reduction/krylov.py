@@ -44,7 +44,8 @@ class Krylov(ReductionMethod):
     Parameters
     ----------
     inputs : place or sequence of places
-        Places of loads: DOF labels, points (z) or mappings.
+        Places of loads. A place is a DOF label, a point (x, y, z), at which the direction is z, or
+        a mapping {label: weight}.
     freq : float or sequence of float [Hz]
         Frequencies at which the response is matched. A resonance of an undamped model is refused. A
         frequency of 0 matches the static response. For a free structure, this is the response to

@@ -116,7 +116,8 @@ def rank_modes(
     modes : Modes
         Real and damped modes. Attachment vectors are ignored.
     inputs, outputs : place or sequence of places
-        Places of forces and displacements: DOF labels, points (z) or mappings. Without `outputs`,
+        Places of forces and displacements. A place is a DOF label, a point (x, y, z), at which the
+        direction is z, or a mapping {label: weight}. Without `outputs`,
         the displacements are taken at the inputs.
 
     Raises
@@ -208,7 +209,7 @@ class ErrorBound(Value):
     inputs, outputs : sequence of str
         Channels for which the bound holds.
     rule : str
-        Rule from which the bound follows.
+        Description of the rule that gives the bound, as it is printed.
     terms : (k, 3) array, optional
         Gain ``||c|| ||b||`` [1/kg], frequency [rad/s] and damping ratio of every neglected mode.
         Here b holds the displacements of the mode at the inputs, and c those at the outputs.
@@ -251,11 +252,12 @@ class ErrorBound(Value):
     def below(self, freq: float) -> float:
         """Return the bound [m/N] for all frequencies up to `freq` [Hz].
 
-        A neglected mode i has the response ``g_i h_i(w)`` with the gain g_i. If the mode lies above
-        `freq`, its response up to `freq` is far below its peak. The bound is the smallest of three
-        values. The first is `value`. The second is the sum over the modes of the largest
-        ``g_i |h_i(w)|`` up to `freq`, and it needs `terms`. The third is the static error plus the
-        sum of the largest ``g_i |h_i(w) - h_i(0)|``, and it needs `terms` and `static`.
+        A neglected mode i has the response ``g_i h_i(w)``. Here g_i is the gain in `terms`, and h_i
+        is ``1 / (omega_i^2 - w^2 + 2j zeta_i omega_i w)`` at the angular frequency w. If the mode
+        lies above `freq`, its response up to `freq` is far below its peak. The bound is the
+        smallest of three values. The first is `value`. The second is the sum over the modes of the
+        largest ``g_i |h_i(w)|`` up to `freq`, and it needs `terms`. The third is the static error
+        plus the sum of the largest ``g_i |h_i(w) - h_i(0)|``, and it needs `terms` and `static`.
         """
         top = 2 * np.pi * positive(freq, "freq")
         if self.terms is None:

@@ -62,7 +62,7 @@ class ReducedModel(Value):
         Name of the reduction method.
     condition : float
         Condition number of the matrix that the method inverts: phi_kk (the rows of the modes at the
-        kept DOFs), or the scaled M*.
+        kept DOFs), or M* scaled to a diagonal of ones.
     coordinates : sequence of k str
         Names of all coordinates: first the labels of `dofs`, then names of coordinates that are not
         DOFs, such as "mode 7". Empty: the labels of `dofs`.
@@ -195,11 +195,11 @@ class ReducedModel(Value):
         return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
+        """Return the inertia loads (k, r) of motions (k, r): the product ``M* @ motions``."""
         return np.asarray(self.M @ motions)
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the fraction (6,) of each rigid-body motion that T cannot make.
+        """Return the fraction (6,) of each rigid-body motion that T cannot represent.
 
         Rotations turn about the point `about` [m].
         """
@@ -207,9 +207,10 @@ class ReducedModel(Value):
         return relative_miss(self.T @ self.rigid_motions(about), wanted)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
+        """Return the six rigid-body motions of the geometry in the k coordinates, as (k, 6).
 
-        Rotations turn about the point `about` [m].
+        Rotations turn about the point `about` [m]. If T cannot represent a motion exactly, its
+        column approximates it.
         """
         centre = real_array(about, "about", (3,))
         if self.is_physical:
@@ -229,7 +230,10 @@ class ReducedModel(Value):
 
     @property
     def body_motions(self) -> FloatArray:
-        """The M-orthonormal rigid-body motions (k, r) that T can make, whether held or free."""
+        """The M-orthonormal rigid-body motions (k, r) that T can represent.
+
+        Motions that springs to the ground hold are included.
+        """
         if self.joint_motions is not None:
             return orthonormalised(self.M, self.joint_motions, dependent="drop")
         made = self.missed_motions() < NEGLIGIBLE
@@ -390,9 +394,10 @@ class ReducedModel(Value):
         band : (float, float) [Hz]
             Frequency band of the comparison.
         inputs, outputs : places
-            Places of forces and displacements: DOF labels, points (z) or mappings. Without
-            `inputs`, the channels are those of the error bound. With `inputs` but without
-            `outputs`, the displacements are taken at the inputs.
+            Places of forces and displacements. A place is a DOF label, a point (x, y, z), at which
+            the direction is z, or a mapping {label: weight}. Without `inputs`, the channels are
+            those of the error bound. With `inputs` but without `outputs`, the displacements are
+            taken at the inputs.
         count : int, optional
             Number of modes that are compared. None: all modes up to the end of the band.
         freq : (m,) array [Hz], optional

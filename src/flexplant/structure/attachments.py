@@ -78,7 +78,11 @@ class PointMass(Value):
         self._set(inertia=tuple(about.tolist()))
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return tuples ("M", row, weight). Each adds weight row^T row to the matrix M."""
+        """Return the additions to the matrix M, as a list of tuples ("M", row, weight).
+
+        The row (n,) gives a motion of the place from the n DOFs, and the weight is the mass or the
+        moment of inertia. The addition is ``weight row^T row``.
+        """
         if isinstance(self.at, str | Mapping):
             return [("M", dofs.row(self.at), self.mass)]
         moved = [d for d in ("x", "y", "z") if d in dofs.directions]
@@ -128,7 +132,11 @@ class Spring(Value):
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return a tuple ("K", row, weight), which adds weight row^T row to the matrix K."""
+        """Return the addition to the matrix K, as a list of one tuple ("K", row, weight).
+
+        The row (n,) gives the motion of one end relative to the other from the n DOFs, and the
+        weight is the stiffness. The addition is ``weight row^T row``.
+        """
         return [("K", _stretch(self, dofs), self.stiffness)]
 
 
@@ -168,7 +176,11 @@ class Damper(Value):
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
-        """Return a tuple ("D", row, weight), which adds weight row^T row to the matrix D."""
+        """Return the addition to the matrix D, as a list of one tuple ("D", row, weight).
+
+        The row (n,) gives the motion of one end relative to the other from the n DOFs, and the
+        weight is the damping. The addition is ``weight row^T row``.
+        """
         return [("D", _stretch(self, dofs), self.rate)]
 
 

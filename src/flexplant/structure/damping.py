@@ -123,7 +123,7 @@ class ModalDamping(Damping):
         Raises
         ------
         ModelError
-            When a pole is not stable and oscillating, or mode numbers are missing or doubled.
+            When a pole is unstable or real, or mode numbers are missing or given twice.
 
         Examples
         --------
@@ -228,8 +228,8 @@ class Rayleigh(Damping):
         Raises
         ------
         ModelError
-            When frequencies are not positive and different, or no Rayleigh damping goes through
-            the two ratios.
+            When a frequency is not positive, or all are equal. Also when no Rayleigh damping with
+            alpha and beta of at least 0 gives the two ratios.
 
         Examples
         --------

@@ -100,7 +100,7 @@ class ScatteredShape(Interpolation):
 
     Examples
     --------
-    In a translation along x, the weights of five nodes add up to one:
+    The weights of the five nodes add up to one, so that a translation along x is exact:
 
     >>> import flexplant as fx
     >>> import numpy as np

@@ -318,8 +318,8 @@ class FEMatrices(Value):
         ModelError
             When M is missing, a matrix is not symmetric, or K is not positive semidefinite.
         SolverError
-            When the residuals are too large, or when a Sturm count finds another number of
-            frequencies.
+            When the residuals are too large. Also when frequencies are missing, which a Sturm
+            count shows (it counts eigenvalues below a limit by a factorisation of K).
 
         Examples
         --------

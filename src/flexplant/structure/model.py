@@ -194,7 +194,10 @@ class FEModel(Placed, Value):
 
     @cached_property
     def body_motions(self) -> FloatArray:
-        """The M-orthonormal rigid-body motions (n, r) of every piece, whether held or not."""
+        """The M-orthonormal rigid-body motions (n, r), whether the structure is held or not.
+
+        Parts of the structure that nothing joins have separate motions.
+        """
         if self.joint_motions is None:
             motions = body_motions(self.M, self.K, self.dofs)
         else:
@@ -211,14 +214,15 @@ class FEModel(Placed, Value):
         return int(unstable_stiffness(self.K, self.body_motions).size)
 
     def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return the loads (n, r) ``M motions`` of motions (n, r)."""
+        """Return the inertia loads (n, r) of motions (n, r): the product ``M @ motions``."""
         return np.asarray(self.M @ motions)
 
     def ground_inertia(self, ground: FloatArray) -> FloatArray:
         """Return the inertia load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
 
         The motion holds x, y, z, rx, ry, rz, with rotations about the origin. f marks the free DOFs
-        and s the held DOFs. M_fs is known only for DOFs that `fixed` holds.
+        and s the held DOFs, and r_f and r_s are their displacements in this motion. M_fs is known
+        only for DOFs that `fixed` holds.
         """
         load = self.inertia(self.rigid_motions() @ ground)
         return load if self.held_inertia is None else load + self.held_inertia @ ground
@@ -226,7 +230,8 @@ class FEModel(Placed, Value):
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return how much the DOFs held by `fixed` prevent each of six rigid-body motions (6,).
 
-        Springs to ground do not count, since the DOFs can still make the motion. For a motion r the
+        The argument `about` is the point [m] about which rotations turn. Springs to ground do not
+        count, since the DOFs can still make the motion. For a motion r the
         result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
         square root of K_ii. The terms of K r cancel everywhere except next to held DOFs. The result
         is therefore 0 for a motion that no held DOF prevents.

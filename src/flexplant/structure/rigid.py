@@ -475,7 +475,10 @@ class Placed:
         return self.dofs.rows(points, direction)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the six rigid-body motions (n, 6), rotations about a point [m]."""
+        """Return the six rigid-body motions (n, 6) x, y, z, rx, ry, rz.
+
+        Rotations turn about the point `about` [m].
+        """
         centre = real_array(about, "about", (3,))
         return rigid_motions(self.dofs, centre)
 

@@ -242,7 +242,7 @@ class BlockShape(GridShape):
 
     Examples
     --------
-    In a translation along x, the weights add up to one:
+    The weights add up to one, so that a translation along x is exact:
 
     >>> import flexplant as fx
     >>> shape = fx.structure.BlockShape((1.0, 1.0, 1.0), (2, 2, 2))
@@ -261,10 +261,10 @@ class BlockShape(GridShape):
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m].
 
-        The internal bending modes of an element are computed from the displacements of its corners.
-        Rotations rx, ry, rz are half the curl of the displacements. They jump slightly between two
-        elements. On a boundary, the rotations in the element with the larger coordinates are
-        returned.
+        In addition to its trilinear functions, an element has internal bending shapes, whose sizes
+        follow from the displacements of its corners. Rotations rx, ry, rz are half the curl of the
+        displacements. They jump slightly between two elements. On a boundary, the rotations in the
+        element with the larger coordinates are returned.
         """
         require_known("motion", [direction], _BLOCK_MOTIONS, "a solid")
         point = real_array(xyz, "xyz", (3,))
