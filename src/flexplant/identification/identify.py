@@ -184,10 +184,10 @@ def identify_modes(
     refine : bool, optional
         Whether to refine the poles by maximum likelihood. False: the result without refinement, in
         about a second. None: the poles are refined if this is useful and takes at most one or two
-        minutes. It is not useful if separate outputs have
-        different poles (see `setups`). The cost of a step is estimated
-        as ``n (m r)^2`` with n values of the FRF, m poles and r references (the inputs, or the
-        outputs if there are fewer of them). The limits are 5e7 for each step and 5e10 in total.
+        minutes. It is not useful if separate outputs have different poles (see `setups`). The cost
+        of a step is estimated as ``n (m r)^2`` with n values of the FRF, m poles and r references
+        (the inputs, or the outputs if there are fewer of them). The limits are 5e7 for each step
+        and 5e10 in total.
     most : int
         Largest number of poles of the fit. The strongest poles of the diagram are used, and
         `rejected` lists the others.

@@ -153,10 +153,10 @@ class Irs(ReductionMethod):
     """Improved reduced system: static condensation with the inertia of the condensed DOFs.
 
     `Guyan` gives the matrix T_s and the reduced matrices M_s and K_s. Kss is the block of K of the
-    condensed DOFs. The first iteration is the
-    IRS of O'Callahan, ``T_1 = T_s + S M T_s M_s^-1 K_s`` with ``S = diag(0, Kss^-1)``. In further
-    iterations, the previous T and its reduced mass and stiffness replace T_s, M_s and K_s in the
-    second term. The iterations converge to `Serep`, in which the lowest k modes are exact.
+    condensed DOFs. The first iteration is the IRS of O'Callahan, ``T_1 = T_s + S M T_s M_s^-1 K_s``
+    with ``S = diag(0, Kss^-1)``. In further iterations, the previous T and its reduced mass and
+    stiffness replace T_s, M_s and K_s in the second term. The iterations converge to `Serep`, in
+    which the lowest k modes are exact.
 
     Parameters
     ----------
@@ -515,11 +515,10 @@ class MacNeal(_FreeInterface):
 
     The residual flexibility is the static displacement that the truncated modes contribute under
     unit forces on the boundary. In contrast to `Rubin`, they contribute only this static response.
-    The boundary
-    coordinates have no mass: their rows of the reduced mass matrix are zero. The poles are only
-    those of the modes. The model is exact at 0 Hz for loads on the boundary. A plant of this model
-    has a feedthrough. The boundary gets mass when the model is joined to others, or when `update`
-    adds a mass there.
+    The boundary coordinates have no mass: their rows of the reduced mass matrix are zero. The poles
+    are only those of the modes. The model is exact at 0 Hz for loads on the boundary. A plant of
+    this model has a feedthrough. The boundary gets mass when the model is joined to others, or when
+    `update` adds a mass there.
 
     Parameters
     ----------

@@ -97,10 +97,10 @@ class EffectiveIndependence(SelectionCriterion):
 
     The matrix phi has a row for each candidate DOF, with its motion in each mode. The search starts
     with all candidates. Their information on the modes is ``Q = phi^H phi``. Row i of phi has the
-    share ``E_i = phi_i Q^-1 phi_i^H`` in it, a number from 0 to 1. If the share is
-    1, the modes cannot be distinguished without this row. The row with the lowest share is dropped,
-    Q^-1 is updated, and this is repeated. If fewer DOFs than modes are wanted, the search stops
-    when as many rows as modes are left. `PivotedQr` then chooses among these rows.
+    share ``E_i = phi_i Q^-1 phi_i^H`` in it, a number from 0 to 1. If the share is 1, the modes
+    cannot be distinguished without this row. The row with the lowest share is dropped, Q^-1 is
+    updated, and this is repeated. If fewer DOFs than modes are wanted, the search stops when as
+    many rows as modes are left. `PivotedQr` then chooses among these rows.
 
     References
     ----------

@@ -245,9 +245,9 @@ class DesiredDofs(ReductionMethod):
     dofs : sequence of str, DofSet or DofSelection
         Labels of the kept DOFs. There must be one for each mode and each attachment vector (the
         static displacement under a unit force at a place of `static_at`). Without attachment
-        vectors there may be fewer. The same number of lowest modes is then kept, and the
-        model stores the other modes as `truncated`. For an FEModel, the method solves for as many
-        modes as there are labels, minus the number of places in `static_at`.
+        vectors there may be fewer. The same number of lowest modes is then kept, and the model
+        stores the other modes as `truncated`. For an FEModel, the method solves for as many modes
+        as there are labels, minus the number of places in `static_at`.
     static_at : place or sequence of places
         Places where attachment vectors keep the static compliance of truncated modes. Only for an
         FEModel, since `Modes` already contain their attachment vectors.

@@ -117,8 +117,8 @@ def rank_modes(
         Real and damped modes. Attachment vectors are ignored.
     inputs, outputs : place or sequence of places
         Places of forces and displacements. A place is a DOF label, a point (x, y, z), at which the
-        direction is z, or a mapping {label: weight}. Without `outputs`,
-        the displacements are taken at the inputs.
+        direction is z, or a mapping {label: weight}. Without `outputs`, the displacements are taken
+        at the inputs.
 
     Raises
     ------

@@ -231,10 +231,10 @@ class FEModel(Placed, Value):
         """Return how much the DOFs held by `fixed` prevent each of six rigid-body motions (6,).
 
         The argument `about` is the point [m] about which rotations turn. Springs to ground do not
-        count, since the DOFs can still make the motion. For a motion r the
-        result is ``max |K r|_i / max (|K| |r|)_i``, where the force on DOF i is divided by the
-        square root of K_ii. The terms of K r cancel everywhere except next to held DOFs. The result
-        is therefore 0 for a motion that no held DOF prevents.
+        count, since the DOFs can still make the motion. For a motion r the result is ``max |K r|_i
+        / max (|K| |r|)_i``, where the force on DOF i is divided by the square root of K_ii. The
+        terms of K r cancel everywhere except next to held DOFs. The result is therefore 0 for a
+        motion that no held DOF prevents.
         """
         if self.held_inertia is None:
             return np.zeros(6)

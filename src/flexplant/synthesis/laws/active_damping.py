@@ -73,7 +73,11 @@ class ActiveDamping(Value):
 
     @cached_property
     def loop(self) -> ClosedLoop:
-        """The closed loop on the plant. It is also checked on the evaluation model."""
+        """The closed loop of plant and controller.
+
+        If the plant has an evaluation model, which has more modes than the design model, the loop
+        is also checked on it.
+        """
         others = [name for name in self.undamped.u if name not in self.controller.outputs]
         return close_loop(self.undamped, self.controller, idle=others)
 
@@ -88,7 +92,10 @@ class ActiveDamping(Value):
 
     @property
     def loop_gain(self) -> StateSpace:
-        """Loop gain L (negative feedback) for `fx.plot.root_locus`. Factor 1 is the tuned gain."""
+        """Loop gain L (negative feedback) of the tuned element.
+
+        `fx.plot.root_locus` multiplies it by a factor. The factor 1 belongs to the tuned gain.
+        """
         gain: StateSpace = -series(self.undamped.Gyu.select(
             self.controller.inputs, self.controller.outputs), self.controller)  # fmt: skip
         return gain

@@ -101,7 +101,7 @@ class Pid(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         if self.pole is None and not self.i:
             return Section((0.0, 0.0, self.p), (0.0, 0.0, 1.0), 1.0)
         if self.pole is None:
@@ -141,7 +141,7 @@ class Lead(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         root, w = float(np.sqrt(self.ratio)), 2.0 * np.pi * self.freq
         return Section((0.0, 1.0, 1.0 / root), (0.0, 1.0 / root, 1.0), w, w)
 
@@ -175,7 +175,7 @@ class Lag(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.freq
         return Section((0.0, 1.0, 1.0), (0.0, 1.0, 1.0 / self.ratio), w, w)
 
@@ -200,7 +200,7 @@ class Integrator(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.freq
         return Section((0.0, 1.0, 1.0), (0.0, 1.0, 0.0), w, w)
 
@@ -236,7 +236,7 @@ class Notch(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w, two, k = 2.0 * np.pi * self.freq, 2.0 * self.width, self.skew
         return Section((1.0, self.depth * two, 1.0), (1.0 / k**2, two / k, 1.0), w, w)
 
@@ -268,7 +268,7 @@ class LowPass(SingleElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.freq
         if self.order == 1:
             return Section((0.0, 0.0, 1.0), (0.0, 1.0, 1.0), w, w)

@@ -72,7 +72,7 @@ class VelocityFeedback(DampingElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.pole
         return Section((0.0, self.gain * w, 0.0), (0.0, 1.0, 1.0), w)
 
@@ -117,7 +117,7 @@ class PositivePositionFeedback(DampingElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.freq
         return Section((0.0, 0.0, -self.gain), (1.0, 2.0 * self.damping, 1.0), w, w)
 
@@ -160,7 +160,7 @@ class IntegralResonantControl(DampingElement):
 
     @property
     def section(self) -> Section:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
         w = 2.0 * np.pi * self.freq
         return Section((0.0, 0.0, -self.gain), (0.0, 1.0, 1.0), w, w)
 

@@ -102,12 +102,12 @@ class LawElement(Value):
         Parameters
         ----------
         rate : float [Hz]
-            Sampling rate; above twice the frequency of each notch and low-pass.
+            Sampling rate. It must be above twice the frequency of each notch and low-pass.
 
         Raises
         ------
         ModelError
-            When it is not.
+            When the rate is not high enough.
         """
         return self.law.replace(rate=positive(rate, "rate"))
 
@@ -163,11 +163,11 @@ class SingleElement(LawElement):
     @property
     @abstractmethod
     def section(self) -> Section | BlockSection:
-        """Its transfer function."""
+        """Transfer function of the element, from error to command."""
 
     @property
     def own_rate(self) -> float:
-        """The only rate [Hz] at which it runs; 0 where any will do."""
+        """The only rate [Hz] at which the element can run; 0 if it can run at any rate."""
         return 0.0
 
     @property

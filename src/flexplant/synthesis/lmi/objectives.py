@@ -64,7 +64,10 @@ class H2(MeasuredObjective):
         return h2_norm(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the `Judge` objects that compute the norm for controllers of an order."""
+        """Return the objects that compute the norm of the loop for controllers of `order` states.
+
+        `design_structured` calls this method. See `Judge`.
+        """
         w, z = self.chosen(plant)
         require_finite_h2(plant, w, z)
         return [H2Judge(problem_on(plant, w, z), order)]
@@ -90,7 +93,10 @@ class Hinf(MeasuredObjective):
         return peak_gain(closed)[0]
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the `Judge` objects that compute the norm for controllers of an order."""
+        """Return the objects that compute the norm of the loop for controllers of `order` states.
+
+        `design_structured` calls this method. See `Judge`.
+        """
         return [GainJudge(problem_on(plant, *self.chosen(plant)), order)]
 
 
@@ -123,7 +129,10 @@ class PeakGain(MeasuredObjective):
         return impulse_sum(closed) if closed.dt else impulse_integral(closed)
 
     def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
-        """Return the `Judge` objects that compute the sum of each channel, for an order."""
+        """Return the objects that compute the peak gain of each channel from an input to an output.
+
+        `design_structured` calls this method for controllers of `order` states. See `Judge`.
+        """
         w, z = self.chosen(plant)
         return [PeakJudge(problem_on(plant, [i], [o]), order) for i in w for o in z]
 
@@ -158,7 +167,7 @@ class PoleRegion(Value):
     bandwidth: float | None = field(default=None, metadata=checked(positive))
 
     def outside(self, closed: StateSpace) -> str:
-        """Return a text of a pole of the closed loop that lies outside; empty if there is none."""
+        """Return a description of a pole of the closed loop outside the region; empty: no pole."""
         poles = continuous_poles(closed)
         if not poles.size:
             return ""

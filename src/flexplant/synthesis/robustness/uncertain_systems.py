@@ -33,11 +33,15 @@ class BlockStructure(Uncertainty):
     structure: tuple[Block, ...]
 
     def delta_blocks(self, plant: Partition) -> tuple[Block, ...]:
-        """Return the blocks."""
+        """Return the blocks of `structure`."""
         return self.structure
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return M, or its continuous bilinear equivalent, with the channels of a given system."""
+        """Return M with the channels of Delta first, then the channels of the given system.
+
+        If M is sampled and the given system is continuous, M is first mapped to continuous time by
+        the bilinear transformation.
+        """
         M = self.system
         if plant.dt != M.dt or system.n_states != M.n_states:
             raise ModelError(

@@ -238,19 +238,25 @@ _CLOSE = 1e-7
 class Judge(Protocol):
     """Interface of objects that compute the number `design_structured` minimises, such as a norm.
 
-    The search minimises the logarithm of this number and uses its gradient. The judge receives
-    controllers in the user's units. An objective makes its judge from the prepared problem p, which
-    is scaled: one unit of its time is ``1 / p.speed`` seconds. A judge that works on the matrices
-    of p must therefore convert its number to the user's units.
+    The number is the largest of many smooth functions of the controller, such as the gains at all
+    frequencies. The place of a function identifies it, and is for example its frequency. The search
+    minimises the logarithm of the number and uses gradients. The judge receives controllers K, with
+    the matrices A, B, C and D, in the user's units. An objective makes its judge from the
+    problem p, in which `design_structured` has scaled the plant: one unit of its time is
+    ``1 / p.speed`` seconds. A judge that works on the matrices of p must therefore convert its
+    number to the user's units.
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
-        """Return the number (infinite for an unstable loop), and the place where it occurs."""
+        """Return the number and the place of its function; infinite for an unstable loop."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
-        """Return logarithms of functions near the number, including the one at the place."""
-        # `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
-        # the place alone counts
+        """Return the logarithms of the functions that are close to the largest, with gradients.
+
+        The array `by` (n, rows, columns) holds the derivatives of [A, B; C, D] with respect to the
+        n parameters. The function at `place` is always included. If `sweep` is False, no other
+        function is.
+        """
 
 
 class LoopObjective(Protocol):

@@ -70,7 +70,10 @@ class MeasuredObjective(Value):
         """Return the objective of a closed loop from w to z."""
 
     def judges(self, plant: AnyPlant, order: int) -> Sequence[Judge]:
-        """Return the `Judge` objects that compute the objective for controllers of an order."""
+        """Return the objects that compute the objective for controllers of `order` states.
+
+        `design_structured` calls this method. See `Judge`.
+        """
         return [MeasuredJudge(plant, self, order)]
 
 

@@ -84,7 +84,10 @@ class ControllerStructure(Protocol):
     """Structure of a controller for `design_structured`, which it makes ready for a plant."""
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the map from free parameters to the controllers of this structure."""
+        """Return the map from free parameters to the controllers of this structure.
+
+        `design_structured` calls this method with the plant and its scaled matrices.
+        """
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,7 +135,10 @@ class FixedOrder(Value):
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> _Entries:
-        """Return the map from free parameters to the controllers of this structure."""
+        """Return the map from free parameters to the controllers of this structure.
+
+        `design_structured` calls this method with the plant and its scaled matrices.
+        """
         nu, ny = len(plant.u), len(plant.y)
         pattern = np.full((nu, ny), self.direct) if self.pattern is None else self.pattern
         if pattern.shape != (nu, ny):
@@ -254,7 +260,10 @@ class ObserverGains(Value):
     """
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the map from free parameters to the controllers of this structure."""
+        """Return the map from free parameters to the controllers of this structure.
+
+        `design_structured` calls this method with the plant and its scaled matrices.
+        """
         p, n, root = prepared, prepared.A.shape[0], np.sqrt(prepared.speed)
         first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
         gain = -filter_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
@@ -321,7 +330,10 @@ class Parametrised:
         return f"Parametrised({counted(self.start.size, 'parameter')})"
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the map from free parameters to the controllers of this structure."""
+        """Return the map from free parameters to the controllers of this structure.
+
+        `design_structured` calls this method with the plant and its scaled matrices.
+        """
         unit = np.where(self.start != 0, np.abs(self.start), 1.0)
 
         def matrices(theta: FloatArray) -> Matrices:
@@ -375,7 +387,10 @@ class TunedLaws(Value):
         require_known("number of an element", self.free, _NUMBERS)
 
     def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
-        """Return the map from free parameters to the controllers of this structure."""
+        """Return the map from free parameters to the controllers of this structure.
+
+        `design_structured` calls this method with the plant and its scaled matrices.
+        """
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)
         before = np.zeros((len(plant.u), len(axes.names)))
