@@ -27,7 +27,7 @@ class Interpolation(Value):
 
     @abstractmethod
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`."""
+        """Return the weights (n,) of the n DOFs in the motion `direction` at `xyz` [m]."""
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3) [m], with one row for each point."""

@@ -139,7 +139,7 @@ class Value(ABC):  # noqa: B024, kinds declare the abstract methods
         return changes
 
     def save(self, path: str | Path) -> None:
-        """Write the value to one `.npz` file of arrays and JSON, completely or not at all.
+        """Write the value to one `.npz` file. If writing fails, a previous file is kept.
 
         Parameters
         ----------

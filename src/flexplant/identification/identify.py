@@ -151,9 +151,9 @@ def identify_modes(
         may have drifted between the runs, since their mean would have broader resonances. Each pole
         is then the mean over the runs, and its standard deviation follows from the differences
         between the runs. If an FRF has a variance, it gives the weights of the fit and the
-        covariance of the poles. Correlations between outputs and between neighbouring lines (from
-        the window) are included if they are known. Without a variance, the weights and the
-        covariance follow from the residual of the fit, averaged over 41 lines.
+        covariance of the poles. Correlations of the errors between outputs and between neighbouring
+        lines (from the window) are included if they are known. Without a variance, the weights and
+        the covariance follow from the residual of the fit, averaged over 41 lines.
     band : (low, high) [Hz], optional
         Frequency band of the fit and of the reported modes. None: all lines.
     orders : iterable of int, optional

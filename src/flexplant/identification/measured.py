@@ -41,9 +41,9 @@ class MeasuredModes(Value):
         Number of each mode in the model. It counts from 1 and includes rigid-body modes. The
         numbers are needed to update a model.
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
-        Covariance matrix of the vector [Re lambda; Im lambda], or the variance E|d lambda|^2 of
-        each pole. A variance is divided equally between the real and the imaginary part, which are
-        assumed independent. The attribute is always the covariance matrix.
+        Covariance matrix of the vector [Re lambda; Im lambda], or the variance E|n|^2 of the error
+        n of each pole. A variance is divided equally between the real and the imaginary part, which
+        are assumed independent. The attribute is always the covariance matrix.
     shapes : (n, m) complex array, optional
         Mode shapes at n measured DOFs. If a pole is stored as its conjugate, its shape is too.
     dofs : sequence of n str, optional

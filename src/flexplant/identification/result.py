@@ -272,7 +272,7 @@ class IdentifiedModes(MeasuredModes):
     inputs, outputs : sequences of str
         Names of the channels.
     input_dofs : sequence of n_in str
-        Labels of the inputs' DOFs, or their names where no DOF is known.
+        Labels of the inputs' DOFs, or names of the inputs where no DOF is known.
     terms : (n_out, n_in, number of terms) array
         Coefficients of the residual terms E(s). The first `lower` ones belong to 1/s, 1/s^2 and so
         on, and the others to 1, s, s^2 and so on. In these powers, s is divided by ``2 pi top``.

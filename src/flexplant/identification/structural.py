@@ -330,7 +330,7 @@ def expansion(over: Modes, rows: Any) -> FloatArray:
 def shape_deviations(
     measured: IdentifiedModes, dofs: DofSet, *, over: Modes | None = None, count: int = 2
 ) -> FloatArray:
-    r"""Return the principal standard deviations of shapes from `structural_modes`.
+    r"""Return the principal components of the errors of shapes from `structural_modes`.
 
     The vector n contains the error of the identified shape of a mode, followed by the error of its
     participation vector. The mode shape then has the error :math:`A n`. The matrix A takes the mean

@@ -229,8 +229,8 @@ class DofSelection(Value):
     labels : tuple of str
         The DOFs, required ones first.
     condition : float
-        Condition number of phi_kk. These are the rows, at these DOFs, of the mode shapes and of the
-        attachment vectors if the basis has any.
+        Condition number of the matrix phi_kk, which holds the rows of the mode shapes at these
+        DOFs, and those of the attachment vectors if there are any. A low number is good.
     values : (count,) array, optional
         Value of the criterion for each DOF, in the order of the labels.
     criterion : SelectionCriterion

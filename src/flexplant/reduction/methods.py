@@ -233,12 +233,16 @@ class ReductionMethod(Value):
 
     @abstractmethod
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model."""
+        """Return the reduced model of a structure; `reduce` calls this method."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DesiredDofs(ReductionMethod):
     """Modal reduction in desired physical DOFs (equations (6) to (8) of [paper]_).
+
+    The coordinates of the reduced model are DOFs that you choose, and the kept modes are exact. The
+    matrix that expands the coordinates to all DOFs is ``T = phi phi_kk^-1``. Here phi holds the
+    modes and attachment vectors, and phi_kk their rows at the chosen DOFs.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ class ReducedModel(Value):
         The n DOFs of the full structure, with its shape functions.
     rigid_body : (k, r) array
         Rigid-body motions in the k coordinates, with ``K rigid_body = 0``. They are stored because
-        an eigenvalue solver for (K*, M*) would not find their frequencies of exactly 0.
+        an eigenvalue solver for (K*, M*) would find frequencies that differ from 0 by rounding.
     method : str
         Name of the reduction method.
     condition : float

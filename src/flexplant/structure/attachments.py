@@ -214,7 +214,7 @@ class HeldShape(Interpolation):
     rows_left: IntArray
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m]."""
+        """Return the weights (n,) of the n DOFs in the motion `direction` at `xyz` [m]."""
         return np.asarray(self.free.row(xyz, direction)[self.rows_left])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:

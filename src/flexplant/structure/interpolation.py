@@ -115,7 +115,7 @@ class ScatteredShape(Interpolation):
     margin: float = field(default=0.0, metadata=checked(positive, zero=True, unit="m"))
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m].
+        """Return the weights (n,) of the n DOFs in the motion `direction` at the point `xyz` [m].
 
         Raises
         ------

@@ -28,7 +28,7 @@ from .zero_energy_motions import endangered, freed, held_by_rounding, shown_digi
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FEMatrices(Value):
-    """Matrices of ``M q'' + D q' + K q = f`` as they were read from a file, with their errors.
+    """Matrices of ``M q'' + D q' + K q = f`` as they were read from a file, errors included.
 
     An FEModel needs a positive definite M, known DOFs and coordinates. FEMatrices can do without
     them. `check` reports the errors. The method `model` makes an FEModel, or raises an error that
@@ -420,7 +420,7 @@ class FEMatrices(Value):
         return model
 
     def freed(self) -> FEMatrices:
-        """Return the matrices with free rigid-body motions, if only rounding of K holds these.
+        """Return the matrices without the stiffness that rounding of K gives to rigid-body motions.
 
         The new stiffness is ``K' = P^T K P`` with ``P = I - R R^T M``, where R holds the rigid-body
         motions. The elastic modes are M-orthogonal to R and do not change. Use this method for

@@ -106,7 +106,7 @@ class PlateShape(GridShape):
         return self.elements, None, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion z, rx or ry at a point.
+        """Return the weights (n,) of the n DOFs in the motion z, rx or ry at the point `xyz` [m].
 
         Between elements z is continuous. The slope across an edge is not, since the elements are
         non-conforming. On an edge, the slope in the element with the larger coordinates is
@@ -199,7 +199,7 @@ class BeamShape(GridShape):
         return (self.elements,), None, 2
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion z or ry of a section.
+        """Return the weights (n,) of the n DOFs in the motion z or ry of the section at `xyz` [m].
 
         Raises
         ------
@@ -259,7 +259,7 @@ class BlockShape(GridShape):
         return self.elements, self.present, 3
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which the DOFs give the motion `direction` at `xyz` [m].
+        """Return the weights (n,) of the n DOFs in the motion `direction` at the point `xyz` [m].
 
         In addition to its trilinear functions, an element has internal bending shapes, whose sizes
         follow from the displacements of its corners. Rotations rx, ry, rz are half the curl of the
