@@ -109,8 +109,8 @@ class StabilisationDiagram(Value):
     band : (2,) array [Hz]
         Band of the listed poles.
     highest : (n,) int array
-        Highest model order at which a pole could be found. The band is analysed in parts, and a
-        part with few lines has a lower highest order.
+        Highest model order at which each pole could be found. The band is analysed in parts. In a
+        part with few lines this order is lower.
     """
 
     orders: IntArray

@@ -168,9 +168,9 @@ def identify_modes(
         up to 25 if the data require more. Too few terms bias the poles. A bias of up to one
         standard deviation is not visible in the misfit.
     hold : float [Hz], optional
-        Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
-        sampled plant. Modes above half the rate then appear folded, as broad modes with several per
-        cent of damping, unless a filter removes them.
+        Rate of the zero-order hold between the inputs and the machine. Give it if the FRF is that
+        of a sampled plant. Modes above half the rate then appear folded, as broad modes with
+        several per cent of damping, unless a filter removes them.
     delay : float [samples]
         Delay of the response in periods of the hold, as for `StandardPlant.discretized`. It may be
         fractional.

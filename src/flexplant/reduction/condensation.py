@@ -156,7 +156,7 @@ class Irs(ReductionMethod):
     condensed DOFs. The first iteration is the IRS of O'Callahan, ``T_1 = T_s + S M T_s M_s^-1 K_s``
     with ``S = diag(0, Kss^-1)``. In further iterations, the previous T and its reduced mass and
     stiffness replace T_s, M_s and K_s in the second term. The iterations converge to `Serep`, in
-    which the lowest k modes are exact.
+    which as many of the lowest modes are exact as there are kept DOFs.
 
     Parameters
     ----------

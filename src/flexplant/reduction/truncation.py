@@ -52,12 +52,12 @@ class ModalTruncation(ReductionMethod):
 
     Notes
     -----
-    With `Modes`, the bound is the sum of the peaks of all truncated modes and attachment vectors. A
-    peak is ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, with the displacements b of the
-    mode at the inputs and c at the outputs. This bound covers the solved modes only
-    (`ErrorBound.covers`).
+    If the structure is given as `Modes`, the bound is the sum of the peaks of all truncated modes
+    and attachment vectors. A peak is ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, with the
+    displacements b of the mode at the inputs and c at the outputs. This bound covers the solved
+    modes only (`ErrorBound.covers`).
 
-    With an FEModel and one damping ratio for all modes, the bound covers all modes of the
+    For an FEModel with one damping ratio for all modes, the bound covers all modes of the
     structure, including modes that were not solved. By the Cauchy-Schwarz inequality the sum is at
     most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta sqrt(1 - zeta^2))``. The columns of B are unit
     forces at the inputs, and the rows of C give the displacements at the outputs. G is the residual
@@ -181,7 +181,7 @@ class ModalBalanced(ReductionMethod):
     these may not be all modes. `ErrorBound.below` gives a smaller bound for a band. The usual bound
     is twice the sum of the neglected Hankel singular values [Glover1984]_, which are listed in
     `ModeRanking.exact`. It holds for the truncation of the exactly balanced model
-    (`flexplant.balanced`), which is not of second order.
+    (`flexplant.balanced`), which has no mass and stiffness matrices.
 
     References
     ----------

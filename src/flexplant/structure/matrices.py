@@ -37,10 +37,10 @@ class FEMatrices(Value):
     Parameters
     ----------
     K : (n, n) array or sparse matrix
-        Stiffness, with both triangles. When the matrix is complex, ``K (1 + i eta)``, the real part
-        is kept, and the loss factor eta becomes a modal damping ratio of eta / 2. A note says so,
-        and `model` warns. The two kinds of damping give the same response at resonance, and differ
-        by at most a fraction eta elsewhere.
+        Stiffness, with entries in both triangles. When the matrix is complex, ``K (1 + i eta)``,
+        the real part is kept, and the loss factor eta becomes a modal damping ratio of eta / 2. A
+        note says so, and `model` warns. The two kinds of damping give the same response at
+        resonance, and differ by at most a fraction eta elsewhere.
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping. M may be singular.
     dofs : DofSet, optional

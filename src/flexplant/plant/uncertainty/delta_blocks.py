@@ -46,12 +46,12 @@ class RepeatedScalar(Value):
 
     @property
     def w(self) -> int:
-        """Number of outputs."""
+        """Number of channels of w."""
         return self.size
 
     @property
     def z(self) -> int:
-        """Number of inputs."""
+        """Number of channels of z."""
         return self.size
 
 

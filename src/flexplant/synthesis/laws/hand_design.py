@@ -91,7 +91,10 @@ class ShapedAxis(Value):
 
     @property
     def forward(self) -> dict[str, float]:
-        """The feedforward gains that are not zero, by the derivative on which they act."""
+        """The feedforward gains that are not zero, as a mapping {term: gain}.
+
+        A term is "position", "velocity", "acceleration", "jerk" or "snap" of the reference.
+        """
         return {term: g for term, g in zip(TERMS, self.feedforward, strict=False) if g}
 
     @property
