@@ -45,9 +45,9 @@ class PoleSelection(Value):
         Poles with positive imaginary parts.
     participation : (n_in, m) complex array
         Participation factors. The factor of an input in a pole states how strongly the input
-        excites the mode. If there are fewer outputs than inputs, the rows belong to the outputs,
-        with the shape (n_out, m), and contain the mode shape. Repeated poles have linearly
-        independent columns.
+        excites the mode. If there are fewer outputs than inputs, the array has the shape (n_out, m)
+        and holds the mode shapes at the outputs instead. Repeated poles have linearly independent
+        columns.
 
     Examples
     --------

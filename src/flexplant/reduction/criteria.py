@@ -76,7 +76,7 @@ class PivotedQr(SelectionCriterion):
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return the positions of `count` rows of the array `pool` that this criterion chooses.
 
-        The rows of `required` are chosen already.
+        Positions count from 0. The rows of the array `required` are chosen already.
         """
         if not count:
             return []
@@ -119,7 +119,7 @@ class EffectiveIndependence(SelectionCriterion):
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return the positions of `count` rows of the array `pool` that this criterion chooses.
 
-        The rows of `required` are chosen already.
+        Positions count from 0. The rows of the array `required` are chosen already.
         """
         if not count:
             return []
@@ -183,7 +183,7 @@ class Greedy(SelectionCriterion):
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return the positions of `count` rows of the array `pool` that this criterion chooses.
 
-        The rows of `required` are chosen already.
+        Positions count from 0. The rows of the array `required` are chosen already.
         """
         taken: Any = np.array(required)
         free = np.ones(pool.shape[0], dtype=bool)

@@ -39,8 +39,8 @@ class FEMatrices(Value):
     K : (n, n) array or sparse matrix
         Stiffness, with entries in both triangles. When the matrix is complex, ``K (1 + i eta)``,
         the real part is kept, and the loss factor eta becomes a modal damping ratio of eta / 2. A
-        note says so, and `model` warns. The two kinds of damping give the same response at
-        resonance, and differ by at most a fraction eta elsewhere.
+        note says so, and `model` warns. Damping by a loss factor and modal damping give the same
+        response at resonance, and differ by at most a fraction eta elsewhere.
     M, D : (n, n) array or sparse matrix, optional
         Mass and viscous damping. M may be singular.
     dofs : DofSet, optional
@@ -238,8 +238,9 @@ class FEMatrices(Value):
     ) -> FEMatrices:
         """Return the matrices and coordinates in SI, from those in other units.
 
-        Each entry is converted by its kind (``N/mm`` for displacements, ``N mm`` for rotations),
-        which follows from the units of length, mass and time.
+        The unit of an entry depends on its row and column. For example, an entry of K has the unit
+        ``N/mm`` between two displacements and ``N mm`` between two rotations. These units follow
+        from those of length, mass and time.
 
         Parameters
         ----------
