@@ -460,7 +460,7 @@ class Placed:
 
     @property
     def full_dofs(self) -> DofSet:
-        """The DOFs, with their coordinates."""
+        """The DOFs of the full structure, which are `dofs` of this model."""
         return self.dofs
 
     def row(self, at: Place, direction: str = "z") -> FloatArray:

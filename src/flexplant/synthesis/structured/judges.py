@@ -248,7 +248,7 @@ class Judge(Protocol):
     """
 
     def value(self, K: Matrices, /) -> tuple[float, Any]:
-        """Return the number and the place of its function; infinite for an unstable loop."""
+        """Return the number (infinite for an unstable loop), and the place of its function."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
         """Return the logarithms of the functions that are close to the largest, with gradients.
