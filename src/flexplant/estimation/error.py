@@ -352,12 +352,17 @@ class PoiEstimator(Value):
     plant: AnyPlant
 
     def interval(self, channel: str, level: float = INTERVAL) -> FigureInterval:
-        """Return the interval of the rms error over machines with the same measurement.
+        """Return the interval of the rms error over the machines that the plant may be.
+
+        These machines are ``plant.machines``. They exist if the plant was made from
+        ``fit.calibrated(measured)`` or from ``plant.uncertain(...)``, for example with
+        ``fit.machines(measured)``. Each machine is a random draw that agrees with the measurement
+        or the stated uncertainty.
 
         Parameters
         ----------
         channel : str
-            Motion of a POI under any of its names, as for `rms`.
+            Motion of a POI under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
         level : float
             Fraction of the machines in the interval, between 0 and 1.
 
@@ -383,16 +388,16 @@ class PoiEstimator(Value):
     ) -> FigureInterval:
         """Return the interval of the ratio of this rms error to that of another estimator.
 
-        The ratio is computed on each machine that agrees with the measurement. If the ratio is
-        below 1, this estimator is better. To compare two places of a sensor, design an estimator
-        for each place, on plants of the same evaluation model.
+        The ratio is computed on each of the machines ``plant.machines`` that the plant may be (see
+        `interval`). If the ratio is below 1, this estimator is better. To compare two places of a
+        sensor, design an estimator for each place, on plants of the same evaluation model.
 
         Parameters
         ----------
         other : KalmanEstimator or StaticEstimator
             Estimator of the same POIs, on a plant of the same machines.
         channel : str
-            Motion of a POI under any of its names, as for `rms`.
+            Motion of a POI under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
         level : float
             Fraction of the machines in the interval, between 0 and 1.
 
@@ -428,7 +433,7 @@ class PoiEstimator(Value):
 
     @cached_property
     def on_machines(self) -> FloatArray:
-        """RMS errors (n, n_poi) [m or rad] on each machine that agrees with the measurement."""
+        """RMS errors (n, n_poi) [m or rad] on each of the n machines ``plant.machines``."""
         known = self.plant.machine.machines
         plants = [] if known is None else known.plants
         return np.sqrt([

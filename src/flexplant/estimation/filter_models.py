@@ -50,10 +50,11 @@ class FilterModel(Value):
         Model from the commands u to the motions z at the POIs and to the sensors y.
     G : (n, r) array
         Gain from xi, white noises of unit variance, to the state x of the next sample. It
-        represents the disturbances.
+        represents the effect of the disturbances on the states.
     H : (ny, r) array
-        Gain from xi to the sensors. It represents sensor noise, truncated modes as noise, and
-        disturbances that are constant during each sample.
+        Gain from xi to the sensors. It represents the noise of the sensors and the motion of
+        truncated modes, which counts as noise. Disturbances that are held constant over each sample
+        are included as well, because an acceleration sensor responds to them at once.
     V : (nz, nz) array
         Covariance of n, the motion of truncated modes at the POIs.
     N : (nz, ny) array

@@ -161,7 +161,9 @@ def lag_errors(
 
 @dataclass(frozen=True, eq=False)
 class Predictor(Value):
-    """Estimates of a sample from the measurements before this sample: x[k|k-1].
+    """Choice of estimates that use only the measurements before each sample: x[k|k-1].
+
+    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
 
     The notation x[k|j] means the estimate of the state at sample k from the measurements of the
     samples 0 to j.
@@ -176,7 +178,9 @@ class Predictor(Value):
 
 @dataclass(frozen=True, eq=False)
 class Filter(Value):
-    """Estimates of a sample from the measurements up to and including this sample: x[k|k].
+    """Choice of estimates that use the measurements up to and including each sample: x[k|k].
+
+    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
 
     The notation x[k|j] means the estimate of the state at sample k from the measurements of the
     samples 0 to j.
@@ -191,10 +195,12 @@ class Filter(Value):
 
 @dataclass(frozen=True, eq=False)
 class FixedLag(Value):
-    """Estimates of a sample from the measurements up to some samples later: x[k|k+lag].
+    """Choice of estimates that use the measurements up to some samples later: x[k|k+lag].
 
-    The estimate is available with this lag. The notation x[k|j] means the estimate of the state at
-    sample k from the measurements of the samples 0 to j.
+    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
+
+    Each estimate is available only after this lag. The notation x[k|j] means the estimate of the
+    state at sample k from the measurements of the samples 0 to j.
 
     Parameters
     ----------
@@ -217,7 +223,9 @@ class FixedLag(Value):
 
 @dataclass(frozen=True, eq=False)
 class Smoother(Value):
-    """Estimates of each sample from all N measurements of the record: x[k|N-1].
+    """Choice of estimates that use all N samples of the record: x[k|N-1].
+
+    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
 
     This is the fixed-interval smoother. The notation x[k|j] means the estimate of the state at
     sample k from the measurements of the samples 0 to j.

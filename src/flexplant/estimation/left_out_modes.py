@@ -53,9 +53,9 @@ class LeftOut(Value):
     cross : (nz, ny) array
         Covariance N_t between POIs and sensors.
     plant : StandardPlant
-        Plant whose response to u includes the static compliance of the truncated modes. This
-        compliance may consist of attachment vectors (static shapes under unit forces), which only u
-        excites.
+        Plant whose response to u includes the static compliance of the truncated modes. The
+        compliance may be represented by additional fast modes. Their shapes are attachment vectors
+        (static shapes under unit forces), and only u acts on them.
     whole : StandardPlant
         Plant that includes the truncated modes. It is used to compute these values for other POIs.
 

@@ -370,8 +370,9 @@ class NoiseLevels(Value):
     given : StandardPlant
         Plant with the given densities, from which the search started.
     channels : tuple of str
-        Disturbances of w, then sensors (`y1:noise`); `process` means all disturbances of a plant
-        that was not assembled.
+        Disturbances of w, then sensors (`y1:noise`). The name `process` stands for all disturbances
+        together if the plant was not made by `assemble_plant`, so that its disturbances have no
+        names.
     ratios : (p,) array
         Ratio of the estimated density of each channel to the given one.
     covariance : (p, p) array
@@ -380,8 +381,10 @@ class NoiseLevels(Value):
         Ratios from the non-negative least-squares fit of the autocovariances, at which the search
         started; 0 for a channel to which this fit assigns no noise.
     slope : float
-        Largest derivative of the logarithm of the likelihood at the end of the search, relative to
-        the standard deviation of this derivative. The search ends when it is below 1e-4.
+        Remaining slope at the end of the search: the largest derivative of the log-likelihood with
+        respect to one log-ratio. It is divided by the standard deviation that this derivative has
+        over random records (the root of Fisher's information). The search ends when it is below
+        1e-4.
     nis : float
         Mean normalised innovation squared per sensor, for the filter with these levels on the
         record. It is 1 if the model explains the record.
@@ -417,7 +420,7 @@ class NoiseLevels(Value):
 
     @property
     def asd(self) -> Mapping[str, float]:
-        """Estimated densities [unit/sqrt(Hz)] of the channels that have one."""
+        """Estimated densities [unit/sqrt(Hz)] by channel; `process` has none and is left out."""
         return {
             name: float(ratio * self.given.asd[name])
             for name, ratio in zip(self.channels, self.ratios, strict=True)

@@ -152,7 +152,8 @@ def read_model(
     massless : "refuse" or "condense"
         Treatment of DOFs and motions without mass; condensing them is exact.
     free : bool
-        Whether to free rigid-body motions that are held only because the text has too few digits.
+        Whether to remove the small stiffness against rigid-body motions that the rounding of the
+        numbers in the file causes.
     name : str, optional
         Name for display; by default that of the file.
     scalar_direction, rotations : optional

@@ -220,7 +220,7 @@ def control_dare(
 def control_care(
     A: FloatArray, B: FloatArray, *, Q: FloatArray, R: FloatArray, S: FloatArray | None = None
 ) -> RiccatiSolution:
-    """Return X of ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``.
+    """Solve ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``; the result contains X as `P`.
 
     This equation is the dual of that of `filter_care`. The `gain` of the result is F of the law
     ``u = -F x``, which gives the closed loop A - B F.

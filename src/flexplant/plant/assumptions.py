@@ -370,8 +370,9 @@ class Assumption(Value):
     key : str
         Name of the assumption. Four of them concern the modes that do not decay: w reaches each of
         them (`excited`), y sees it (`detectable`), z sees it (`performance`), and u reaches it
-        (`stabilisable`). `D12` and `D21` have full rank. `P12` (u -> z) and `P21` (w -> y) have no
-        invariant zeros on the stability limit.
+        (`stabilisable`). The keys `D12` and `D21` mean that these matrices have full rank. The keys
+        `P12` (u to z) and `P21` (w to y) mean that these transfers have no invariant zeros on the
+        imaginary axis or, if sampled, on the unit circle.
     holds : bool
         Whether the assumption holds.
     finding : str
@@ -430,7 +431,7 @@ class AssumptionReport(Value):
 
     @cached_property
     def modes(self) -> tuple[ModeVisibility, ...]:
-        """Visibility of each elastic mode at its best channels; for information only."""
+        """Visibility of each elastic mode (`ModeVisibility`); for information only."""
         return mode_visibility(self.plant)
 
     @property
@@ -465,7 +466,7 @@ class AssumptionReport(Value):
         return "\n".join(lines)
 
     def require(self, keys: tuple[str, ...], purpose: str) -> None:
-        """Raise AssumptionError unless the assumptions of these keys hold.
+        """Raise AssumptionError unless all assumptions with the given keys hold; see `Assumption`.
 
         An assumption that does not apply to this plant counts as satisfied. The message says for
         which `purpose` the assumptions are needed and what to change. The error carries the report.

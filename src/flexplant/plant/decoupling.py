@@ -83,7 +83,7 @@ def decouple(
     axes: Sequence[str] | None = None,
     bandwidth: float | Mapping[str, float] | None = None,
 ) -> Decoupling:
-    """Return the static transformations to the axes that the actuators move, and from them.
+    """Return static transformations to and from the axes that the actuators can move.
 
     The axes are decoupled at a real frequency sigma, where no mode resonates (see
     `flexplant.plant.driven_axes`). `flexplant.plant.gravity_axes` gives the mass and the centre of

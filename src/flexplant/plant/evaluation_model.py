@@ -53,7 +53,10 @@ class EvaluationModel(Value):
 
     @classmethod
     def of(cls, given: Any) -> EvaluationModel | None:
-        """Return the evaluation model of what a user passes; None stays None."""
+        """Return the argument `evaluation` of `assemble_plant` as an EvaluationModel.
+
+        For None the result is None.
+        """
         if given is None or isinstance(given, cls):
             return given
         given = getattr(given, "nominal", given)
@@ -63,17 +66,21 @@ class EvaluationModel(Value):
 
     @classmethod
     def known_to(cls, model: Structure) -> EvaluationModel | None:
-        """Return a reduced model that still knows the modes it left out; None for other models."""
+        """Return a ReducedModel with its truncated modes as an evaluation model, or None.
+
+        The result is None for other models, and if the reduced model has not kept its truncated
+        modes.
+        """
         known = isinstance(model, ReducedModel) and model.truncated is not None
         return cls(model) if known else None
 
     @property
     def is_structure(self) -> bool:
-        """Whether the source is a structure, which gets the plant's ports."""
+        """Whether the source is a structure, to which the ports of the plant are applied."""
         return not is_channelled(self.source)
 
     def with_ports(self, ports: Ports) -> EvaluationModel:
-        """Return the evaluation model of a plant that got other ports."""
+        """Return the same evaluation model with other ports."""
         return self if self.is_structure else self.replace(ports=ports)
 
     @cached_property

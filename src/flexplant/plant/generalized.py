@@ -68,7 +68,7 @@ class GeneralizedPlant(PartitionedSystem):
 
     @property
     def done(self) -> str:
-        """Weights and blocks that were applied to the machine, as text for the repr."""
+        """Text of the applied weights and blocks, for the printed plant."""
         return f", {self.alteration}"
 
     @property

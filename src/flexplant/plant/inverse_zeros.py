@@ -26,9 +26,10 @@ class SlowZeros(Value):
 
     F is the response from a set-point to the forces that a feedforward needs. Its poles p_i are the
     zeros of the plant, and c_i are its residues. A feedforward uses the power series
-    ``k_0 + ... + k_m s^m`` of F at s = 0. This series does not represent slow poles well. For them
-    the feedforward therefore adds the term ``s^m`` times a filter that is zero at s = 0:
-    ``sum_i c_i / p_i^(m + 1) s / (s - p_i)``.
+    ``k_0 + ... + k_m s^m`` of F at s = 0. This series does not represent slow poles well. The
+    feedforward therefore adds the term ``s^m H(s)`` for them. Its filter
+    ``H(s) = sum_i (c_i / p_i^(m + 1)) (s / (s - p_i))`` is zero at s = 0. In the methods, the
+    argument `order` is the exponent m.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ class SlowZeros(Value):
 
     @property
     def freq(self) -> FloatArray:
-        """The frequencies [Hz], in order."""
+        """Frequencies [Hz] of the poles, in increasing order."""
         return np.sort(np.abs(self.poles)) / (2.0 * np.pi)
 
     @property
@@ -70,7 +71,11 @@ class SlowZeros(Value):
         return np.asarray(np.exp(self.poles * self.dt) / (self.poles**order * self._rates))
 
     def responses(self, s: ComplexArray, order: int) -> ComplexArray:
-        """Return contributions (n, 2 k) of real and imaginary parts of residues at s [rad/s]."""
+        """Return the added term ``s^m H(s)`` (n, 2 k) at n values of s, for unit residues.
+
+        Column i belongs to a residue of 1 at pole i, and column k + i to a residue of sqrt(-1).
+        Each includes the term of the conjugate pole. The values s are in rad/s.
+        """
         at = np.asarray(s)[:, None]
         rate = np.expm1(at * self.dt) / self.dt if self.dt else at
         gains, rates = self._gains(order), self._rates
@@ -79,12 +84,12 @@ class SlowZeros(Value):
         return np.asarray(at**order * np.hstack([one + other, 1j * (one - other)]))
 
     def at(self, s: complex) -> ComplexArray:
-        """Return their contribution (r,) to an expansion of order 4 at any s [rad/s]."""
+        """Return the added term ``s^m H(s)`` (r,) of the axes at a complex s [rad/s], for m = 4."""
         parts = np.hstack([self.residues.real, self.residues.imag])
         return np.asarray(parts @ self.responses(np.array([s]), len(DERIVATIVES))[0])
 
     def filters(self, order: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return A, B, C, D from a derivative of the set-point to the forces of axes."""
+        """Return A, B, C, D of H, from the m-th derivative of the set-point to the axes' forces."""
         gains, rates = self.residues * self._gains(order), self._rates
         A = la.block_diag(*(np.array([[p.real, -p.imag], [p.imag, p.real]]) for p in rates))
         B = np.tile([[1.0], [0.0]], (rates.size, 1))
@@ -94,7 +99,11 @@ class SlowZeros(Value):
         return (np.eye(len(A)) + self.dt * A, self.dt * B, C, D) if self.dt else (A, B, C, D)
 
     def run(self, driving: FloatArray, time: FloatArray, order: int) -> FloatArray:
-        """Return the forces of axes (n_time, r) to a derivative of the set-point at samples."""
+        """Return the output of the filter H for samples of the m-th derivative of the set-point.
+
+        The result contains the force of each axis at each sample, (n_time, r). `driving` holds the
+        derivative, and `time` the instants of the samples [s].
+        """
         from scipy.signal import dlsim
 
         if not self.dt or not np.allclose(np.diff(time), self.dt, rtol=SPLIT):

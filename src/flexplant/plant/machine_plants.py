@@ -26,7 +26,7 @@ from .uncertainty.parameter_amounts import ParameterDelta
 
 
 class FigureInterval(NamedTuple):
-    """Interval of a figure over a fraction of the machines that the measurement allows.
+    """Interval that contains a figure for a fraction of the machines that a plant may be.
 
     Parameters
     ----------
@@ -77,19 +77,21 @@ def fitted_response(plant: Any) -> MeasuredResponse | None:
 class PlantMachines:
     """Possible machines of a plant; they have its channels and its sampling.
 
-    If the plant has a fit (`flexplant.updating.Machines`) and an evaluation model, the modes of
-    these machines come from the fit. Otherwise they come from the uncertainty that the user states:
-    frequencies, with the changes of the mode shapes that belong to them, and dampings. Gains,
-    delays and other stated Deltas are drawn as well. Machines have the modes of the evaluation
-    model, unless the stated uncertainty contains parameters or mode shapes of the plant's own
-    model.
+    A machine is a plant that is drawn at random within the known uncertainty. If the plant knows
+    the remaining uncertainty of a fit (``fit.machines(measured)``, see
+    `flexplant.updating.Machines`) and has an evaluation model, the modes of these machines come
+    from the fit, so that they agree with its measurement. Otherwise they come from the uncertainty
+    that the user states: frequencies, with the changes of the mode shapes that belong to them, and
+    dampings. Gains, delays and other stated Deltas are drawn as well. Machines have the modes of
+    the evaluation model, unless the stated uncertainty contains parameters or mode shapes of the
+    plant's own model.
 
     Parameters
     ----------
     plant : StandardPlant
         The plant.
     fit : Machines, optional
-        The machines of the fit.
+        Result of ``fit.machines(measured)``, from which machines are drawn.
 
     Examples
     --------
@@ -117,7 +119,7 @@ class PlantMachines:
         return self.drawn(self.fit.count, rng=self.fit.seed)
 
     def drawn(self, count: int = COUNT, *, rng: Rng = 0) -> list[Any]:
-        """Return machines; machine i is the same for every count.
+        """Return machines that are drawn at random; machine i is the same for every count.
 
         Parameters
         ----------
@@ -195,7 +197,7 @@ class PlantMachines:
 
     @property
     def densities(self) -> str:
-        """Remark for intervals of noise figures if no density is uncertain; otherwise empty."""
+        """Remark that noise densities do not vary among the machines; empty if they do."""
         return "" if self._unsure else ", densities as given"
 
     def _of_fit(self, rng: np.random.Generator) -> DrawnModes:

@@ -306,13 +306,13 @@ class PositionMap(Value):
 
     @property
     def ever(self) -> npt.NDArray[np.bool_]:
-        """Whether each mode (m,) has a share of at least one percent in the loop at some place."""
+        """Whether each mode (m,) has a share of at least 1 % at some place of the grid."""
         most = self.visible.reshape(-1, len(self.modes)).max(axis=0, initial=0.0)
         return np.asarray(most >= WEAK)
 
     @property
     def weakest(self) -> FloatArray:
-        """The least share (...) of the modes that are in the loop somewhere."""
+        """The smallest share (...) at each place, of the modes for which `ever` is true."""
         return np.asarray(self.visible[..., self.ever].min(axis=-1, initial=1.0))
 
     def _where(self, values: FloatArray, largest: bool) -> str:

@@ -104,20 +104,23 @@ class ForcePort(Value):
 
     @property
     def added_to(self) -> str | None:
-        """The sensor to which a port that does not act on the structure is added."""
+        """Name of the sensor to which an `OutputDisturbance` is added; None for all other ports."""
         return None
 
     @property
     def ground(self) -> FloatArray:
-        """Rigid-body motion (6,) of the ground about the origin, of a port that accelerates it."""
+        """Rigid-body motion (6,) of the ground, per unit; zero except for a `BaseAcceleration`."""
         return np.zeros(6)
 
     @abstractmethod
     def push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) over the model's DOFs per unit behind the filter."""
+        """Return the load (n,) over the model's DOFs per unit of the output of the filter."""
 
     def static_push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) per unit of the channel at rest, with the filter's static gain."""
+        """Return the load (n,) per unit of a constant input of the channel.
+
+        It is the load of `push` times the static gain of the filter.
+        """
         return static_gain(self.filter) * self.push(realisation)
 
 
@@ -186,7 +189,7 @@ class SensorPort(Value):
 
     @property
     def order(self) -> int:
-        """Which time derivative of a displacement it measures: 0, 1 or 2."""
+        """Order of the time derivative of a displacement that it measures: 0, 1 or 2."""
         return QUANTITIES.index(self.quantity)
 
     @property
@@ -196,18 +199,27 @@ class SensorPort(Value):
 
     @abstractmethod
     def row(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the row (n,) over the model's DOFs of the displacement behind `quantity`."""
+        """Return the row (n,) that gives the measured displacement from the model's DOFs.
+
+        A sensor of a velocity or an acceleration measures a time derivative of this displacement.
+        """
 
     def carried(self, realisation: ModalRealisation) -> FloatArray:
-        """Return its displacement (6,) in each rigid-body motion about the origin."""
+        """Return the displacement (6,) that it measures per unit of each rigid-body motion.
+
+        The rigid-body motions are x, y, z, rx, ry, rz about the origin.
+        """
         return np.asarray(self.row(realisation) @ realisation.model.rigid_motions())
 
     def static_row(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the row (n,) of the channel over displacements at rest; 0 for other quantities."""
+        """Return the row (n,) that gives the channel for constant displacements of the DOFs.
+
+        It includes the static gain of the filter. It is zero for velocities and accelerations.
+        """
         return (static_gain(self.filter) if self.order == 0 else 0.0) * self.row(realisation)
 
     def see(self, realisation: ModalRealisation) -> MeasuredRow:
-        """Return its coefficients of the states, and of forces that act on it directly."""
+        """Return the coefficients of states, forces and ground motions in the signal."""
         along = self.carried(realisation) if self.inertial else None
         return observed(realisation, self.row(realisation), self.order, along)
 

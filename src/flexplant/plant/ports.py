@@ -82,11 +82,14 @@ class Sensor(SensorPort):
     asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
 
     def row(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the row (n,) over the model's DOFs of its displacement."""
+        """Return the row (n,) that gives its displacement from the model's DOFs."""
         return realisation.row(self.at, self.direction)
 
     def carried(self, realisation: ModalRealisation) -> FloatArray:
-        """Return its displacement (6,) in each rigid-body motion about the origin."""
+        """Return the displacement (6,) that it measures per unit of each rigid-body motion.
+
+        The rigid-body motions are x, y, z, rx, ry, rz about the origin.
+        """
         return place_motion(realisation.model.full_dofs, self.at, self.direction)
 
 
@@ -157,7 +160,7 @@ class Poi(Value):
         return motion_unit(self.at if isinstance(self.at, Mapping) else {}, axis)
 
     def row(self, realisation: ModalRealisation, axis: str) -> FloatArray:
-        """Return the row (n,) over the model's DOFs of one axis."""
+        """Return the row (n,) that gives the motion of one axis from the model's DOFs."""
         try:
             return realisation.row(self._at(axis), axis)
         except LabelError as error:
@@ -169,7 +172,7 @@ class Poi(Value):
             ) from error
 
     def see(self, realisation: ModalRealisation, axis: str) -> MeasuredRow:
-        """Return the coefficients of states, and of directly acting forces, for one axis."""
+        """Return the coefficients of states, forces and ground motions for one axis."""
         along = None
         if self.absolute:
             along = place_motion(realisation.model.full_dofs, self._at(axis), axis)
@@ -337,7 +340,7 @@ class Ports(Value):
 
     @property
     def standing(self) -> str:
-        """Text of the positions of the machine; empty if it does not move."""
+        """Text with the values of the positions; empty if the machine has no positions."""
         return ", ".join(
             f"{one.name} = {self.values[one.name]:g} ({one.range[0]:g} to {one.range[1]:g})"
             for one in self.positions
@@ -406,7 +409,7 @@ class Ports(Value):
 
     @property
     def followed(self) -> tuple[tuple[Poi, str], ...]:
-        """The axes that have a set-point, as pairs of a POI and an axis."""
+        """The axes that have a set-point: pairs of a POI and an axis."""
         pois = ((self.poi(one.poi), one.axes) for one in self.references)
         return tuple((poi, axis) for poi, axes in pois for axis in axes or poi.axes[:1])
 

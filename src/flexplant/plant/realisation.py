@@ -377,7 +377,7 @@ class Feedthrough(ResidualForm):
     above: float | None = field(default=None, metadata=checked(positive))
 
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
-        """Return the realisation with its fast pairs replaced by their static gain.
+        """Return the modes of a structure with the fast ones replaced by their static flexibility.
 
         ModelError when nothing would be replaced, or everything.
         """

@@ -41,7 +41,7 @@ Port: TypeAlias = ForcePort | SensorPort | Poi
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachineParts(Value):
-    """Parts from which a machine is assembled, and which Deltas change: modes, ports and delay.
+    """Parts of a machine that Deltas change and from which its plant is made: modes, ports, delay.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class MachineParts(Value):
 
     @classmethod
     def of(cls, plant: Partition) -> MachineParts:
-        """Return the nominal machine of a plant."""
+        """Return the parts of a plant, which are those of the nominal machine."""
         own = plant.assembled
         return cls(plant, own.realisation, own.realisation.pairs, own.ports)
 
@@ -86,7 +86,7 @@ class MachineParts(Value):
         return self.replace(ports=self.ports.replace(**{port.home: side}))
 
     def with_gain(self, name: str, gain: float) -> MachineParts:
-        """Return the machine with the gain of an actuator or sensor times a number."""
+        """Return the machine with the gain of an actuator or sensor multiplied by a number."""
         every: tuple[Actuator | SensorPort, ...] = (*self.ports.u, *self.ports.y)
         port = next(one for one in every if one.name == name)
         part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
@@ -95,7 +95,7 @@ class MachineParts(Value):
         return self.with_port(port.replace(dynamics=part.replace(D=gain * part.D, **driven)))
 
     def assembled(self) -> Any:
-        """Return the plant of the machine, with the nominal one's ports and sampled like it."""
+        """Return the plant of the machine, with the sampling of the nominal plant."""
         plant, realisation = self.plant, self.realisation
         if self.model is not None:
             with warnings.catch_warnings():  # the nominal plant has said in which form it is

@@ -144,7 +144,7 @@ class PlaceTable(Value):
         return f"<PlaceTable {sizes}>"
 
     def covers(self, position: Position) -> bool:
-        """Return whether its values span the range of a position."""
+        """Return whether the grid covers the whole range of a position."""
         values, (low, high) = np.asarray(self.grid[position.name]), position.range
         spare = SAME * (high - low)
         return bool(values[0] <= low + spare and values[-1] >= high - spare)
@@ -178,11 +178,11 @@ class PlaceMotion(Value):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The positions that it depends on."""
+        """Names of the positions on which the place depends."""
         return tuple(self.along.grid if isinstance(self.along, PlaceTable) else self.along)
 
     def place(self, values: Mapping[str, float]) -> Place:
-        """Return the place at values of the positions."""
+        """Return the place for given values of the positions."""
         require_known("position", self.names, values, "the values given")
         one = {name: np.array([values[name]]) for name in self.names}
         found = [(tuple(points[0].tolist()), weight) for weight, points in self.points(one)]
@@ -207,7 +207,7 @@ class PlaceMotion(Value):
         return [(weight, np.asarray(point) + shift) for point, weight in terms.items()]
 
     def starting(self, place: Place, values: Mapping[str, float]) -> PlaceMotion:
-        """Return the same motion of a port, with a given place at given values of the positions."""
+        """Return the same motion, shifted so that it is at `place` for the given positions."""
         if isinstance(self.along, PlaceTable):
             raise LabelError(
                 "a port whose places are a table stands where the table says. Replace its table, "

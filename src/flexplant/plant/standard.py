@@ -381,7 +381,7 @@ class StandardPlant(Partition):
 
     @cached_property
     def machines(self) -> PlantMachines | None:
-        """Possible machines of this plant, drawn once; None without a stated uncertainty.
+        """Machines that this plant may be, drawn at random; None if no uncertainty is known.
 
         A plant made from ``fit.calibrated(measured)``, or from
         ``plant.uncertain(fit.machines(measured))`` with an evaluation model, has machines that
@@ -453,7 +453,9 @@ AnyPlant: TypeAlias = StandardPlant | GeneralizedPlant
 
 
 def plant_of(given: AnyPlant | UncertainPlant[StandardPlant] | System) -> AnyPlant:
-    """Return the plant of a synthesis or a loop: a `GeneralizedPlant`, or a `standard_plant`.
+    """Return a plant for a synthesis or a loop; a `GeneralizedPlant` is returned unchanged.
+
+    Other values are converted as by `standard_plant`.
 
     Parameters
     ----------
@@ -502,8 +504,9 @@ def assemble_plant(
         Larger model of the same machine, on which results are checked, with the modes that `model`
         lacks. Every plant made from this one has it too, and every filter, controller, loop, score
         and budget accounts for it. If it is a structure, the ports are applied to it; if it is a
-        plant, it must have the channels of the ports. By default the larger model consists of a
-        reduced `model` and the modes that it left out, if it still knows them.
+        plant, it must have the channels of the ports. If it is not given and `model` is a
+        ReducedModel that has kept its truncated modes, the larger model consists of `model` and
+        these modes.
     residual : FastStates or Feedthrough, optional
         Form of residual attachment vectors of Modes: fast modes (the default), or a compliance that
         responds at once.
@@ -529,9 +532,10 @@ def assemble_plant(
     FlexplantWarning
         When damping couples the modes so that a block for each mode cannot represent it. The cause
         is an overdamped pair, two poles that are (nearly) equal, or a damper to ground whose pole
-        in a rigid-body motion is faster than 1e-4 of the first elastic frequency. Slower poles are
-        neglected, because rigid-body modes are undamped by convention. The undamped modes are then
-        coupled by the whole matrix D (dense form).
+        in a rigid-body motion is faster than 1e-4 of the first elastic frequency. In these cases
+        the plant has the dense form: its states are those of the undamped modes, which the full
+        damping matrix couples. A damper with a slower pole is neglected and causes no warning,
+        because rigid-body modes are undamped by convention.
 
     References
     ----------

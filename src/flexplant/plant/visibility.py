@@ -88,7 +88,7 @@ class ModeVisibility(Value):
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """Shares below one percent, in words."""
+        """Text for each side where the share of the mode is below 1 %."""
         return tuple(
             f"{side} {_VERBS[side]} mode {self.mode} ({self.freq:.4g} Hz, damping "
             f"{100 * self.zeta:.2g} %) "

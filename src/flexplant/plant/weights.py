@@ -350,8 +350,9 @@ def mixed_sensitivity(
     The loop is ``e = r - G u, u = K e``. The sensitivity from r to e is ``S = (I + G K)^-1``, and
     ``T = G K S`` is the complementary sensitivity. MATLAB's `augw` builds the same plant;
     `design_hinf` designs K for it, as `mixsyn` does. If G has a rigid-body mode or an integrator,
-    this plant has an invariant zero on the stability limit from r to the outputs, which the
-    standard assumptions exclude. In this case add a disturbance at u, as `stage_weights` does.
+    the transfer from r to the outputs of this plant has an invariant zero on the imaginary axis (on
+    the unit circle if G is sampled). The standard assumptions exclude such a zero. In this case add
+    a disturbance at u, as `stage_weights` does.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ def bode(
     Returns
     -------
     Axes
-        Axes of the magnitude of the first channel; `.figure.axes` are all, row by row.
+        Axes of the magnitude of the first channel; its `.figure.axes` lists all axes, row by row.
 
     Raises
     ------
@@ -196,8 +196,9 @@ def frf(
 ) -> Axes:
     """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
 
-    Measurements are black points under the lines. The first line whose label has no style of its
-    own (see `flexplant.plot`) is thick, so that other lines do not hide it.
+    Measurements are black points under the lines. If the label of the first response has no fixed
+    style (the labels with a fixed style are listed in `flexplant.plot`), its line is thick, so that
+    other lines do not hide it.
 
     Parameters
     ----------
@@ -225,7 +226,7 @@ def frf(
     Returns
     -------
     Axes
-        Axes of the magnitude; `.figure.axes` are all.
+        Axes of the magnitude; its `.figure.axes` lists all axes.
 
     Raises
     ------

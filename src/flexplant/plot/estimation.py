@@ -191,7 +191,7 @@ def estimate(
     truth : (N,) array, optional
         True motion, where it is known; the error of the estimate is then drawn.
     deviations : float
-        Half the width of the band.
+        Half the width of the band, in standard deviations.
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 
@@ -294,7 +294,7 @@ def consistency(
     Returns
     -------
     Axes
-        Axes of the NIS; `.figure.axes` are all.
+        Axes of the NIS; its `.figure.axes` lists all axes.
 
     Raises
     ------

@@ -62,8 +62,9 @@ def nyquist(
     If there are more than four curves, each has a separate panel.
 
     The magnitude of ``S = 1 / (1 + L)`` is the inverse of the distance of L from -1. Only positive
-    frequencies are drawn, without the mirror image. If the frequencies of a measured gain are too
-    coarse for a resonance, the curve follows the circle through the neighbouring points.
+    frequencies are drawn, without the mirror image. Near a resonance the curve of L is nearly a
+    circle. If a measured gain has too few frequencies there, the drawn curve follows the circle
+    through the neighbouring points.
 
     Parameters
     ----------
@@ -383,7 +384,7 @@ def sensitivities(
     Returns
     -------
     Axes
-        Axes of S; `.figure.axes` are all.
+        Axes of S; its `.figure.axes` lists all axes.
 
     Raises
     ------

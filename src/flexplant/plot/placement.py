@@ -183,7 +183,7 @@ def placed(
     Returns
     -------
     Axes
-        Axes of the view from above; `.figure.axes` are all.
+        Axes of the view from above; its `.figure.axes` lists all axes.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def response(
     Returns
     -------
     Axes
-        The panel of the first channel; `.figure.axes` are all, in the order of the channels.
+        Axes of the first channel; its `.figure.axes` lists all axes, in the order of the channels.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def step(
     Returns
     -------
     Axes
-        Axes of the first channel; `.figure.axes` are all, row by row.
+        Axes of the first channel; its `.figure.axes` lists all axes, row by row.
 
     Raises
     ------

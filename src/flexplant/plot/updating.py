@@ -185,8 +185,8 @@ def update(
         Residuals of the update, or other measurements by which it is judged.
     unused : Frf or FrfResidual, optional
         Measured response that was not fitted. It is drawn in place of that of the residuals. Give
-        an FrfResidual if its channels are not named by their DOFs, or if it was measured after a
-        hold.
+        an FrfResidual if the channels of the response are not named by DOFs, or if the response
+        contains a zero-order hold.
     level : float
         Level of the confidence intervals.
 

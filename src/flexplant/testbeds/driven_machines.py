@@ -166,10 +166,11 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
 def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a mirror that tilts on flexures.
 
-    A mirror of 0.12 kg and 80 mm tilts about x and y at 23 and 26 Hz in a housing (2.5 kg, with
-    bolts that give 310 Hz and more). The rim of the mirror bends at 2.3 and 2.6 kHz. Four coils
-    push against the housing; each pair makes one moment. Two differential sensors measure the tilt
-    of the rim relative to the housing. The tilt of the mirror's centre has a reference.
+    The mirror has a mass of 0.12 kg and a diameter of 80 mm. Its tilting modes about x and y are at
+    23 and 26 Hz. The housing has a mass of 2.5 kg, and its modes on its bolts are at 310 Hz and
+    above. The rim of the mirror bends at 2.3 and 2.6 kHz. Four coils push against the housing; each
+    pair makes one moment. Two differential sensors measure the tilt of the rim relative to the
+    housing. The tilt of the mirror's centre has a reference.
 
     Parameters
     ----------

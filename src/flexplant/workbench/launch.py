@@ -226,8 +226,8 @@ def open_page(
         Design to continue. By default each axis begins with a PID controller and a low-pass filter
         well below its resonances.
     model : StandardPlant or StateSpace, optional
-        Model of a measured plant. It is drawn with the measurement, and gives the error and the
-        effect of truncated modes.
+        Model of a measured plant. Its response is drawn next to the measurement. The predicted
+        servo error and the effect of truncated modes are computed with it.
     before, after, rate, delay, hold, rigid, unstable, references
         Arguments of `design_loops`. By default they follow from the plant or model and the axes
         that its actuators drive.

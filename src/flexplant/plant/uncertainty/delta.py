@@ -62,15 +62,18 @@ class Delta(Value):
     outermost: ClassVar[bool] = False
 
     def changed(self, machine: MachineParts, amount: float) -> MachineParts:
-        """Return a machine that is off by an amount, in the unit of `scale`."""
+        """Return the machine with a change by `amount`, which has the unit of `scale`."""
         raise NotImplementedError(f"{type(self).__name__} must say by `changed` what it changes.")
 
     def amount(self, drawn: float) -> float:
-        """Return the amount that belongs to a drawn number; the number 1 gives `scale`."""
+        """Return the change that belongs to a value of delta; delta = 1 gives `scale`."""
         return self.scale * drawn
 
     def of_matrices(self, plant: Partition) -> Delta:
-        """Return the Delta; one of a mode becomes a change of M, D and K of the plant's model."""
+        """Return a Delta that can be combined with `Parameters`; most kinds return it unchanged.
+
+        A Delta of a modal frequency or damping becomes a change of K or D of the plant's model.
+        """
         return self
 
     def require_in_range(self, deviations: float) -> None:
@@ -83,7 +86,7 @@ class Delta(Value):
 
     @classmethod
     def opened(cls, plant: Partition, opened: Opened, deltas: Sequence[Delta]) -> Opened:
-        """Return a continuous plant's system with channels for all Deltas of this kind."""
+        """Return the system of a continuous plant with added channels for Deltas of this kind."""
         base = plant.system
         units = EvenUnits.of(base)
         parts = []

@@ -48,7 +48,7 @@ class Fit(Uncertainty):
         such a calibrated plant, and for a fit with a discrepancy (an estimated error of the model
         itself), the `uncertainty` of the fit is used in its place. A mode may then differ by two
         standard deviations. The second is the uncertainty of a calibrated model,
-        ``fit.uncertainty(measured)``. The third are measured poles with mode numbers and a
+        ``fit.uncertainty(measured)``. The third is a set of measured poles with mode numbers and a
         covariance.
     modes : sequence of int, optional
         Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
@@ -97,7 +97,7 @@ class Fit(Uncertainty):
         self._set(deviations=positive(self.deviations, "deviations"), parameters=about)
 
     def known(self, plant: Partition) -> Known:
-        """Return Deltas of modes, or of parameters where damping couples the modes."""
+        """Return the Deltas of the modes; if damping couples the modes, those of the parameters."""
         source = self.source
         if isinstance(source, Machines):
             source = source.fit

@@ -1,4 +1,4 @@
-"""What is not known of a machine, as a value: the base that all kinds of it derive from."""
+"""Kinds of uncertainty of a machine: the class from which all of them derive."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .delta_blocks import Block
 
 
 class Known(NamedTuple):
-    """Deltas of one kind of uncertainty for a plant, and how they are drawn.
+    """Deltas of one kind of uncertainty for a plant, and their distribution in random draws.
 
     Parameters
     ----------
@@ -53,8 +53,9 @@ class Uncertainty(Value):
     """A kind of uncertainty of a machine, for ``plant.uncertain(...)``.
 
     To add a new kind, derive a class and define its method `deltas`, which returns the Deltas of a
-    plant. Define `known` instead if the Deltas are correlated, or if a machine is drawn by other
-    numbers than the Deltas. For uncertain dynamics define `delta_blocks` and `with_blocks`.
+    plant. Define `known` instead if the Deltas are correlated, or if random machines are drawn by
+    means of other numbers than the Deltas. For uncertain dynamics define `delta_blocks` and
+    `with_blocks`.
 
     Examples
     --------
@@ -74,25 +75,36 @@ class Uncertainty(Value):
     """
 
     def deltas(self, plant: Partition) -> Sequence[Delta]:
-        """Return the Deltas that a plant has."""
+        """Return the Deltas of this kind of uncertainty for a plant."""
         return ()
 
     def known(self, plant: Partition) -> Known:
-        """Return the Deltas that a plant has, and how they are drawn."""
+        """Return the Deltas of this kind for a plant, and their distribution in random draws."""
         return Known.independent(self.deltas(plant))
 
     def bound(self, plant: Partition) -> Any:
-        """Return the `NeglectedModes` of a plant; None for a kind without such a bound."""
+        """Return the bound on modes that a plant neglects; None except for the kind `Neglected`."""
         return None
 
     def delta_blocks(self, plant: Partition) -> Sequence[Block]:
-        """Return the blocks of a plant that are not numbers of its machine, such as dynamics."""
+        """Return the Deltas that are systems or matrices; empty if all Deltas are real numbers.
+
+        Uncertain dynamics (`UnmodelledDynamics`) are such a block.
+        """
         return ()
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return a system of the plant, or its bilinear image, with the blocks' channels first."""
+        """Return a system with the channels of `delta_blocks` in front of its own channels.
+
+        A kind without such blocks returns the system unchanged. `system` is the system of the
+        plant, or one made from it, for example a continuous system that the bilinear map gives for
+        a sampled plant.
+        """
         return system
 
     def larger(self, plant: Partition) -> Any:
-        """Return a plant with the modes that machines have in addition; None if not known."""
+        """Return the plant with its neglected modes; None except for the kind `Neglected`.
+
+        Machines that are drawn at random are made from this plant.
+        """
         return None

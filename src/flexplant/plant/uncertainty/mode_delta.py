@@ -88,7 +88,7 @@ class ModeDelta(Delta):
             )
 
     def of_matrices(self, plant: Partition) -> ParameterDelta:
-        """Return it as a change of K, omega^2 (M phi)(M phi)', or of D."""
+        """Return the same Delta as a change of K by omega^2 (M phi)(M phi)', or of D."""
         realisation = plant.assembled.realisation
         push = np.asarray(plant.model.M @ realisation.inputs[:, 2 * self.mode - 1])
         size = self._share(realisation.pairs[self.mode - 1])

@@ -158,7 +158,7 @@ class Shapes(Uncertainty):
         )
 
     def known(self, plant: Partition) -> Known:
-        """Return a Delta for each direction, scaled to the length of the shape."""
+        """Return a Delta for each direction of change of a mode shape."""
         realisation = modal_realisation(plant)
         require_elastic(realisation, self.modes)
         n = realisation.outputs.shape[0]

@@ -98,7 +98,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def delta_blocks(self) -> tuple[Block, ...]:
-        """The Deltas that are dynamic or matrices: unmodelled dynamics, and your own blocks."""
+        """The Deltas that are systems or matrices, such as those of `UnmodelledDynamics`."""
         found = [block for kind in self.kinds for block in kind.delta_blocks(self.plant)]
         names = [delta.name for delta in self.deltas] + [block.name for block in found]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -107,14 +107,14 @@ class UncertainPlant(Value, Generic[P]):
         return tuple(found)
 
     def with_blocks(self, system: StateSpace) -> StateSpace:
-        """Return a system of the plant with the channels of `delta_blocks` first."""
+        """Return a system of the plant with the channels of `delta_blocks` in front of its own."""
         for kind in self.kinds:
             system = kind.with_blocks(self.plant, system)
         return system
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance (m, m) of the Deltas as random numbers."""
+        """Covariance (m, m) of the m Deltas, which are random numbers when machines are drawn."""
         whole = la.block_diag(np.zeros((0, 0)), *(known.covariance for known in self._known))
         return np.asarray(whole[np.ix_(self._order, self._order)])
 
@@ -206,7 +206,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def of_matrices(self) -> bool:
-        """Whether Deltas of parameters exist, so that all Deltas of modes change M, D and K too."""
+        """Whether there are Deltas of `Parameters`. Deltas of modes then change M, D and K too."""
         found = any(isinstance(delta, ParameterDelta) for delta in self.deltas)
         if found:
             require_matrices(self.plant)
@@ -279,11 +279,14 @@ class UncertainPlant(Value, Generic[P]):
         return made_of(machine, lft(opened, delta))
 
     def with_drawn_blocks(self, machine: P, rng: np.random.Generator) -> P:
-        """Return a machine with a drawn system in the place of each block."""
+        """Return a machine with a random system in the place of each of `delta_blocks`."""
         return self._closed(machine, self.drawn_blocks(rng))
 
     def drawn_blocks(self, rng: np.random.Generator, size: float | None = None) -> dict[str, Any]:
-        """Return random stable systems of the blocks, by name, of gain `size` or at most 1."""
+        """Return a random stable system for each of `delta_blocks`, by name.
+
+        The gain of each system is `size`; by default it is random, at most 1.
+        """
         poles = self.plant.continuous.system.poles()
         return {
             one.name: drawn_delta(one, rng, poles, rng.uniform() if size is None else size)
@@ -297,7 +300,7 @@ class UncertainPlant(Value, Generic[P]):
         return nominal.machines
 
     def values(self, rng: np.random.Generator) -> list[tuple[Delta, float]]:
-        """Return drawn values of the Deltas, each kind from its covariance.
+        """Return random values of the Deltas; each kind is drawn from its covariance.
 
         For a fit, its parameters are drawn in place of the Deltas of its modes. These parameters
         change all modes and mode shapes.
@@ -312,7 +315,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def larger(self) -> Any:
-        """The plant with the modes that drawn machines have in addition; None if not known."""
+        """The plant with its neglected modes, from which machines are drawn; None if not known."""
         given = (kind.larger(self.plant) for kind in self.kinds)
         found = [one for one in given if one is not None]
         plant: Any = self.plant
