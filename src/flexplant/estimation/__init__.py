@@ -21,11 +21,12 @@
 
 **How accurate is a predicted error?** It is as accurate as the evaluation model, including the
 errors of its mesh, which ``modes.extrapolated(coarser)`` corrects. ``observer.interval`` gives the
-interval of the error on machines that agree with a measurement. For a plate of 0.6 m x 0.6 m, a
-mesh of 8 x 8 elements predicts the error of finer meshes within 6 % in z and within 23 % in
-rotations. For a plate of 0.5 m x 0.3 m the same mesh predicts an error in z that is 65 % too large,
-because above 10 kHz modes of nearly equal frequency have other shapes on a finer mesh. For this
-plate 12 x 12 elements agree with 24 x 24 elements within 5 % in z.
+interval of the error over ``plant.machines``, random draws of the machine within the known
+uncertainty of the plant. For a plate of 0.6 m x 0.6 m, a mesh of 8 x 8 elements predicts the error
+of finer meshes within 6 % in z and within 23 % in rotations. For a plate of 0.5 m x 0.3 m the same
+mesh predicts an error in z that is 65 % too large, because above 10 kHz modes of nearly equal
+frequency have other shapes on a finer mesh. For this plate 12 x 12 elements agree with 24 x 24
+elements within 5 % in z.
 
 `design_kalman` does what ``kalman`` and ``lqe`` do in MATLAB and python-control.
 `KalmanEstimator.to_filterpy` makes a filter for filterpy.

@@ -156,7 +156,7 @@ class ConsistencyReport(Value):
 
     @property
     def holds(self) -> bool:
-        """Whether no test rejects the model of the innovations."""
+        """Whether the innovations pass all tests."""
         return self.cause == "none"
 
 
@@ -180,8 +180,8 @@ def consistency(
     model passes all five with the probability `level`. The likely causes follow from the failed
     tests:
 
-    - *outliers*: single samples of a sensor that noise cannot explain. The filter reacts to such a
-      sample as to one wrong sample;
+    - *outliers*: single wrong samples of a sensor, which noise cannot explain. The innovations that
+      follow are the response of the filter to one wrong sample;
     - *offset* of a sensor: the mean of its innovations is larger than the spectrum at the lowest
       frequencies explains.
 
@@ -196,10 +196,10 @@ def consistency(
       large innovations are named;
     - *noise ratio*: the innovations are coloured, but two other levels, one of the process noise
       and one of the sensor noise, explain them. The levels are fitted to the spectrum;
-    - *frequency*: the spectrum has another peak, and a change of a neighbouring mode explains it
-      better than an additional mode does. Frequency and damping of all such modes are fitted to the
-      record by maximum likelihood. The fit includes the commands, so that a closed loop does not
-      bias the result (`moved`);
+    - *frequency*: the spectrum has a peak that the model does not predict, and a change of a
+      neighbouring mode explains it better than an additional mode does. Frequency and damping of
+      all such modes are fitted to the record by maximum likelihood. The fit includes the commands,
+      so that a closed loop does not bias the result (`moved`);
     - any other peak means *truncation* if it lies above all modes of the plant, or at a truncated
       mode that is known. It means *folding* if the plant has modes above the peak, or the truncated
       mode lies above half the rate. A disturbance that is missing in the plant is also possible.

@@ -453,7 +453,7 @@ class PoiFilter(PoiEstimator):
 
     @property
     def rms_text(self) -> str:
-        """Text of the predicted rms errors, with their intervals or the reason without them."""
+        """Text of the predicted rms errors, with intervals or the reason why there are none."""
         channels, units = poi_channels(self.plant), self.plant.units
         known = self.plant.machine.machines if self.plant.dt else None
         if known is None:

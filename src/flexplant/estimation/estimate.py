@@ -46,7 +46,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     names : sequence of str
         Names of the estimates.
     data : (nz, N) array [m or rad]
-        The estimates; NaN while the measurements do not determine one yet.
+        The estimates; NaN as long as the measurements do not yet determine an estimate.
     deviations : (nz, N) array [m or rad]
         Standard deviations of the errors of the estimates. They hold on the filter's model, in
         which truncated modes count as white noise. Infinite as long as an estimate is not
@@ -69,9 +69,10 @@ class Estimate(Value, Mapping[str, FloatArray]):
     units : mapping {channel: unit}
         Unit of each channel.
     gate : float
-        Number of deviations above which a sample counted as missing; infinite without a gate.
+        Number of standard deviations above which an innovation was taken for an outlier, so that
+        its sample counted as missing. Infinite if no gate was used.
     gated : (ny, N) array of bool
-        Gated samples; (ny, 0) without a gate.
+        Whether each sample was rejected by the gate; (ny, 0) without a gate.
     record : (N, ny + nu) array
         Measurements and commands of the record.
     channels : sequence of str
@@ -144,7 +145,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         return len(self.names) + len(self.sensors)
 
     def warn_of_gate(self) -> None:
-        """Warn if a sensor has so many gated samples that they cannot be outliers."""
+        """Warn if the gate rejected more samples of a sensor than can be outliers."""
         share = self.gated.mean(axis=1) if self.gated.size else np.zeros(len(self.sensors))
         worst = int(np.argmax(share))
         if share[worst] > max(_MOST, 10 * erfc(self.gate / np.sqrt(2.0))):

@@ -108,7 +108,7 @@ class KalmanEstimator(PoiFilter):
 
     @cached_property
     def predicted_covariance(self) -> FloatArray:
-        """Covariance (n, n) of the error of x[k|k-1], before the measurement, on its model."""
+        """Covariance (n, n) of the error of the prediction x[k|k-1], on the filter's model."""
         model, moved = self.model, self.model.A @ self.gain
         P = model.A @ self.covariance @ model.A.T + model.Q
         if np.any(model.S):
@@ -260,7 +260,7 @@ class KalmanEstimator(PoiFilter):
         return np.block([[g.C, g.D], [g.A, g.B]]), (g.n_states, ny, len(g.inputs) - ny)
 
     def report(self, lags: npt.ArrayLike = LAGS) -> LagReport:
-        """Return the rms errors at the POIs by lag, with the static relation; prints as a table.
+        """Return the rms errors at the POIs for several lags; prints as a table.
 
         The rows are the static relation (see `design_static`), the predictor, the filter, fixed
         lags and the smoother, all stationary. They show how much smaller the error is if the

@@ -47,11 +47,11 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
         noises of the new signals are then correlated. A labelled system without noise densities is
         refused, and the message tells how to add them.
     machines : PlantMachines, optional
-        The machines ``plant.machines`` that agree with a measurement. If they are given, the filter
-        relies less on uncertain modes. The noise of the truncated modes is moved towards the mean
-        covariance of the difference between the machines and the filter's model: by 0, 1/4, 1/2 or
-        all of this change. The filter whose error intervals have the smallest upper ends is
-        returned. Without truncated modes this argument has no effect.
+        Random draws of the machine within its known uncertainty, as ``plant.machines`` gives them.
+        If they are given, the filter relies less on uncertain modes. The noise of the truncated
+        modes is moved towards the mean covariance of the difference between the machines and the
+        filter's model: by 0, 1/4, 1/2 or all of this change. The filter whose error intervals have
+        the smallest upper ends is returned. Without truncated modes this argument has no effect.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def design_kalman(plant: AnyPlant | System, *, machines: Any = None) -> KalmanEs
     AssumptionError
         When the plant is continuous or a sensor has no noise. When a disturbance that is not
         constant during each sample reaches a sensor directly. When w does not excite a rigid-body
-        mode, or y does not see it. When the machines have no intervals.
+        mode, or y does not see it. When data are missing that the intervals over `machines` need.
     ModelError
         When the plant is weighted, its noise is not known, or the evaluation model has fewer modes
         than the plant.

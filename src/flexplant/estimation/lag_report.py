@@ -85,7 +85,7 @@ class LagReport(Value):
         return np.asarray(self.rms[list(self.names).index(row)])
 
     def recovered(self, row: str, channel: str) -> float:
-        """Return how much of the smoother's gain over the filter a row (such as "1 ms") reaches.
+        """Return the improvement of a row (such as "1 ms") relative to that of the smoother.
 
         The result is the decrease of the error variance from the filter to this row, divided by
         the decrease from the filter to the smoother: 0 for the filter, and 1 for the smoother.

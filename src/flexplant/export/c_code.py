@@ -44,10 +44,10 @@ def write_c(
     The states are transformed to blocks of two, so that a compiler can compute several blocks at a
     time. As a check, the response of the blocks is compared with that of the controller. Numbers
     have 17 digits (9 in single precision), which is exact. The names of the functions end in
-    `_reset`, `_start`, `_output`, `_update` and `_step`. `_start` begins without a jump of the
-    present commands: it finds steady states with these commands, if they exist. In each sample call
-    `_output` and then `_update`, or only `_step`. If a value is not finite, the last outputs are
-    held and a flag is raised.
+    `_reset`, `_start`, `_output`, `_update` and `_step`. `_start` is used in place of `_reset` if
+    commands act already: it computes states with which these commands stay constant (if such states
+    exist), so that they do not jump. In each sample call `_output` and then `_update`, or only
+    `_step`. If a value is not finite, the last outputs are held and a flag is raised.
 
     Parameters
     ----------

@@ -347,8 +347,8 @@ def write_fmu(
     Parameters
     ----------
     system : StandardPlant, GeneralizedPlant, StateSpace, Controller or ClosedLoop
-        Sampled system. The unit of a plant has w and u as inputs, and z and y as outputs. Of a
-        ClosedLoop the controller is written, as by `write_c`.
+        Sampled system. The functional mock-up unit of a plant has w and u as inputs, and z and y as
+        outputs. For a ClosedLoop, its controller is written, as by `write_c`.
     path : str or Path
         Path such as "stage.fmu". The file is written completely or not at all. Its name becomes the
         name of the model.
@@ -376,7 +376,7 @@ def write_fmu(
     Warns
     -----
     FlexplantWarning
-        When no C compiler is found. The unit then contains only sources, which the importing
+        When no C compiler is found. The file then contains only sources, which the importing
         program must compile.
 
     References

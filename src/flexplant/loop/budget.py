@@ -62,8 +62,9 @@ class ErrorBudget(Value):
     certificate : Certificate
         Relative differences between the variance and the results of other methods for it.
     interval : str
-        Text of the interval of the rms over the machines that agree with a measurement, or the
-        reason why there is no such interval. It is empty if the plant knows no such machines.
+        Text of the interval of the rms over the machines ``plant.machines``, or the reason why
+        there is no such interval. These machines are random draws within the known uncertainty of
+        the plant. The text is empty if no uncertainty is known.
 
     Examples
     --------

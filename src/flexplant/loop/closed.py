@@ -193,7 +193,7 @@ class ClosedLoop(Value):
         """Return a function that computes the response from one channel of w to one of z.
 
         The argument of this function is an array of frequencies [Hz], which it does not check. It
-        returns an array (1, 1, n_freq) and is fast, because all else is prepared once.
+        returns an array (1, 1, n_freq) and is fast, because all else is computed in advance.
         """
         return self._responses([reference], [error])
 
@@ -319,7 +319,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def on_machines(self) -> MachineLoops:
-        """The same controller around machines of the same measurement; ModelError if not known."""
+        """Loops of this controller around ``plant.machines``; ModelError if these are not known."""
         known = self.plant.machine.machines
         if known is None:
             raise ModelError(
@@ -335,7 +335,7 @@ class ClosedLoop(Value):
         *,
         unit: str = "",
     ) -> FigureInterval:
-        """Return the interval of a number over the machines that agree with the measurement.
+        """Return the interval of a number over the machines that the plant may be (`on_machines`).
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Figures of a loop on machines that agree with the measurement, and their intervals."""
+"""Figures of a loop on the machines that its plant may be, and their intervals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARGIN, BANDWIDTH, RADIUS = FIGURES = ("modulus margin", "bandwidth", "spectral 
 
 
 class MachineLoops:
-    """One controller around machines that agree with the measurement; figures are cached."""
+    """One controller around each of the machines ``plant.machines``; figures are cached."""
 
     def __init__(self, loop: Any, machines: PlantMachines) -> None:
         self.machines = machines

@@ -29,8 +29,9 @@ class OnMeasurement(Value):
     reason : str
         Reason why the stability is not known; empty if it is known.
     added : float [samples]
-        Delay of the plant that was added to the response. It is added to a response measured from
-        sample to sample, which may already contain it.
+        Delay of the plant that was added to the response. It is not 0 if the response was measured
+        from sample to sample and, as stated, contains no delay. If it contains one, use
+        ``plant.measured(frf, delay=...)``.
 
     Examples
     --------

@@ -400,8 +400,9 @@ class LoopComparison(Value):
         Names of the loops whose plants have no evaluation model.
     intervals : mapping {name: str}
         Text of the intervals of margin and bandwidth, or the reason why there are none. An interval
-        holds 95 % of the machines that the measurement of a fit allows (`FitMachines`). A loop is
-        included only if such machines were given to its plant.
+        contains the figure for 95 % of the machines ``plant.machines``, which are random draws
+        within the known uncertainty of the plant. A loop is included only if the uncertainty of its
+        plant is known.
     """
 
     rows: Mapping[str, LoopFigures]

@@ -385,8 +385,8 @@ class StandardPlant(Partition):
 
         A plant made from ``fit.calibrated(measured)``, or from
         ``plant.uncertain(fit.machines(measured))`` with an evaluation model, has machines that
-        agree with the measurement. Otherwise they are drawn from the uncertainty stated by
-        ``plant.uncertain(...)``.
+        agree with the measurement of the fit. Otherwise they are drawn from the uncertainty that
+        ``plant.uncertain(...)`` states.
         """
         fit = fitted_machines(self)
         if fit is None and self.uncertainty is None:

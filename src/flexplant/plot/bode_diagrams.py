@@ -54,7 +54,8 @@ def bode(
     systems : StateSpace, Frf, or mapping {label: one of these} or list of them
         Systems to draw, also of python-control and SciPy; several share their axes.
     outputs, inputs : str or sequence of str, optional
-        Channels of the first system; all by default. Others use the same names.
+        Channels of the first system; all by default. The other systems must have channels with the
+        same names.
     freq : (n_freq,) array [Hz], optional
         Frequencies at which systems are evaluated; by default a grid of each, refined at
         resonances.

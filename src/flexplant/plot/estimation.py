@@ -54,7 +54,7 @@ def predictions(
     colors : mapping {design: color}, optional
         Colours of the diamonds.
     cases : sequence of str, optional
-        Names of the k cases, written above those of the first design.
+        Names of the k cases, written above the marks of the first design.
     unit : str
         SI unit of the errors; a prefix is chosen.
     ax : Axes, optional
@@ -180,7 +180,7 @@ def estimate(
     deviations: float = 2.0,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an estimate over time with the band of its deviation.
+    """Draw an estimate over time with a band of its standard deviation.
 
     Parameters
     ----------

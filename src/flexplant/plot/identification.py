@@ -36,12 +36,12 @@ _MARKS = (
 def stabilisation(
     diagram: StabilisationDiagram, *, frf: Frf | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw poles over model orders; columns of crosses are modes.
+    """Draw the poles of models of increasing order; a column of crosses is a mode.
 
     Parameters
     ----------
     diagram : StabilisationDiagram
-        Diagram from which poles are chosen.
+        Result of `flexplant.identification.stabilisation_diagram`.
     frf : Frf, optional
         Response whose sum over all channels is drawn in the background.
     ax : Axes, optional

@@ -178,7 +178,7 @@ def placed(
     zones : sequence of Rectangle or Disc
         Excluded zones, hatched.
     ax : Axes, optional
-        Axes of the view from above, with all devices.
+        Axes on which the view from above is drawn, with all devices.
 
     Returns
     -------
@@ -316,9 +316,9 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
     Returns
     -------
     list of Axes
-        A panel for the decoupling error, one for the participation of the modes in the loop, and
-        one for each figure. Over two positions, the lowest participation of all modes is drawn. The
-        smallest and largest values are marked.
+        A panel for the decoupling error, one for the share of each mode in the loop
+        (`PositionMap.visible`), and one for each figure. Over two positions, the smallest share of
+        all modes is drawn. The smallest and largest values are marked.
 
     Raises
     ------

@@ -62,7 +62,7 @@ def response(
     label : str, optional
         Prefix of the channel names, or name of a single channel, to compare runs on one axes.
     color : str, optional
-        Colour of the lines; a cycle by default.
+        Colour of the lines; by default the colours follow `CYCLE`.
     span : (start, end) [s], optional
         Part of the run to draw; all of it by default. The prefix is chosen for that span.
     exposures : (k, 2) array [s], optional

@@ -352,7 +352,7 @@ def layout(
     ports : Ports, optional
         Ports whose places are drawn.
     desired : iterable of str
-        Labels of the desired DOFs.
+        Labels of DOFs to mark, for example those that a reduction keeps.
     marked : mapping {text: place}, optional
         Further places, which are drawn with their names.
     ax : Axes, optional

@@ -184,9 +184,9 @@ def update(
     residuals : sequence of Residual
         Residuals of the update, or other measurements by which it is judged.
     unused : Frf or FrfResidual, optional
-        Measured response that was not fitted. It is drawn in place of that of the residuals. Give
-        an FrfResidual if the channels of the response are not named by DOFs, or if the response
-        contains a zero-order hold.
+        Measured response that was not fitted. It is drawn instead of the response in `residuals`.
+        Give an FrfResidual if the channels of the response are not named by DOFs, or if the
+        response contains a zero-order hold.
     level : float
         Level of the confidence intervals.
 
@@ -363,7 +363,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     fit : UpdateResult
         Result of `fx.update`.
     measured : (m,) complex array [rad/s]
-        Measured eigenvalues, in the same order.
+        Measured eigenvalues, in the order of the eigenvalues of `fit`.
     ax : Axes, optional
         Axes to draw on; by default those of a new figure.
 

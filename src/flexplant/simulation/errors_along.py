@@ -234,7 +234,10 @@ class PathFilters(Value):
         return "\n".join(lines) + ">"
 
     def price(self, gain: str) -> dict[str, FloatArray]:
-        """Return the error (n_time,) of "scheduled" or "frozen" minus "exact", by motion."""
+        """Return the error (n_time,) of "scheduled" or "frozen" minus that of "exact".
+
+        The result is a dictionary with an entry for each motion.
+        """
         require_known("gain", [gain], GAINS)
         extra = getattr(self, gain) - self.exact
         return {name: np.asarray(extra[i]) for i, name in enumerate(self.names)}

@@ -130,9 +130,10 @@ class Feedforward(Value):
         return self.replace(gains=gains)
 
     def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return the force of each actuator at times (n_time,) [s], by the names of `known_forces`.
+        """Return the force of each actuator (n_time,) for a set-point `move` at times [s].
 
-        If the gains depend on the place, the number of times must equal the number of places. The
+        The names are those of the channels of `known_forces`, such as `u1:feedforward`. If the
+        gains depend on the place, the number of times must equal the number of places. The
         set-point must have at least the order of the highest derivative with a gain. With filters
         of slow zeros, the output depends on earlier times. The times must then be the samples of
         the plant, and the first ones must be at rest.

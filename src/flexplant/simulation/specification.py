@@ -55,11 +55,12 @@ class Verdict(Value):
     at_least : (n,) bool array
         Whether the limit is a lower limit.
     low, high : (n,) arrays, optional
-        Ends of the interval of each value. The interval holds on 95 % of the machines that agree
-        with the measurement. NaN where no interval is stated.
+        Ends of the interval of each value. The interval contains the value for 95 % of the machines
+        ``plant.machines``, which are random draws within the known uncertainty of the plant. NaN
+        where no interval is stated.
     sentences : sequence of n str, optional
-        The intervals in words, or the reason why there is none. Texts are empty if the plant of the
-        loop knows no such machines.
+        The intervals in words, or the reason why there is none. Texts are empty if no uncertainty
+        of the plant is known.
 
     Examples
     --------
@@ -232,8 +233,9 @@ class Specification(Value):
     def check(self, loop: ClosedLoop, run: _Run | None = None, *, exposures: Any = None) -> Verdict:
         """Return the achieved values of a loop and of its run, compared with the limits.
 
-        If the plant knows the machines that agree with a measurement, each value gets an interval
-        that holds on 95 % of them.
+        If the uncertainty of the plant is known (`StandardPlant.machines`), each value gets an
+        interval. It contains the value for 95 % of the machines that are drawn at random within
+        this uncertainty.
 
         Parameters
         ----------

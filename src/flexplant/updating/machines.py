@@ -45,8 +45,8 @@ class Machines(Value):
     """Uncertainty of a machine after an update: random draws of whole machines.
 
     A machine is the real structure, of which the model is an approximation. Each draw is one
-    machine that agrees with the measurement. The object is the result of ``fit.machines(measured)``
-    and is passed to a plant by ``plant.uncertain(machines)``. A plant of
+    machine that agrees with the measurement `measured`. The object is the result of
+    ``fit.machines(measured)`` and is passed to a plant by ``plant.uncertain(machines)``. A plant of
     ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal coordinates
     of the plant's evaluation model. There, the mass matrix is the unit matrix I, and Omega is the
     diagonal matrix of the frequencies. Each draw has four steps:

@@ -65,7 +65,7 @@ _OVER, _BESIDE, _BEYOND = 3.0, 1.25, 3.0
 
 
 class Bench:
-    """Machines in the axes of a design, shared by all tabs; the first is the nominal one."""
+    """Machines and design of a page, shared by all tabs; the first machine is the nominal one."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class Bench:
 
     @classmethod
     def of(cls, plant: Any, design: LoopDesign | None, options: Mapping[str, Any]) -> Self:
-        """Return the bench of a plant, a list of plants or a mapping of them by name."""
+        """Return the machines and the first design of a page, from the arguments of `open_page`."""
         machines = _machines_by_name(plant)
         names = ("before", "after", "rate", "delay", "hold", "rigid", "unstable", "references")
         given = {n: options[n] for n in names if options.get(n) is not None}
@@ -114,18 +114,18 @@ class Bench:
 
     @cached_property
     def question(self) -> Question:
-        """Results that are computed in addition to those of the axis."""
+        """Machine, model, channel and move for which errors and truncated modes are computed."""
         return Question(self.machines[0], self.model, self.channel, self.move)
 
     def question_of(self, index: int) -> Question:
-        """Return the same question for another machine."""
+        """Return the same as `question` for the machine with the given index."""
         machine = self.machines[index]
         model = self.model if machine.is_measured or self.model is not self.machines[0] else machine
         return replace(self.question, machine=machine, model=model)
 
     @property
     def top(self) -> float:
-        """The highest frequency of a slider [Hz]."""
+        """Highest frequency [Hz] to which a slider of the page can be set."""
         last = float(self.machines[0].freq[-1])
         return min(last, 0.499 * self.start.rate) if self.start.rate else last
 

@@ -133,7 +133,7 @@ class WorkbenchServer(Bench):
     _server: Served | None = None
 
     def panel(self) -> Any:
-        """Return a separate page, as a Panel object."""
+        """Return a new page as a Panel object, to be placed in another Panel application."""
         return Page(self).layout
 
     def servable(self) -> Any:

@@ -89,7 +89,7 @@ class Uncertainty(Value):
     def delta_blocks(self, plant: Partition) -> Sequence[Block]:
         """Return the Deltas that are systems or matrices; empty if all Deltas are real numbers.
 
-        Uncertain dynamics (`UnmodelledDynamics`) are such a block.
+        An example is the Delta of `UnmodelledDynamics`.
         """
         return ()
 

@@ -78,11 +78,11 @@ def design_stage(
     at random. A further machine then satisfies this with a probability of 20/21 (95 %).
 
     There are two ways to draw the machines. If the plant comes from a calibrated fit and no
-    uncertainties of frequencies are stated, the machines agree with the measurement
-    (`StandardPlant.machines`). Otherwise all frequencies change simultaneously by their stated
-    uncertainties, and the mode shapes change with them. The damping ratios change by their stated
-    uncertainties, or by 30 % by default. For a plant of a calibrated fit, the certificate also has
-    the margin on the machines of the fit.
+    uncertainties of frequencies are stated, the machines are those of `StandardPlant.machines`,
+    which agree with the measurement of the fit. Otherwise all frequencies change simultaneously by
+    their stated uncertainties, and the mode shapes change with them. The damping ratios change by
+    their stated uncertainties, or by 30 % by default. For a plant of a calibrated fit, the
+    certificate also has the margin on the machines of the fit.
 
     Parameters
     ----------
