@@ -142,7 +142,7 @@ class BaseAcceleration(ForcePort):
 
     @property
     def ground(self) -> FloatArray:
-        """The rigid-body motion (6,) of the ground about the origin."""
+        """Rigid-body motion (6,) of the ground about the origin, per unit of the channel."""
         return turned_about(self.direction, np.asarray(self.about))
 
     def push(self, realisation: ModalRealisation) -> FloatArray:

@@ -28,12 +28,12 @@ _OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GeneralizedPlant(PartitionedSystem):
-    """The plant of a synthesis: ``W_z P W_w``, whose y may be the outputs of a block.
+    """Plant for a synthesis: a machine P with weights, ``W_z P W_w``, or with blocks at y.
 
     Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Once
-    weights are applied, w and z are no longer physical channels. The attribute `unweighted` is the
-    machine without weights and blocks; it holds the ports, modes, noise, uncertainty and evaluation
-    model.
+    weights are applied, w and z are no longer physical channels. Once a block is applied, its
+    outputs are the new y. The attribute `unweighted` is the machine without weights and blocks; it
+    holds the ports, modes, noise, uncertainty and evaluation model.
 
     Parameters
     ----------

@@ -227,7 +227,7 @@ class PartitionedSystem(Value):
 
     @property
     def modal_states(self) -> IntArray:
-        """Positions of the states of the structure's modes; states of sensor filters precede them.
+        """Indices of the states of the structure's modes; states of sensor filters precede them.
 
         ModelError when the plant has other states now.
         """
@@ -241,7 +241,7 @@ class PartitionedSystem(Value):
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Disturbances whose noise is held over each sample: the last columns of `noise_factor`."""
+        """Disturbances whose noise is held over each sample, the last columns of `noise_factor`."""
         return tuple(p.name for p in self.ports.w if getattr(p, "held", False) and p.asd > 0)
 
     @property
@@ -497,7 +497,7 @@ class Partition(PartitionedSystem):
 
     @property
     def continuous(self) -> Self:
-        """The plant before sampling; this plant if it is continuous or that is not known."""
+        """The plant before sampling; the plant itself if it is continuous or this is not known."""
         found: Self | None = self.origin.continuous
         return self if found is None else found
 

@@ -327,7 +327,7 @@ class ResidualForm(Value):
     """How the residual compliance of a reduction appears in a plant: as it is, unless said."""
 
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
-        """Return the realisation in this form."""
+        """Return the modes of a structure in this form."""
         return realisation
 
 

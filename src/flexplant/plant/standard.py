@@ -127,7 +127,7 @@ class StandardPlant(Partition):
         z: Mapping[str, Any] | None = None,
         w: Mapping[str, Any] | None = None,
     ) -> GeneralizedPlant:
-        """Return the plant with weights on z and w, whose states are added; channel names stay.
+        """Return the plant with weights on z and w. Their states are added; channel names stay.
 
         Parameters
         ----------
@@ -172,7 +172,7 @@ class StandardPlant(Partition):
         return measured_through(self, as_statespace(block))
 
     def with_ports(self, ports: Ports) -> StandardPlant:
-        """Return the plant of the same structure, sampled alike, with other ports.
+        """Return the plant of the same structure and sampling with other ports.
 
         The modes are not solved again, so that this is fast; the placement functions use it.
         ModelError when the plant was not assembled from a structure.
@@ -310,7 +310,7 @@ class StandardPlant(Partition):
         return position_map(self, judge, points)
 
     def along(self, name: str, points: npt.ArrayLike) -> PortPath:
-        """Return the rows of a POI (or the columns of a force) at many points at once.
+        """Return the rows of C and D of a POI (or columns of B and D of a force) at many points.
 
         Use it for positions that change with time. Only rows of C depend on the place of a POI, and
         rows of D if the plant has a feedthrough.

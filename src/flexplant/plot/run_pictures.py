@@ -60,7 +60,8 @@ def response(
     unit : str, optional
         SI unit of channels that have none in `run.units`. A prefix is chosen in each panel.
     label : str, optional
-        Prefix of the channel names, or name of a single channel, to compare runs on one axes.
+        Prefix of the channel names in the legend, or name of a single channel in the legend. Use it
+        to compare runs on one axes.
     color : str, optional
         Colour of the lines; by default the colours follow `CYCLE`.
     span : (start, end) [s], optional

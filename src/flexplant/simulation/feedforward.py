@@ -187,7 +187,8 @@ def design_feedforward(
     move differently. Poles of the controller and zeros of P may be as slow as the moves. The errors
     are weighted with the spectrum of the move. If no move is given, the spectrum is that of a move
     with a duration of about ``3 / bandwidth`` of the loop. The feedforward then has no force at
-    rest if the plant needs none. With a lower `order`, the gains are the best ones of that order.
+    rest if the plant needs no force to stay at a position. With a lower `order`, the gains are the
+    best ones of that order.
 
     Parameters
     ----------

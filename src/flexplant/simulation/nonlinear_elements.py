@@ -149,7 +149,7 @@ class Hysteresis(Value):
     width: float = field(metadata=checked(positive))
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the function that applies the play, with one state for each generator."""
+        """Return the function that applies the play, with a separate state for each run."""
         now = np.zeros(len(generators))
 
         def play(values: FloatArray) -> FloatArray:
@@ -183,7 +183,7 @@ class Dropout(Value):
     )
 
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
-        """Return the function that loses samples, in a separate run for each generator."""
+        """Return the function that loses samples. Each generator belongs to one run."""
         last = np.full(len(generators), np.nan)
 
         def read(values: FloatArray) -> FloatArray:

@@ -200,6 +200,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float]:
         """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
 
+        MA is the moving average, and MSD the moving standard deviation, over a window in seconds.
+
         Windows are centred at each sample. Those centred before `start` [s] are left out, because
         they cover the move and its settling. At the end of the record, windows are shortened.
         """

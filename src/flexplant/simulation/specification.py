@@ -171,7 +171,7 @@ class Specification(Value):
     Parameters
     ----------
     ma, msd : float, optional [m or rad]
-        Largest moving average |MA| and moving standard deviation MSD of the error over the
+        Largest allowed moving average |MA| and moving standard deviation MSD of the error over the
         exposures (see `exposure_errors`).
     rms, peak : float, optional [m or rad]
         Largest allowed rms and magnitude of the error in the run, from `start` on.

@@ -53,13 +53,13 @@ class Neglected(Uncertainty):
         self._set(resonances=whole(self.resonances, "resonances"))
 
     def bound(self, plant: Partition) -> NeglectedModes:
-        """Return the weights that bound the effect of the modes."""
+        """Return the weights that bound the effect of the neglected modes."""
         if isinstance(self.model, NeglectedModes):
             return self.model
         return neglected_modes(plant, self._whole(plant), resonances=self.resonances)
 
     def larger(self, plant: Partition) -> Any:
-        """Return the plant with these modes; None if only a bound is known."""
+        """Return the plant with the neglected modes; None if only a bound is known."""
         return None if isinstance(self.model, NeglectedModes) else self._whole(plant)
 
     def _whole(self, plant: Any) -> Any:

@@ -75,7 +75,7 @@ class NeglectedModes(Value):
     sampled: NeglectedModes | None = None
 
     def narrowed(self, outputs: Sequence[str]) -> NeglectedModes:
-        """Return the bound on some of the outputs, with only the states of their weights."""
+        """Return the bound for some of the outputs, with only the states of their weights."""
         W = self.weights
         heads = tuple(f"{name}:neglected:" for name in name_list(outputs, "outputs"))
         kept = np.array([name.startswith(heads) for name in W.states], dtype=bool)

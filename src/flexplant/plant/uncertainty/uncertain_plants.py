@@ -125,7 +125,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def neglected(self) -> NeglectedModes | None:
-        """Weights on the modes that the plant lacks."""
+        """Bound on the effect of neglected modes, as `NeglectedModes`; None without `Neglected`."""
         found = [one for kind in self.kinds if (one := kind.bound(self.plant)) is not None]
         if len(found) > 1:
             raise ModelError("modes are neglected twice. Pass one plant.Neglected, of all of them.")
@@ -133,7 +133,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @cached_property
     def opened(self) -> Opened:
-        """The continuous plant with the channels of Deltas, without those of neglected modes."""
+        """The continuous plant with the channels of its Deltas, except for neglected modes."""
         for delta in self.deltas:
             delta.require_in_range(self.deviations)
         base: Partition = self.plant.continuous
@@ -218,7 +218,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @property
     def channels(self) -> dict[str, str]:
-        """The Delta of each channel, in order: {`mode6:freq:rate`: `mode6:freq`, ...}."""
+        """Name of the Delta of each channel, in order: {`mode6:freq:rate`: `mode6:freq`, ...}."""
         names = iter(self.opened.system.inputs)
         return {
             next(names).removesuffix(":w"): name
@@ -295,7 +295,7 @@ class UncertainPlant(Value, Generic[P]):
 
     @property
     def machines(self) -> Any:
-        """The machines that the plant may be (`plant.PlantMachines`), drawn from all kinds."""
+        """The machines that the plant may be, drawn at random (see `plant.PlantMachines`)."""
         nominal: Any = self.nominal
         return nominal.machines
 

@@ -115,7 +115,7 @@ class UnmodelledDynamics(Uncertainty):
             )
 
     def delta_blocks(self, plant: Partition) -> list[Block]:
-        """Return the full block of the Delta."""
+        """Return the Delta as one block, a full matrix of dynamics."""
         u, y = self._sides(plant)
         if self.form == "coprime":
             return [FullBlock(len(y), len(u) + len(y), name=self.name or "coprime")]
@@ -123,7 +123,7 @@ class UnmodelledDynamics(Uncertainty):
         return [FullBlock(len(y or u), len(u or y), name=name)]
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return a system of the plant with the Delta's channels first."""
+        """Return a system of the plant with the channels of the Delta in front of its own."""
         if system.dt:  # by its bilinear image, in which a block has the same gain
             image = self.with_blocks(plant, bilinear(system, 1.0 / system.dt))
             return tustin(image, 1.0 / system.dt)
