@@ -154,7 +154,8 @@ class KalmanEstimator(PoiFilter):
         gate : float, optional
             Number of standard deviations above which an innovation is an outlier. Such a sample of
             a sensor is treated as missing. With 5 or 6, only a fraction of 6e-7 or 2e-9 of correct
-            samples is rejected. The estimate lists them (`gated`). By default all samples are used.
+            samples is rejected. The result contains the rejected samples (`gated`). By default all
+            samples are used.
 
         Returns
         -------

@@ -463,7 +463,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     def unit(self, output: str, input: str) -> str | None:
         """Return the unit of a response, such as "rad/N", "1" of a ratio; None when not known.
 
-        It follows from the units of the channels, or from the quantity of a measurement per N.
+        It follows from the units of the channels. If these are not given, it follows from the
+        `quantity` of the outputs, with inputs in N.
         """
         self._place((output, input))
         known = self.channel_units
@@ -476,7 +477,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 
     @property
     def channel_units(self) -> dict[str, str]:
-        """Units of the channels: as given, or from the quantity of a measurement per N."""
+        """Units of the channels: those given, or those of the quantity per force in N."""
         per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}.get(
             self.quantity or ""
         )

@@ -59,8 +59,8 @@ class Disturbance(_PlacedForce):
         has the variance asd^2 rate / 2 per sample once the plant is sampled. It may act directly on
         an acceleration sensor: process and sensor noise are then correlated.
     moves : mapping {position: (3,) array} or PlaceTable, optional
-        Motion of its point with the positions of `Ports`; `at` is its place when all positions are
-        zero.
+        Motion of the point `at` with the positions of the machine (see `Ports`). The point is at
+        `at` when all positions are zero.
 
     Examples
     --------
@@ -211,7 +211,8 @@ class Actuator(_PlacedForce):
     latency : float [s]
         Delay of the command by cable or bus, in seconds, in addition to the `delay` in samples of
         `discretized`. A sampled plant contains it exactly, also if it is a fraction of a sample. A
-        continuous plant neglects it and says so (`ports.with_pade(order)` approximates it there).
+        continuous plant neglects it, and its printed text says so (`ports.with_pade(order)`
+        approximates the delay there).
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
         `name:disturbance` of w. It passes through the `dynamics` like the command, but not through

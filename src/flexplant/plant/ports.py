@@ -47,8 +47,8 @@ class Sensor(SensorPort):
         to those of the plant.
     latency : float [s]
         Delay of the signal, in seconds. A sampled plant contains it exactly, also if it is a
-        fraction of a sample. A continuous plant neglects it and says so (`ports.with_pade(order)`
-        approximates it there).
+        fraction of a sample. A continuous plant neglects it, and its printed text says so
+        (`ports.with_pade(order)` approximates the delay there).
     absolute : bool, optional
         Whether the sensor also measures the motion of the floor (BaseAcceleration): True for
         inertial sensors such as a geophone (absolute velocity), False for sensors that measure
@@ -109,10 +109,11 @@ class Poi(Value):
         Motions among x, y, z [m], rx, ry, rz [rad]; a Reference uses the first one unless it names
         others. Labels in a weighted sum keep their own directions.
     absolute : bool
-        Whether its motion is absolute (with that of a BaseAcceleration) or relative to the floor.
+        Whether its motion is absolute, so that it includes the motion of a BaseAcceleration, or
+        relative to the floor.
     moves : mapping {position: (3,) array} or PlaceTable, optional
-        Motion of its point with the positions of `Ports`; `at` is its place when all positions are
-        zero.
+        Motion of the point `at` with the positions of the machine (see `Ports`). The point is at
+        `at` when all positions are zero.
 
     Examples
     --------

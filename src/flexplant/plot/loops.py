@@ -69,7 +69,7 @@ def nyquist(
     Parameters
     ----------
     loop_gains : StateSpace, Frf, ClosedLoop, or mapping {label: one of these}
-        Loop gains L of one channel each, for negative feedback (``1 + L``). Of a closed loop, the
+        Loop gains L of one channel each, for negative feedback (``1 + L``). For a closed loop, the
         gain at each actuator is drawn while the loops of the other actuators stay closed.
     channel : (output, input), optional
         Channel of systems with several channels.
@@ -285,9 +285,10 @@ def sensitivity(
     Parameters
     ----------
     curves : ClosedLoop, Frf, (plant, controller), (freq [Hz], size), or mapping {label: of these}
-        Curves to draw. Of a loop, |S| from each reference to the error of its axis is drawn. Of a
-        loop without references, and of `(plant, controller)`, it is the largest singular value of S
-        at u. Of an `Frf`, such as `sensitivity(loop)`, it is the largest singular value.
+        Curves to draw. For a loop with references, |S| from each reference to the error of its axis
+        is drawn. For a loop without references, and for `(plant, controller)`, the largest singular
+        value of S at u is drawn. For an `Frf`, such as `sensitivity(loop)`, its largest singular
+        value is drawn.
     colors : mapping {label: color}, optional
         Colours of some lines.
     dashed : collection of str

@@ -112,7 +112,8 @@ def neglected_modes(
     Parameters
     ----------
     plant : StandardPlant
-        The plant, continuous or sampled. Of a sampled plant the continuous one is compared.
+        The plant, continuous or sampled. For a sampled plant, the plant before sampling is
+        compared.
     evaluation : StandardPlant, FEModel, Modes or ReducedModel
         The larger model. A plant must have the same channels; a structure gets the plant's ports.
     resonances : int
