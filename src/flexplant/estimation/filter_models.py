@@ -94,7 +94,7 @@ class FilterModel(Value):
 
     @cached_property
     def R(self) -> FloatArray:
-        """Covariance (ny, ny) at the sensors."""
+        """Covariance (ny, ny) of the noise at the sensors in one sample."""
         return self.H @ self.H.T
 
     @cached_property

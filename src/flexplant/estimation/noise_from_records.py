@@ -437,7 +437,8 @@ class NoiseLevels(Value):
     def plant(self) -> AnyPlant:
         """The plant with the estimated densities and their standard deviations.
 
-        Random machines made from this plant draw their densities with these deviations.
+        In the machines ``plant.machines`` of this plant, the densities are random with these
+        deviations.
         """
         given = self.given
         if PROCESS in self.channels:

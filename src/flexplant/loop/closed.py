@@ -223,7 +223,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def broken(self) -> BrokenLoop:
-        """The open loop: plant and controller between u and those outputs y that u can move."""
+        """The broken loop: plant and controller, between u and those y that u can move."""
         read = self.controller.input_index(self.fed_back)
         return BrokenLoop(
             self.driven,

@@ -81,12 +81,12 @@ class ScheduledLoop(Value):
 
     @property
     def plant(self) -> AnyPlant:
-        """The plant at the position at which it was assembled, or to which `at` moved it."""
+        """The plant at its present position, which `StandardPlant.at` changes."""
         return self.loops[0].plant
 
     @cached_property
     def standing(self) -> ClosedLoop:
-        """The loop at the position at which its plant was assembled, or to which `at` moved it."""
+        """The loop at the present position of its plant, which `StandardPlant.at` changes."""
         return self.at(self.plant.assembled.ports.values[self.position])
 
     @cached_property

@@ -50,7 +50,8 @@ class Disturbance(_PlacedForce):
     asd : float [N/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for a force that is not noise.
     asd_deviation : float
-        Relative standard deviation of the density among machines that are drawn at random.
+        Relative standard deviation of the density among the machines ``plant.machines``, which are
+        drawn at random.
     shape : StateSpace, optional
         Stable filter between the channel and the structure. The asd is then that of the white noise
         at the input of the filter, and the states of the filter are added to those of the plant.
@@ -101,7 +102,8 @@ class BaseAcceleration(ForcePort):
     asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     asd_deviation : float
-        Relative standard deviation of the density among machines that are drawn at random.
+        Relative standard deviation of the density among the machines ``plant.machines``, which are
+        drawn at random.
     shape : StateSpace, optional
         A stable filter between the channel and the base: the floor's spectrum.
     about : (3,) array [m]
@@ -165,7 +167,8 @@ class OutputDisturbance(ForcePort):
     asd : float [unit of the channel/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     asd_deviation : float
-        Relative standard deviation of the density among machines that are drawn at random.
+        Relative standard deviation of the density among the machines ``plant.machines``, which are
+        drawn at random.
     shape : StateSpace, optional
         A stable filter between the channel and the sensor: drift, mains hum.
     unit : str, optional
@@ -218,7 +221,8 @@ class Actuator(_PlacedForce):
         `name:disturbance` of w. It passes through the `dynamics` like the command, but not through
         the latency.
     asd_deviation : float
-        Relative standard deviation of the density among machines that are drawn at random.
+        Relative standard deviation of the density among the machines ``plant.machines``, which are
+        drawn at random.
 
     Raises
     ------

@@ -41,7 +41,8 @@ class Sensor(SensorPort):
         rate / 2``. It is added to the samples, after dynamics and latency; use an OutputDisturbance
         for noise that passes through them.
     asd_deviation : float
-        Relative standard deviation of the density among machines that are drawn at random.
+        Relative standard deviation of the density among the machines ``plant.machines``, which are
+        drawn at random.
     dynamics : StateSpace, optional
         Stable system of sensor and anti-alias filter, from motion to signal. Its states are added
         to those of the plant.

@@ -336,8 +336,8 @@ class StandardPlant(Partition):
         """Return the plant with its uncertainty, of one or several kinds.
 
         An example is ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``. Each
-        kind gives Deltas with ``|delta| <= 1``, and random values for drawn machines. The order of
-        the kinds does not matter.
+        kind gives Deltas with ``|delta| <= 1``, and random values for the machines that `machines`
+        draws. The order of the kinds does not matter.
 
         Parameters
         ----------

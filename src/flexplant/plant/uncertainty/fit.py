@@ -37,8 +37,8 @@ class Fit(Uncertainty):
     modes is ``J C J'``. The stiffness and the damping of each mode become the Deltas `mode6:freq`,
     `mode6:damping`. If damping couples the modes (a large damper to ground, an overdamped pair),
     the parameters of the fit themselves are the Deltas, and they act on all modes and mode shapes.
-    Machines that are drawn at random differ in the parameters. Machines of a calibrated plant (one
-    that has the measured poles) differ in their modes instead.
+    The machines ``plant.machines``, which are drawn at random, differ in the parameters. Machines
+    of a calibrated plant (one that has the measured poles) differ in their modes instead.
 
     Parameters
     ----------

@@ -53,9 +53,9 @@ class Uncertainty(Value):
     """A kind of uncertainty of a machine, for ``plant.uncertain(...)``.
 
     To add a new kind, derive a class and define its method `deltas`, which returns the Deltas of a
-    plant. Define `known` instead if the Deltas are correlated, or if random machines are drawn by
-    means of other numbers than the Deltas. For uncertain dynamics define `delta_blocks` and
-    `with_blocks`.
+    plant. Define `known` instead if the Deltas are correlated, or if the machines
+    ``plant.machines`` are drawn by means of other random numbers than the Deltas. For uncertain
+    dynamics define `delta_blocks` and `with_blocks`.
 
     Examples
     --------
@@ -105,6 +105,6 @@ class Uncertainty(Value):
     def larger(self, plant: Partition) -> Any:
         """Return the plant with its neglected modes; None except for the kind `Neglected`.
 
-        Machines that are drawn at random are made from this plant.
+        The machines ``plant.machines``, which are drawn at random, are made from this plant.
         """
         return None

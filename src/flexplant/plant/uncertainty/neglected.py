@@ -16,9 +16,9 @@ from .neglected_dynamics import NeglectedModes, neglected_modes
 class Neglected(Uncertainty):
     """The modes that a plant lacks: one dynamic Delta with weights that bound their effect.
 
-    Machines that are drawn at random have these modes, and Deltas of modes act on the modes with
-    the same numbers. If parameters of the plant's own model are drawn, however, the machines do not
-    have the neglected modes.
+    The machines ``plant.machines``, which are drawn at random, have these modes. Deltas of modes
+    act on the modes with the same numbers. If parameters of the plant's own model are drawn,
+    however, the machines do not have the neglected modes.
 
     Parameters
     ----------
