@@ -88,7 +88,7 @@ class SpillOver(Value):
 
     @property
     def is_fine(self) -> bool:
-        """Whether the loop is stable with the truncated modes and |S| at u stays below 8 dB."""
+        """Whether the loop is stable with the truncated modes and `is_high` is false."""
         return self.is_stable and not self.is_high
 
     @property

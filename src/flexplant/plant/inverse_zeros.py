@@ -26,10 +26,11 @@ class SlowZeros(Value):
 
     F is the response from a set-point to the forces that a feedforward needs. Its poles p_i are the
     zeros of the plant, and c_i are its residues. A feedforward uses the power series
-    ``k_0 + ... + k_m s^m`` of F at s = 0. This series does not represent slow poles well, which
-    have frequencies below a hundredth of the sampling rate. The feedforward therefore adds the term
-    ``s^m H(s)`` for them. Its filter ``H(s) = sum_i (c_i / p_i^(m + 1)) (s / (s - p_i))`` is zero
-    at s = 0. In the methods, the argument `order` is the exponent m.
+    ``k_0 + ... + k_m s^m`` of F at s = 0. Poles are slow if their frequencies are below a hundredth
+    of the sampling rate. The series does not represent these poles well. The feedforward therefore
+    adds the term ``s^m H(s)`` for them. Its filter
+    ``H(s) = sum_i (c_i / p_i^(m + 1)) (s / (s - p_i))`` is zero at s = 0. In the methods, the
+    argument `order` is the exponent m.
 
     Parameters
     ----------

@@ -54,9 +54,10 @@ class NeglectedModes(Value):
         Outputs that equal others with the opposite sign (errors of a reference); they are not
         bounded a second time.
     tightest : float
-        Largest singular value of Delta over the frequencies that verified the bound: at most 1.
+        Largest singular value, over the frequencies at which the bound was verified, of the Delta
+        that gives the larger model exactly. It is at most 1.
     looseness : float
-        Median, over the logarithm of frequency, of 1 divided by the largest singular value of
+        Median, over the logarithm of frequency, of 1 divided by the largest singular value of this
         Delta. A value of 2 means that the bound is typically twice as large as necessary.
     sampled : NeglectedModes, optional
         The same bound for the sampled plant, which includes the delay and the aliasing of sampling.
