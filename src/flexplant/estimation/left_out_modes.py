@@ -47,11 +47,11 @@ class LeftOut(Value):
     modes : (m,) array of int
         Numbers of the truncated modes in the evaluation model, from 1.
     sensors : (ny, ny) array
-        Stationary covariance R_t at the sensors.
+        Stationary covariance R_t of the motion of the truncated modes at the sensors.
     pois : (nz, nz) array
-        Covariance V_t at the POIs.
+        Stationary covariance V_t of this motion at the POIs.
     cross : (nz, ny) array
-        Covariance N_t between POIs and sensors.
+        Stationary covariance N_t of this motion between POIs and sensors.
     plant : StandardPlant
         Plant whose response to u includes the static compliance of the truncated modes. The
         compliance may be represented by additional fast modes. Their shapes are attachment vectors

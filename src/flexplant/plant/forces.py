@@ -157,8 +157,8 @@ class OutputDisturbance(ForcePort):
     """A disturbance in w that is added to the motion of one sensor, before the sensor's dynamics.
 
     White noise needs a sensor with `dynamics` that roll off (an anti-alias filter, for example), or
-    a shape that rolls off; otherwise its samples would have infinite variance. For white noise of
-    the samples use `Sensor.asd`.
+    a shape that rolls off; otherwise the samples of the sensor would have infinite variance. For
+    white noise of the samples use `Sensor.asd`.
 
     Parameters
     ----------

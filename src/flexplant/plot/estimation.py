@@ -116,7 +116,7 @@ def predictions(
 def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the rms error of an estimate over its lag.
 
-    With a lag, the estimate of a sample uses measurements up to this time later.
+    An estimate with a lag also uses the measurements of this time after the estimated sample.
 
     Parameters
     ----------

@@ -295,7 +295,8 @@ def open_file(
     quantity : {"displacement", "velocity", "acceleration"}, optional
         Wanted quantity of the outputs of a measurement; see `flexplant.io.read_frf_uff`.
     scale : float, optional
-        Factor that brings the numbers of a universal file to SI, where its units are not clear.
+        Factor that converts the numbers of a universal file to SI units, if the file does not state
+        its units clearly.
 
     Raises
     ------
