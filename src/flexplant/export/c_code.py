@@ -54,12 +54,13 @@ def write_c(
     controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or {place: one of these}
         Sampled controller. All blocks of a ClosedLoop go to one file. Its inputs are the channels
         of `plant.y`, and its outputs the driven actuators, followed by the monitored outputs. If a
-        single controller has an input with the same name as one of its outputs (as in an observer
-        or an `anti_windup_form`), the generated code feeds the applied command to this input, and
-        it is not an input of the C functions. The keys of a mapping are places, values of the input
-        `schedule`. Its controllers may differ only in their output matrices C and D (for example
-        feedforward or decoupling), which are interpolated linearly between places. For a
-        ScheduledLoop all matrices are interpolated, and its position is the last input.
+        single controller has an input with the same name as one of its outputs (as in a controller
+        that contains an observer, or in an `anti_windup_form`), the generated code feeds the
+        applied command to this input, and it is not an input of the C functions. The keys of a
+        mapping are places, values of the input `schedule`. Its controllers may differ only in their
+        output matrices C and D (for example feedforward or decoupling), which are interpolated
+        linearly between places. For a ScheduledLoop all matrices are interpolated, and its position
+        is the last input.
     path : path
         Path of the source file. The header is written to the same folder.
     name : str, optional

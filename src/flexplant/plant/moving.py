@@ -232,8 +232,8 @@ class PositionMap(Value):
         actuators. The transformations that `decouple` gives for the plant at its present position
         are applied to the plant at each place of the grid. The error is the largest gain of the
         difference between the result and the identity; it is 0 where the decoupling is still exact.
-        Each axis is weighted by the motion of the sensors that it causes. NaN where the actuators
-        cannot move the axes independently.
+        To compare displacements and rotations, each axis is scaled by the displacement that it
+        causes at the sensors. NaN where the actuators cannot move the axes independently.
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str

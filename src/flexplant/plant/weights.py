@@ -37,10 +37,10 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int
 
     The error of sensor i is ``y_i:error = y_i,ref - y_i``. Here y_i,ref is the signal that the
     sensor would have if the machine were at rest, its POIs were at their references r, and the
-    other axes (`driven_axes`) were at zero. It is ``G_yu T (G_zu T)^-1 r`` at zero frequency, where
-    G_yu and G_zu are the plant from u to y and to z, and T gives the actuator forces of the axes.
-    On a free body this is its rigid-body motion. A controller that reads these errors has one
-    degree of freedom: it responds to a reference as to a disturbance.
+    other axes (`driven_axes`) were at zero. This signal is ``G_yu T (G_zu T)^-1 r`` at zero
+    frequency, where G_yu and G_zu are the plant from u to y and to z, and T gives the actuator
+    forces of the axes. For a free body the signal is that of a rigid-body motion. A controller that
+    reads these errors has one degree of freedom: it responds to a reference as to a disturbance.
 
     While the machine moves it bends, so that its sensors differ from their values at rest, and the
     controller opposes the move. With an order above 0, derivatives of the references correct

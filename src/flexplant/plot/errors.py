@@ -181,9 +181,9 @@ def exposures(
 ) -> Axes:
     """Draw an error with its moving average (MA) and moving standard deviation (MSD).
 
-    The windows of `exposure_errors` are shaded, and its figures are in the legend. The picture
-    begins shortly before the first window. The first of several runs is drawn, but the figures hold
-    for all runs.
+    The exposures are shaded, and the results of `exposure_errors` are in the legend. The picture
+    begins shortly before the first exposure. The first of several runs is drawn, but the figures
+    hold for all runs.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     Parameters
     ----------
     found : ErrorMap
-        Map from `flexplant.simulation.exposure`, whose points span an area.
+        Result of `flexplant.simulation.error_map`, whose points span an area.
     what : str
         Quantity to draw: "ma" (moving average) or "msd" (moving standard deviation).
     ax : Axes, optional

@@ -57,14 +57,14 @@ def nyquist(
     reach: float = 2.5,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw loop gains L in the complex plane, with -1 and the circle with ``|S| > modulus``.
+    """Draw loop gains L in the complex plane, with -1 and the circle ``|S| = modulus`` about it.
 
     If there are more than four curves, each has a separate panel.
 
-    The magnitude of ``S = 1 / (1 + L)`` is the inverse of the distance of L from -1. Only positive
-    frequencies are drawn, without the mirror image. Near a resonance the curve of L is nearly a
-    circle. If a measured gain has too few frequencies there, the drawn curve follows the circle
-    through the neighbouring points.
+    The magnitude of ``S = 1 / (1 + L)`` is the inverse of the distance of L from -1. It is larger
+    than `modulus` inside the circle. Only positive frequencies are drawn, without the mirror image.
+    Near a resonance the curve of L is nearly a circle. If a measured gain has too few frequencies
+    there, the drawn curve follows the circle through the neighbouring points.
 
     Parameters
     ----------

@@ -62,9 +62,10 @@ def learn_feedforward(
     by gains. In a linear loop the error depends linearly on these gains, ``e = e_0 + Phi gains``.
     Phi is the effect of a unit of each gain on the error in closed loop. It is computed from a
     model and may be approximate: each move measures the remaining error, and the least-squares
-    gains for this error are added to the gains. The error e_0 without these forces is not modelled.
-    Every error that repeats (due to a wrong mass, a compliance or a delay) is therefore compensated
-    as far as the basis functions allow.
+    gains for this error are added to the gains. The error e_0, which remains without these forces,
+    needs no model, because it is a part of the measured error. Every error that repeats (due to a
+    wrong mass, a compliance or a delay) is therefore compensated as far as the basis functions
+    allow.
 
     Parameters
     ----------
