@@ -87,32 +87,32 @@ functions in other tools.
 - run a controller in C with the machine, at 10 kHz: `examples/real_time.py`
 
 **Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
-package (peer) in two runs of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
+package (peer) in one run of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
 above 1 means that flexplant is faster. Before the times are taken, the results are compared. Times
-vary by about 20 % from run to run. In these runs other work on both cores made the quick calls up
-to 50 % slower.
+vary by about 20 % from run to run. In this run other work used both cores (load 11 to 13), which
+makes quick calls up to 50 % slower.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 4.2 s | scipy eigsh | 35 s | 8.3 |
-| 24 modes of a plate, 30 603 DOFs | 1.5 s | scipy eigsh on CHOLMOD | 1.6 s | 1 |
-| all 243 modes of a plate, dense | 14 ms | scipy eigh | 5.7 ms | 0.42 |
-| 200 lines of a plate's responses, 30 000 DOFs | 2.4 s | scipy splu (4 of them) | 590 s | 250 |
-| 8 x 8 frequency responses, 10 000 lines | 9.9 ms | python-control, slycot | 0.22 s | 23 |
-| H-infinity norm, 48 states, 0.1 % damping | 3.8 ms | slycot ab13dd | 2.6 ms | 0.7 |
-| the same, A dense | 3.4 ms | slycot ab13dd | 2.6 ms | 0.75 |
-| H2 norm, 200 states | 4.8 ms | python-control, slycot | 9 ms | 1.9 |
-| zero-order hold, 48 states | 0.16 ms | scipy cont2discrete | 0.17 ms | 1.1 |
-| a discrete Riccati equation, 48 states | 5.5 ms | scipy solve_discrete_are | 9.1 ms | 1.7 |
-| 100 000 samples through a Kalman filter | 60 ms | filterpy (5000 of them) | 9.2 s | 150 |
-| 100 000 samples of a loop, 212 states | 100 ms | python-control | 1.6 s | 16 |
-| the same, commands saturated | 2.8 s | python-control (2000 of them) | 6 s | 2.1 |
-| H-infinity, 3 states: norm 0.137 | 22 ms | python-control, slycot: 0.137 | 20 ms | 0.91 |
-| H-infinity, 61 states of a stage: norm 0.901 | 0.63 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 21 ms | slycot ab13md, the upper one | 14 ms | 0.7 |
-| the upper bound alone | 12 ms | slycot ab13md, the upper one | 15 ms | 1.2 |
-| poles of a close pair in noise: error 5e-07 | 0.58 s | scikit-rf: 7e-07 | 0.51 s | 0.88 |
-| a sparse OUTPUT4 file of Nastran | 16 ms | pyYeti | 36 ms | 2.3 |
+| 24 modes of a solid, 27 783 DOFs | 4.4 s | scipy eigsh | 36 s | 8.2 |
+| 24 modes of a plate, 30 603 DOFs | 1.5 s | scipy eigsh on CHOLMOD | 1.7 s | 1.1 |
+| all 243 modes of a plate, dense | 15 ms | scipy eigh | 5.5 ms | 0.37 |
+| 200 lines of a plate's responses, 30 000 DOFs | 2.2 s | scipy splu (4 of them) | 560 s | 250 |
+| 8 x 8 frequency responses, 10 000 lines | 9.1 ms | python-control, slycot | 0.21 s | 23 |
+| H-infinity norm, 48 states, 0.1 % damping | 3.2 ms | slycot ab13dd | 2.4 ms | 0.73 |
+| the same, A dense | 3.3 ms | slycot ab13dd | 2.4 ms | 0.73 |
+| H2 norm, 200 states | 3.9 ms | python-control, slycot | 8.4 ms | 2.2 |
+| zero-order hold, 48 states | 0.15 ms | scipy cont2discrete | 0.17 ms | 1.1 |
+| a discrete Riccati equation, 48 states | 4.8 ms | scipy solve_discrete_are | 8.2 ms | 1.7 |
+| 100 000 samples through a Kalman filter | 50 ms | filterpy (5000 of them) | 7.7 s | 150 |
+| 100 000 samples of a loop, 212 states | 94 ms | python-control | 1.7 s | 17 |
+| the same, commands saturated | 2.4 s | python-control (2000 of them) | 4.8 s | 2 |
+| H-infinity, 3 states: norm 0.137 | 22 ms | python-control, slycot: 0.137 | 21 ms | 0.95 |
+| H-infinity, 61 states of a stage: norm 0.901 | 0.59 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 21 ms | slycot ab13md, the upper one | 15 ms | 0.69 |
+| the upper bound alone | 13 ms | slycot ab13md, the upper one | 15 ms | 1.1 |
+| poles of a close pair in noise: error 5e-07 | 0.45 s | scikit-rf: 7e-07 | 0.26 s | 0.58 |
+| a sparse OUTPUT4 file of Nastran | 13 ms | pyYeti | 36 ms | 2.7 |
 
 Peers are faster for some tasks because flexplant also checks its results. For all modes of the
 plate, a third of the time goes into residuals. Another third goes into the separation of rigid-body
