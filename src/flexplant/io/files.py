@@ -270,7 +270,7 @@ def _by_suffix_alone(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Format:
-    """Files that hold matrices, and their reader; `add_format` makes it known.
+    """A format of files that hold matrices, with its reader; `add_format` registers it.
 
     Parameters
     ----------

@@ -214,7 +214,8 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     Raises
     ------
     FlexplantError
-        When pyuff is missing, the file is damaged or holds no modes, or modes at other nodes.
+        When pyuff is missing, the file is damaged or holds no modes, or its modes are not all given
+        at the same nodes.
     ModelError
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable; when local
         directions cannot be turned, as for `read_frf_uff`.
@@ -292,8 +293,9 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     FlexplantError
         When pyuff is missing, the file is damaged, or holds no nodes.
     ModelError
-        When a node is given, or moves, in a coordinate system that cannot be read (see
-        `read_frf_uff`). Also when it moves in local directions and the file holds no results.
+        When the coordinates or the directions of motion of a node use a coordinate system that
+        cannot be read (see `read_frf_uff`). Also when a node moves in local directions and the file
+        holds no results, because results in another file would not be turned with it.
 
     Examples
     --------

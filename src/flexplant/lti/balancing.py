@@ -80,11 +80,12 @@ def balanced(
 ) -> BalancedReduction:
     """Return a system with fewer states by balanced truncation or residualisation.
 
-    The error obeys ``|G - G_r| <= 2 (s_{r+1} + ... + s_n)`` in the H-infinity norm. Here G_r is the
-    reduced system, and s_{r+1} to s_n are the Hankel singular values of the stable part that are
-    discarded. Rigid-body and unstable modes are split off first and kept exactly. With weights, the
-    Gramians are those of the weighted system ``W_o G W_i`` (method of Enns), and the error is the
-    norm of ``W_o (G - G_r) W_i``.
+    The result is a `BalancedReduction`, whose attribute `system` is the reduced system. The error
+    obeys ``|G - G_r| <= 2 (s_{r+1} + ... + s_n)`` in the H-infinity norm. Here G is the given
+    system and G_r the reduced one, and s_{r+1} to s_n are the Hankel singular values of the stable
+    part that are discarded. Rigid-body and unstable modes are split off first and kept exactly.
+    With weights, the Gramians are those of the weighted system ``W_o G W_i`` (method of Enns), and
+    the error is the norm of ``W_o (G - G_r) W_i``.
 
     Parameters
     ----------
@@ -313,7 +314,9 @@ class NormReport(Value):
 
 
 def norm_report(sys: System) -> NormReport:
-    """Return the H2, H-infinity, L-infinity and Hankel norms, with the reason of an infinite one.
+    """Return the H2, H-infinity, L-infinity and Hankel norms as a `NormReport`.
+
+    For each infinite norm the report also states the reason.
 
     Parameters
     ----------

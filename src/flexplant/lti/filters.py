@@ -49,8 +49,8 @@ def zpk(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt: float = 0.0
     Parameters
     ----------
     zeros, poles : sequences of complex [rad/s, or of z]
-        Zeros and poles; each complex number must be listed together with its conjugate. There are
-        at most as many zeros as poles.
+        Zeros and poles, for a sampled system in the z-plane. Each complex number must be listed
+        together with its conjugate. There are at most as many zeros as poles.
     gain : float
         Factor of the products.
     dt : float [s]
@@ -182,7 +182,7 @@ def low_pass_filter(freq: float, *, order: int = 1, gain: float = 1.0) -> StateS
     freq : float [Hz]
         Corner frequency.
     order : {1, 2}
-        Slope at high frequencies.
+        Slope at high frequencies, in decades per decade.
     gain : float
         Gain at low frequencies.
 

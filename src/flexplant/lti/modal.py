@@ -59,7 +59,8 @@ class ModalForm(Value):
 def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     """Return a system with A in real blocks, [[s, w], [-w, s]] for a pair, [p] for a real pole.
 
-    A rigid-body mode has two poles at 0 but only one eigenvector. It becomes a pair of integrators
+    The result is a `ModalForm`, whose attribute `system` is the system in these coordinates. A
+    rigid-body mode has two poles at 0 but only one eigenvector. It becomes a pair of integrators
     [[0, w], [0, 0]], whose poles are exactly at 0 (at 1 when sampled). The states are scaled so
     that inputs and outputs have gains of similar size. With such blocks, the cost of frequency
     responses, Gramians and sampling grows only linearly with the number of modes.

@@ -222,8 +222,9 @@ def control_care(
 ) -> RiccatiSolution:
     """Solve ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``; the result contains X as `P`.
 
-    This equation is the dual of that of `filter_care`. The `gain` of the result is F of the law
-    ``u = -F x``, which gives the closed loop A - B F.
+    The result is a `RiccatiSolution`, whose attribute `P` is X. This equation is the dual of that
+    of `filter_care`. The `gain` of the result is F of the law ``u = -F x``, which gives the closed
+    loop A - B F.
 
     Parameters
     ----------

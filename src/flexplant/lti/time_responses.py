@@ -142,7 +142,8 @@ def impulse(
     Returns
     -------
     TimeResponse
-        In units of the output per second for an input of one unit.
+        Response whose `data` has the shape (n_out, n_in, n_time), in [output unit / (input unit
+        s)].
 
     Raises
     ------

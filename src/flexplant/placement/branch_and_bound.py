@@ -250,8 +250,9 @@ class BranchAndBound(Search):
 
     The candidates are divided into groups of similar candidates. A branch is the set of all choices
     that take a given number of candidates from each group. A branch is discarded when its lower
-    bound shows that it contains no better choice than the best one found. In small branches the
-    lower bound of each choice is checked. The search starts from the result of `Exchange`.
+    bound shows that it contains no better choice than the best one found. In small branches all
+    choices are listed, and the lower bound of each single choice is compared with the best value.
+    The search starts from the result of `Exchange`.
 
     Parameters
     ----------

@@ -134,10 +134,12 @@ class PoiLqr(MotionAndEffort):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the chosen actuators.
 
-        All terms that do not depend on the choice are computed once. With a delay of d whole
-        samples, no controller can influence the motion during these samples. Their cost is the
-        constant ``sum_{i<d} |C1 A^i W|^2``. The control acts on the state that is predicted d
-        samples ahead. Only a fractional delay adds a state for each actuator.
+        All terms that do not depend on the choice are computed once. A force acts on the motion one
+        sample later at the earliest. With a delay of d whole samples, no controller can therefore
+        influence the response to a disturbance in the first d + 1 samples. The cost of this
+        response is the constant ``sum_{i<=d} |C1 A^i W|^2``, where W W' is the covariance of the
+        process noise. The control acts on the state that is predicted d samples ahead. Only a
+        fractional delay adds a state for each actuator.
         """
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)

@@ -338,10 +338,10 @@ class OffPoi(Constraint):
     """Excludes candidates on a POI (point of interest), at which no sensor can be mounted.
 
     A sensor that the plant already has at a POI stays allowed if the radius is 0. A POI may be
-    relative, such as ``at={"tip:x": 1, "frame:x": -1}``. Such a POI lies at its points of positive
-    weight. It lies at its points of negative weight if the plant's own relative sensors touch only
-    the positive ones. All other points of a relative POI are not excluded, because sensors may
-    measure against the frame.
+    relative, such as ``at={"tip:x": 1, "frame:x": -1}``. Sensors are then excluded only on one side
+    of it: as a rule at its points of positive weight, here the tip. If the plant's own relative
+    sensors touch only these points, sensors are excluded at the points of negative weight instead.
+    The other side stays allowed, because sensors may measure against it.
 
     Parameters
     ----------

@@ -152,10 +152,11 @@ class Criterion(Value):
         return ""
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the text of an interval of the error of a plant divided by that of another plant.
+        """Return a text: an interval of the error of a plant divided by that of another plant.
 
-        The interval is taken over the sampled machines of the plant. The text is empty if there are
-        none, or if the value of the criterion is not a mean square.
+        The interval is computed over the machines that agree with the measurement, as for the
+        attribute `interval` of `Placement`. The text is empty if there are none, or if the value of
+        the criterion is not a mean square.
         """
         return ""
 

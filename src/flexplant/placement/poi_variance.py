@@ -244,9 +244,10 @@ class PoiVariance(Criterion):
             _check_direct(plant, candidates)
 
     def compared(self, plant: StandardPlant, other: StandardPlant) -> str:
-        """Return the text of an interval of the rms error divided by that of another plant.
+        """Return a text: an interval of the rms error divided by that of another plant.
 
-        The ratio is computed for each sampled machine.
+        The ratio is computed for each machine that agrees with the measurement, as for the
+        attribute `interval` of `Placement`.
         """
         machines = plant.machine.machines
         if machines is None or self._own:

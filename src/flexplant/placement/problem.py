@@ -178,10 +178,11 @@ class Placement(Value):
         Lower bound on the value of every choice of the same number of candidates. If the optimum is
         proven, by trying every subset or by branch and bound, it is the value itself. Otherwise it
         follows from a convex relaxation, in which each candidate has a weight between 0 and 1. The
-        relaxation exists for log det, and, if no port has a filter or delay, for mean squares. Mean
-        squares are `PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, and criteria
-        that wrap them. For other sums the bound is the value with all candidates together. If the
-        criterion is a plain function, the bound is minus infinity.
+        relaxation exists for criteria that are the log det of a matrix, such as `ModeInformation`.
+        If no port has a filter or delay, it also exists for mean squares. Mean squares are
+        `PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, and criteria that wrap
+        them. For other sums the bound is the value with all candidates together. If the criterion
+        is a plain function, the bound is minus infinity.
     evaluations : int
         Number of choices that were scored.
     history : tuple of tuples of float
@@ -203,9 +204,10 @@ class Placement(Value):
         Sensors or actuators of the plant that were not among the candidates. They are not part of
         the choice, and the value is computed without them.
     interval : str
-        Text of an interval for the error divided by the error with the plant's own sensors. It
-        contains this ratio for 95 % of the uncertain plant's sampled machines. If the interval does
-        not exist, the text is the reason. It is empty if the plant has no sampled machines.
+        Text of an interval for the error divided by the error with the plant's own sensors. It is a
+        95 % interval for a machine that agrees with the measurement. Such machines are known if the
+        plant comes from ``fit.calibrated(measured)`` with an evaluation model. If they are known
+        but there is no interval, the text is the reason. If they are not known, the text is empty.
 
     Examples
     --------
@@ -341,8 +343,9 @@ class Problem:
 
     @property
     def root(self) -> Branch:
-        """The branch that contains all choices. It uses only constraints on single candidates."""
-        return Branch.containing(self.required, self.free, self.count)
+        """The branch (set of choices) that contains all choices. Only required and excluded
+        candidates limit it; constraints on several candidates are not used.""" return
+        Branch.containing(self.required, self.free, self.count)
 
     def bound(self) -> float:
         """Return a lower bound on the score of every choice; minus infinity if none is known."""
@@ -377,11 +380,11 @@ class Problem:
         return values
 
     def start(self, random: np.random.Generator | None) -> tuple[int, ...]:
-        """Return a choice that satisfies the constraints and sees every rigid-body mode.
+        """Return a choice that satisfies the constraints and observes every rigid-body mode.
 
-        The choice is random if a generator is given; otherwise it is the same in each call.
-        If no such choice is found, the nearest one is returned. If no choice satisfies the
-        constraints, the result is empty.
+        The choice is random if a generator is given; otherwise it is the same in each call. If
+        every choice that was found misses a rigid-body mode, one of these is returned. If no choice
+        satisfies the constraints, the result is empty.
         """
         if not self.rows.A.size:
             weights = None if random is None else random.uniform(0.1, 1.0, self.total)
@@ -480,7 +483,8 @@ class Search(Value):
     def search(self, problem: Problem, work: Work) -> SearchResult:
         """Return the best choice that was found.
 
-        A method uses `score(sets)`, `bound()`, `choices()` and `start` of the problem. It calls
+        A method uses the methods `score(sets)`, `bound()`, `choices()` and `start` of the problem,
+        which is a `Problem`. The second argument, `work`, runs the calculations: the method calls
         functions through ``work.mapped`` and draws random numbers from ``work.rng``. With these two
         rules its result is identical on every executor (pool of processes), and a search that was
         stopped continues from its checkpoint file.

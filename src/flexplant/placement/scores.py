@@ -50,9 +50,11 @@ class Scores(Value):
         Remark that the scores do not include truncated modes. It is empty if the plant has an
         evaluation model.
     interval : str
-        Text of an interval for the error of the best layout divided by that of the next one. It
-        contains this ratio for 95 % of the uncertain plant's sampled machines. If the interval does
-        not exist, the text is the reason. It is empty if the plant has no sampled machines.
+        Text of an interval for the error of the best layout divided by that of the next one. It is
+        a 95 % interval for a machine that agrees with the measurement. Such machines are known if
+        the plant comes from ``fit.calibrated(measured)`` with an evaluation model. If they are
+        known but there is no interval, the text is the reason. If they are not known, the text is
+        empty.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -315,6 +317,8 @@ def device_worth(
     progress: bool | None = None,
 ) -> DeviceWorth:
     """Return the value of a criterion without each chosen device, to show what each one is worth.
+
+    The result is a `DeviceWorth`, which prints as a table.
 
     Parameters
     ----------

@@ -270,8 +270,9 @@ class OverMachines(Several):
     criterion : Criterion or callable
         Criterion, or function of a plant that returns a float; smaller is better.
     machines : sequence of StandardPlant
-        Sampled plants, such as `plant.uncertain(fit).machines.plants`, or one plant for each
-        machine of a fleet. Each of them gets the sensors and actuators of the plant that is scored.
+        Sampled plants, for example one plant for each machine of a fleet, or the possible machines
+        of one plant: `plant.uncertain(fit).machines.plants`, where `fit` is the result of `update`.
+        Each of them gets the sensors and actuators of the plant that is scored.
     measure : {"worst", "mean"}
         Whether the value is the largest over the machines, or their mean.
 

@@ -62,11 +62,11 @@ def design_h2(
     Raises
     ------
     AssumptionError
-        When w acts directly on z in a continuous plant, so that the norm is infinite. Also when an
-        undamped mode is not seen by y, reached by u, seen by z or excited by w.
+        When w acts directly on z in a continuous plant, so that the norm is infinite. Also when u
+        does not excite, or y does not measure, a mode that is not stable.
     InfeasibleError, SolverError
-        When no stabilising controller was found. Also when noise or effort was added and the norm
-        falls to zero together with them.
+        When no stabilising controller was found. Also when the norm can be made arbitrarily small
+        by ever larger gains, so that no best controller exists.
     CertificateError
         When the closed loop is not stable or its norm is not that of the formula.
     ModelError
@@ -77,10 +77,11 @@ def design_h2(
     LQG is a special case of this design. Its cost is ``x' Q x + u' R u``. Its white noises have the
     intensities W (process) and V (sensors); for a sampled plant W and V are covariances. The
     channels of LQG are ``z = [Q^(1/2) x; R^(1/2) u]`` and ``w = [process; sensor]``, with ``B1 =
-    [W^(1/2), 0]`` and ``D21 = [0, V^(1/2)]``. For an assembled plant, the method `weighted` makes w
-    and z. The weight of each channel of w is the size of its noise, where asd is its amplitude
-    spectral density: asd / sqrt(2) for a continuous plant and asd / sqrt(2 dt) for a sampled one.
-    The weight of each channel of z is one over the allowed rms of the motion or effort.
+    [W^(1/2), 0]`` and ``D21 = [0, V^(1/2)]``. For a plant of `assemble_plant`, its method
+    `weighted` gives w and z these weights. The weight of each channel of w is the size of its
+    noise, where asd is its amplitude spectral density: asd / sqrt(2) for a continuous plant and asd
+    / sqrt(2 dt) for a sampled one. The weight of each channel of z is one over the allowed rms of
+    the motion or effort.
 
     If D12 or D21 does not have full rank, a small noise of each sensor is added to w, and a small
     effort of each actuator to z, as for `design_hinf`. Both are reduced until the norm hardly

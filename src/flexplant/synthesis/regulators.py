@@ -77,7 +77,7 @@ def lqi(
     R : (m, m) array
         Weight on the inputs, positive definite.
     outputs : iterable of str, optional
-        The p outputs that are integrated; by default all.
+        Outputs that are integrated; by default all. Here p is the number of these outputs.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def lqe(sys: System, *, W: FloatArray, V: FloatArray, N: FloatArray | None = Non
     The system is ``dx/dt = A x + B u + w, y = C x + D u + v`` with white noises w and v. The
     estimate x^ follows ``dx^/dt = A x^ + B u + K e`` with the innovation ``e = y - C x^ - D u`` and
     the filter gain K. For a sampled system x^ is the state predicted for the next sample. For a
-    plant with ports, use `flexplant.design_kalman`, which also computes the error of the estimate.
+    StandardPlant, use `flexplant.design_kalman`, which also computes the error of the estimate.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def lqg(
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     Q, R : (n, n), (m, m) arrays
-        Weights as in `lqr`. If p outputs are integrated, Q is (n + p, n + p) as in `lqi`.
+        Weights as in `lqr`. If outputs are integrated, Q also weights their integrals, as in `lqi`.
     W, V : (n, n), (p, p) arrays
         Spectral densities (or covariances) of the noises, as in `lqe`.
     integrate : iterable of str, optional
@@ -276,7 +276,8 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     sys : StateSpace, or a system of python-control or SciPy
         System with n states, m inputs and p outputs.
     poles : (n,) array [rad/s, or 1 where sampled]
-        Poles in conjugate pairs. Each may be given at most as many times as there are inputs.
+        Poles in conjugate pairs; for a sampled system they lie in the z-plane and have no unit.
+        Each may be given at most as many times as there are inputs.
 
     Returns
     -------

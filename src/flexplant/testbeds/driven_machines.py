@@ -105,12 +105,13 @@ def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
     """Return the plant of a short stroke on a long stroke, below a lens on isolators.
 
-    All bodies move along x. One actuator pushes the long stroke (60 kg) against the base (3000 kg,
-    4 Hz). The other pushes the short stroke (15 kg, with a mirror block of 4 kg at 700 Hz) against
-    the long stroke, without contact between the two. The lens (70 kg, 95 Hz) hangs in a metrology
-    frame (500 kg, isolated from the base at 1.2 Hz). An interferometer measures the mirror block
-    relative to the lens, and a second sensor the gap between both strokes. The die relative to the
-    lens has a reference, and so has the gap.
+    All bodies move along x. A frequency in brackets is that of the body on its springs. One
+    actuator pushes the long stroke (60 kg) against the base (3000 kg, 4 Hz). The other pushes the
+    short stroke (15 kg, with a mirror block of 4 kg at 700 Hz) against the long stroke, without
+    contact between the two. The lens (70 kg, 95 Hz) hangs in a metrology frame (500 kg, isolated
+    from the base at 1.2 Hz). An interferometer measures the mirror block relative to the lens, and
+    a second sensor the gap between both strokes. The die relative to the lens has a reference, and
+    so has the gap.
 
     Parameters
     ----------
@@ -166,11 +167,11 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
 def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a mirror that tilts on flexures.
 
-    The mirror has a mass of 0.12 kg and a diameter of 80 mm. Its tilting modes about x and y are at
-    23 and 26 Hz. The housing has a mass of 2.5 kg, and its modes on its bolts are at 310 Hz and
-    above. The rim of the mirror bends at 2.3 and 2.6 kHz. Four coils push against the housing; each
-    pair makes one moment. Two differential sensors measure the tilt of the rim relative to the
-    housing. The tilt of the mirror's centre has a reference.
+    A mirror (0.12 kg, diameter 80 mm) is held by flexures in a housing. Its tilting modes about x
+    and y have the frequencies 23 and 26 Hz. The housing (2.5 kg) is bolted to the ground and tilts
+    on its bolts at 310 and 360 Hz. The rim of the mirror bends at 2.3 and 2.6 kHz. Four coils push
+    against the housing; each pair makes one moment. Two differential sensors measure the tilt of
+    the rim relative to the housing. The tilt of the mirror's centre has a reference.
 
     Parameters
     ----------
@@ -327,10 +328,10 @@ def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
 def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a hexapod with stiff legs on a soft base.
 
-    Six legs carry a platform (22 kg) with a load (8 kg, 140 Hz and more). Each leg is a stack of
-    the stiffness 1.5e7 N/m with an actuator that strains it. The legs stand on a base (120 kg) that
-    sways on its mounts at 16 to 35 Hz. Sensors in the legs measure their lengths. All six motions
-    of the platform relative to the base have references.
+    Six legs carry a platform (22 kg). A load (8 kg) on the platform has modes at 140 Hz and above.
+    Each leg is a stack of the stiffness 1.5e7 N/m with an actuator that strains it. The legs stand
+    on a base (120 kg) that sways on its mounts at 16 to 35 Hz. Sensors in the legs measure their
+    lengths. All six motions of the platform relative to the base have references.
 
     Parameters
     ----------
@@ -393,9 +394,10 @@ def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
     """Return the plant of a screw axis with an encoder on its motor and one at its load.
 
     A motor and a screw (2.4e-3 kg m^2, lead 10 mm) move a table (140 kg) through an axial stiffness
-    of 1.3e8 N/m. A workpiece (35 kg) stands on the table and sways at 48 Hz. The nut pushes against
-    a machine bed (1100 kg, which sways at 14 Hz). Encoders measure the angle of the motor and the
-    table relative to the bed. The workpiece has a reference relative to the bed.
+    of 1.3e8 N/m. A workpiece (35 kg) stands on the table and sways at 48 Hz. The screw is supported
+    by a machine bed (1100 kg, which sways at 14 Hz) and pushes against it. Encoders measure the
+    angle of the motor and the table relative to the bed. The workpiece has a reference relative to
+    the bed.
 
     Parameters
     ----------

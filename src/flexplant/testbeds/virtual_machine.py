@@ -54,7 +54,8 @@ class WaferStage(Value):
     step : float [m]
         Step (resolution) of the sensors; 0 if they have no steps.
     drawing : mapping
-        Size, thickness and material of its plate (or block) as drawn; by default the paper's.
+        Size, thickness and material of its plate (or block) as drawn; by default the plate of Table
+        1 of [paper]_.
     magnets : tuple of GroundSpring
         Magnets on which a block floats, as drawn; empty for a free plate or block.
 
@@ -108,8 +109,8 @@ class WaferStage(Value):
         Parameters
         ----------
         modes : sequence of int
-            Numbers of the modes, counted from 1 with rigid-body modes, as in the paper. Elastic
-            modes are sorted by frequency; overdamped ones are not counted.
+            Numbers of the modes, counted from 1, the rigid-body modes first. Elastic modes are
+            sorted by frequency; overdamped ones are not counted.
         deviation : float
             Standard deviation of the errors of the poles, relative to their size. With 0 the poles
             are exact and the result has no covariance.

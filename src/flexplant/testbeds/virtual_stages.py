@@ -45,14 +45,15 @@ def wafer_stage(
     delay: float | None = None,
     individual: int = 1,
 ) -> WaferStage:
-    """Return the virtual machine: the paper's plate with an actuator's mass that no drawing shows.
+    """Return a virtual machine: a free plate with the mass of an actuator that no drawing shows.
 
-    The machine is the free plate of Table 1 of the paper, with rotary inertia. It is described by
-    polynomials that are solved to convergence, so that its frequencies differ from those of any
-    mesh of the drawing. A point mass is added at (L/2, L/4), the paper's z_8, and another of up to
-    0.1 kg at a random place. The stiffness is scattered over the plate by 0.3 % and the damping
-    over its modes by 30 %. The sensors have steps of 0.05 nm, and the delay is not a whole number
-    of samples.
+    The machine is the free plate of Table 1 of [paper]_, an aluminium plate of 0.6 m by 0.6 m by
+    27.2 mm, with rotary inertia. It is described by polynomials that are solved to convergence, so
+    that its frequencies differ from those of any mesh of the drawing. The mass of the actuator is
+    added at (L/2, L/4), where L is the side of the plate (point z_8 of the paper), and another of
+    up to 0.1 kg at a random place. The stiffness is scattered over the plate by 0.3 % and the
+    damping over its modes by 30 %. The sensors have steps of 0.05 nm, and the delay is not a whole
+    number of samples.
 
     Parameters
     ----------

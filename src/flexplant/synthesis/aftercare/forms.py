@@ -425,9 +425,9 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     Raises
     ------
     AssumptionError
-        When D is singular, so that Hanus' form has no inverse of it. Also when the zeros of the
-        controller, which are the poles of this form, are not stable. Give a recovery time in both
-        cases.
+        When no `recovery` is given and Hanus' form cannot be used. D may be singular, so that its
+        inverse does not exist. Or the zeros of the controller, which are the poles of this form,
+        are not stable. Give a recovery time in both cases.
     ModelError
         When slow states do not act on the commands, so that commands cannot correct them.
 

@@ -50,11 +50,11 @@ def design_hinf(
     The H-infinity norm is the largest gain over all frequencies. Weights on w and z define how
     large it may be in each channel. For a stage, `stage_weights` computes the weights from a
     bandwidth: ``weights = fx.stage_weights(plant, 60.0)``. The design is then ``K =
-    fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``. If `K.gamma` is below 1, all
-    requirements of the weights are satisfied. `mixed_sensitivity` builds a plant from weights of S,
-    KS and T. Two checks are made on the closed loop in the original channels: it must be stable,
-    and its norm is computed by two methods. ``fx.close_loop(plant, K)`` returns the closed loop.
-    The page `algorithms` describes the method.
+    fx.design_hinf(plant.weighted(z=weights.z, w=weights.w))``. The attribute `K.gamma` is the norm
+    that the controller reaches. If it is below 1, all requirements of the weights are satisfied.
+    `mixed_sensitivity` builds a plant from weights of S, KS and T. The closed loop of the given
+    plant is checked: it must be stable, and its norm is computed by two methods.
+    ``fx.close_loop(plant, K)`` returns the closed loop. The page `algorithms` describes the method.
 
     Parameters
     ----------
@@ -81,19 +81,20 @@ def design_hinf(
     uncertain : UncertainPlant, optional
         Uncertainty of the plant before it was weighted, such as
         ``plant.uncertain(frequency=0.005)``. It is not needed if `plant` is an UncertainPlant. The
-        design then aims at a loop that remains stable for all modal frequencies of the uncertainty.
-        Each mode gets an additional channel through which a change of its frequency acts. The
-        structured singular value mu measures how near the uncertainty comes to an unstable loop
-        (see `mu`). The channel includes the scaling matrix G of mu, because changes of frequencies
-        are real numbers. The size of the channel is found in a first design. `gamma` then includes
-        these channels, and a value above 1 is not a failure. The entry ``all frequencies at once``
-        of `certificate` is an upper bound on mu over a frequency grid. If it is below 1, no plant
-        of the uncertainty has a closed-loop pole at a frequency of the grid.
-        ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
+        design then aims at a loop that remains stable for all modal frequencies within their
+        uncertainties. For this purpose each uncertain mode gets one additional input and output,
+        through which a change of its frequency acts. Changes of frequencies are real numbers. These
+        channels therefore include the scaling matrix G, which `mu` uses for real uncertainties. A
+        first design determines the scale of each channel. `gamma` is then the norm with these
+        channels, and a value above 1 is not a failure. The entry ``all frequencies at once`` of
+        `certificate` is an upper bound of the structured singular value mu over a frequency grid.
+        If it is below 1, no plant of the uncertainty has a closed-loop pole at a frequency of the
+        grid. ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
     damped_below : float [Hz]
-        Frequency below which the controller actively damps uncertain modes that actuators excite.
-        The channels of these modes then represent frequency errors of 1 % and errors of their mode
-        shapes. `design_stage` uses 3.5 times the bandwidth.
+        Frequency below which the controller actively damps the uncertain modes that the actuators
+        excite. Other modes are only tolerated, as described for `uncertain`. The additional channel
+        of a mode to be damped represents a frequency error of at least 1 %. It also represents
+        errors of its mode shape and damping. `design_stage` uses 3.5 times the bandwidth.
     progress : bool, optional
         Whether to show a progress bar of the method's steps. By default (None) it is shown on a
         terminal or in a notebook, for work of more than two seconds.
@@ -102,9 +103,9 @@ def design_hinf(
     -------
     Controller
         The controller. `gamma` is the verified norm, and `lower` is a lower bound on the norm for
-        all controllers. `certificate` holds the checks. `reached` holds the norm from each group of
-        channels of w to each group of channels of z. `left_out` holds the check with the truncated
-        modes, which the design model leaves out.
+        all controllers. `certificate` holds the checks. `reached` holds the largest gain from each
+        group of w (disturbances, references, noises) to each group of z (motions, efforts).
+        `left_out` holds the check with the truncated modes, which the design model leaves out.
 
     Raises
     ------

@@ -81,10 +81,10 @@ def design_ncf(
     Returns
     -------
     Controller
-        The controller. `gamma` is the verified norm, and `lower` is gamma_min. The certificate
-        holds the margin 1 / gamma of the shaped plant, gamma_min from the Hankel norm of the
-        factors, and the modulus margin of the loop at u. As a rule of thumb, a design with a gamma
-        below 4 is robust.
+        The controller. `gamma` is the value of gamma above, verified as an H-infinity norm of the
+        closed loop, and `lower` is gamma_min. The certificate holds the margin 1 / gamma of the
+        shaped plant, gamma_min from the Hankel norm of the factors, and the modulus margin of the
+        loop at u. As a rule of thumb, a design with a gamma below 4 is robust.
 
     Raises
     ------

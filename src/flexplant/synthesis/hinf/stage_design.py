@@ -94,15 +94,16 @@ def design_stage(
     bandwidth : float [Hz], optional
         Bandwidth of the loop; by default the largest possible one. It is the frequency at which |S|
         from reference to error crosses 1 on the slowest axis. The weights are adjusted until the
-        loop reaches it within 1 %. For a plant without references, the weights are those of 1.5
-        times the bandwidth.
+        loop reaches it within 1 %. A plant without references has no such frequency. Its weights
+        are then the `stage_weights` of 1.5 times the given bandwidth.
     margin : float
         Smallest allowed modulus margin, with the loop opened at u. The modulus margin is one over
         the largest singular value of the sensitivity S at any frequency.
     poi : str, optional
         Point of interest (POI), as for `stage_weights` and `reference_errors`.
     disturbance, effort : float
-        Sizes of the weights, as for `stage_weights` of an uncertain plant.
+        Sizes of the weights of disturbances and efforts, as for `stage_weights`. By default they
+        are those for uncertain frequencies.
     progress : as for `design_hinf`
 
     Returns

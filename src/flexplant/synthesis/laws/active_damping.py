@@ -119,12 +119,14 @@ def damp_modes(
 ) -> ActiveDamping:
     """Return a law that damps one mode, to a given damping ratio or as much as possible.
 
-    The search tries filters of the given kind with both signs of the gain, and follows the root
-    locus of each. The filter adds poles to the loop. Therefore the smallest damping ratio of the
-    mode's pole and the poles of the filter is maximised. A law is accepted only if it keeps the
-    modulus margin, does not move rigid-body poles to the right, and keeps at least 70 % of the
-    damping ratio of every other mode. If a damping ratio is given, the result is the law that
-    reaches it with the smallest gain over the resonance.
+    The search tries filters of the given kind with several corner frequencies. The sign of the gain
+    is chosen so that a small gain moves the pole of the mode to the left. For each filter the size
+    of the gain is varied along the root locus. The filter adds poles to the loop, and these must be
+    damped too. The search therefore maximises the smallest damping ratio of the mode's pole and the
+    poles of the filter. A law is accepted only if it keeps the modulus margin, does not move
+    rigid-body poles to the right, and keeps at least 70 % of the damping ratio of every other mode.
+    If a damping ratio is given, the result is the law that reaches it with the smallest gain of the
+    filter at the frequency of the mode.
 
     Parameters
     ----------

@@ -160,6 +160,7 @@ def design_loops(
     Returns
     -------
     DesignedLoops
+        The laws as `laws`, their margins as `report`, and the controller as `system`.
 
     Raises
     ------

@@ -60,31 +60,33 @@ def design_servo(
     """Return a controller with one law for each axis that the actuators move.
 
     The controller is ``u = -T C(z) (hat - ref)``, with the estimates hat and the references ref. T
-    decouples the axes: ``T = pinv(G(sigma)) / sigma^2``, where G is the plant's response at the
-    real number s = sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). C has one law for each
-    axis. It depends on the slope of the axis's response at the bandwidth w_b:
+    decouples the axes: ``T = pinv(G(sigma)) / sigma^2``. G is the transfer matrix from u to the
+    axes, at the real number s = sigma = 2 pi bandwidth (see `flexplant.plant.driven_axes`). C has
+    one law for each axis. It depends on how the axis responds at the bandwidth w_b [rad/s]:
 
-    - mass line (above all springs): ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``;
-    - damper line: ``k (1 + w_i / s) F(s)``;
-    - spring line: ``k F(s) / s``; response that is zero at zero frequency: ``k F(s)``.
+    - like a mass, -40 dB per decade: ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``;
+    - like a damper, -20 dB per decade: ``k (1 + w_i / s) F(s)``;
+    - like a spring, 0 dB: ``k F(s) / s``; response that is zero at zero frequency: ``k F(s)``.
 
-    Here w_i is the corner of the integral action, and F is a second-order roll-off with the
-    notches. If the slope lies between two lines, the law with the smaller peak of |S| at u is used.
-    The gain k makes the loop gain of the axis 1 at the bandwidth. If |S| at u exceeds 6 dB next to
-    a resonance, k is found from the response at s = sigma, if this keeps 6 dB. If a mode lies
-    within a factor of 4 above the bandwidth, a wide lead is tried: each 4 in the mass line's law
-    becomes 16, or 64 if 16 does not keep 6 dB. It suppresses the error up to a higher frequency,
-    but less at low frequencies, and passes more noise to the actuators. A notch has the damping of
-    its mode. Its frequency is that of the mode, or lower for a fast mode, so that errors of the
-    frequency are tolerated. `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
+    Here w_i is the corner of the integral action, and F is a second-order low-pass multiplied by
+    the notches. If two of these laws are possible, the one with the smaller peak of |S| at u is
+    used. The gain k makes the loop gain of the axis 1 at the bandwidth. A resonance next to the
+    bandwidth can make this k unsuitable, so that |S| at u exceeds 6 dB. If so, k is computed from
+    the response at s = sigma, where no mode resonates; this k is used only if it keeps 6 dB. If a
+    mode lies between one and four times the bandwidth, a wide lead is tried: each 4 in the law of a
+    mass becomes 16, or 64 if 16 does not keep 6 dB. A wide lead suppresses errors up to a higher
+    frequency. It suppresses them less at low frequencies, and passes more noise to the actuators. A
+    notch has the damping of its mode. Its frequency is that of the mode, or lower for a fast mode,
+    so that errors of the frequency are tolerated. `servo_bandwidth` gives the largest bandwidth
+    with a peak of 6 dB.
 
     Parameters
     ----------
     plant : StandardPlant
         Sampled plant.
     bandwidth : float or mapping {axis: float} [Hz]
-        Frequency at which the loop gain of each axis crosses 1; below a fifth of the rate. If the
-        plant resonates, errors are suppressed only up to a lower frequency, see the certificate.
+        Frequency at which the loop gain of each axis crosses 1; below a fifth of the rate.
+        Resonances may limit the suppression of errors to lower frequencies, see the certificate.
     poi : str, optional
         Point of interest (POI) whose axes are controlled; by default all POIs.
     axes : sequence of str, optional
@@ -102,7 +104,8 @@ def design_servo(
         the plant. They are added one by one while |S| at u is above 6 dB (or the loop is unstable)
         and a notch lowers it. With an empty sequence there are no notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
-        Block whose outputs are the estimates `die:hat`, ...; by default the POI itself is used.
+        Block whose outputs are the estimates `die:hat`, ...; by default the loop is checked with
+        the true motion of the POI in their place.
 
     Returns
     -------
@@ -121,14 +124,15 @@ def design_servo(
     ModelError
         When the plant is weighted, or a frequency is not positive or not below half the rate.
     SolverError
-        When rate and delay leave too little phase at the bandwidth, or the loop with the observer
-        is unstable; the message names the modes and the largest bandwidth.
+        When sampling and delay leave no phase margin at the bandwidth, or the loop with the
+        observer is unstable. The message names the modes and the largest bandwidth.
 
     Warns
     -----
     FlexplantWarning
-        When the loop on the POI itself is unstable, the truncated modes make it unstable or bring
-        |S| at u above 8 dB, or a sensor is held at zero while references move the POIs.
+        When the loop without an observer is unstable, or the truncated modes make the loop unstable
+        or bring |S| at u above 8 dB. Also when the plant has references, but the actuators move a
+        free motion that no axis shows; the servo then holds a sensor of this motion at zero.
 
     Examples
     --------
@@ -208,16 +212,16 @@ def servo_bandwidth(
     The responses of plant and observer are computed once on a grid that includes resonances. The
     loop is opened at the plant's input; the observer still receives u. Bandwidths are tried from
     high to low in steps of 9 %. A bandwidth that keeps the peak on the grid is accepted if the
-    closed loop is stable, `modulus_margin` keeps the peak, and every axis with a reference has |S|
-    of at most 0.3 at a twentieth of the bandwidth. Truncated modes are included if known. A
+    closed loop is stable, its modulus margin is at least 1 / peak, and every axis with a reference
+    has |S| of at most 0.3 at a twentieth of the bandwidth. Truncated modes are included if known. A
     bisection then searches above the accepted bandwidth.
 
     Parameters
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Upper bound on the largest singular value of S at u; 2 is 6 dB. Axes are scaled where
-        `ClosedLoop.modulus_margin` scales them.
+        Upper bound on the largest singular value of S at u; 2 is 6 dB. The scaling is that of
+        `ClosedLoop.modulus_margin`.
 
     Returns
     -------

@@ -56,8 +56,8 @@ def tune_loops(
     starts, without proof that it is optimal. The page `algorithms` describes the method.
 
     The law of an axis depends on the slope of its response: that of a mass (-40 dB per decade), of
-    a damper (-20 dB) or of a spring (0 dB). If there is a single axis and it is unstable, or
-    integrates an odd number of times as motors do, it gets the law of `tune_pid`.
+    a damper (-20 dB) or of a spring (0 dB). A single axis gets the law of `tune_pid` if it is
+    unstable or has an odd number of integrators, such as a motor.
 
     Parameters
     ----------

@@ -109,8 +109,8 @@ def design_lmi(
     Controller
         The controller. `gamma` is the verified norm of the minimised objective, and `reached` holds
         the norm of every objective. The certificate holds the bound of the LMIs for comparison.
-        `tried` lists the back-offs with the norm that each reached. If a bound was not kept, the
-        norm is infinite, and the reason is given.
+        `tried` lists the back-offs with the norm that each reached. For a back-off whose controller
+        did not keep a bound, the list has an infinite norm and the reason.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def design_lmi(
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError
-        When the solver stops early, or no controller agrees with the result of the LMIs.
+        When the solver stops early, or its result does not satisfy the LMIs.
 
     References
     ----------

@@ -132,6 +132,9 @@ def margins(loop: Loop, *, at: Literal["u", "y"] = "u") -> MarginTable:
     Returns
     -------
     MarginTable
+        Table of the margins. The classical margins are gain, phase and delay at each crossover. A
+        disk margin is the size `alpha` of a disk of complex factors of the loop gain for which the
+        loop stays stable; `DiskMargin` defines its kinds S-T, S and T.
 
     Raises
     ------

@@ -92,28 +92,30 @@ def design_mu(
     """Return a controller whose weighted gain is small on every machine of an uncertain plant.
 
     The method is D-K iteration (as ``musyn``). A Delta is an uncertainty that is scaled to size 1.
-    D(s) are filters of few states that scale the channels of the Deltas. Each step has two parts.
-    First, an H-infinity controller is designed for the plant whose Deltas are scaled by D. Second,
-    a new D is computed for the best loop so far. Each D is multiplied by the number that gives the
-    smallest H-infinity norm. If Deltas are real, the iteration is also made without this number,
-    and the better result is kept. Before the iteration, two candidates are computed: the controller
-    designed without uncertainty, and the one for a constant D.
+    A machine is the plant with one choice of the Deltas. D(s) are filters of few states that scale
+    the channels of the Deltas. Each step has two parts. First, an H-infinity controller is designed
+    for the plant whose Deltas are scaled by D. Second, a new D is computed for the best loop so
+    far. All filters D are then multiplied by a common factor that makes the H-infinity norm of the
+    next design as small as possible. If Deltas are real, the whole iteration is repeated without
+    this factor, and the better result is kept. Before the iteration, two candidates are computed:
+    the controller designed without uncertainty, and the one for a constant D.
 
     The design treats real Deltas as complex, which is conservative. The controllers are compared by
     mixed mu, in which real Deltas stay real. Its bound holds at all frequencies, also between grid
     points. The result is the controller with the smallest mixed mu.
 
     If all Deltas are frequencies, a simpler design is used. As in `design_hinf` of an uncertain
-    plant, each mode has one channel, with the scaling G for real Deltas and a constant D that is
-    balanced in closed loop. The bound is then computed on a frequency grid through the modes, to
-    first order in their changes. In addition, loops are computed exactly on machines whose
-    frequencies are all at an end of their intervals. This design needs a weighted disturbance that
-    moves the modes. Without one, the general iteration is made.
+    plant, each mode has one channel, with the scaling matrix G for real Deltas (see `mu`) and a
+    constant D. D is chosen so that the closed loop's gains into the channel and out of it are equal
+    at the frequency of the mode. The bound is computed to first order in the changes of the
+    frequencies, on a frequency grid through the modes. In addition, some machines are drawn whose
+    frequencies are all at an end of their intervals. Their loops are computed exactly. This design
+    needs a weighted disturbance that moves the modes. Without one, the general iteration is made.
 
     Parameters
     ----------
     uncertain : UncertainPlant
-        Uncertain plant from `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M,
+        Uncertain plant from ``plant.uncertain(fit, fx.plant.Neglected())`` or `uncertain_system(M,
         blocks)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
         Weights of the performance requirement, as for `StandardPlant.weighted`, for example those
@@ -122,7 +124,8 @@ def design_mu(
     iterations : int
         Largest number of steps of the D-K iteration.
     order : int
-        Largest number of states of D, for each Delta and for each of its sides.
+        Largest number of states of the filter D of one Delta. The filter acts on the outputs of the
+        plant that enter the Delta, and its inverse on the inputs that the Delta drives.
     progress
         As for `design_hinf`. Truncated modes give the same warning as there.
 

@@ -126,18 +126,19 @@ def robust_stability(
 ) -> RobustStability:
     """Return bounds on the uncertainty for which a loop stays stable, by mu of all its Deltas.
 
-    A Delta is an uncertainty that is scaled to size 1. The structured singular value mu is one over
-    the size of the smallest Deltas that make the loop unstable. Deltas of frequencies, damping and
-    parameters are real numbers. All neglected modes together are one full complex block. Unmodelled
-    dynamics and the blocks of `uncertain_system` are real, complex or full, as they were defined.
-    The bound holds at all frequencies, also between grid points. A sampled loop is examined with
-    its sampling and delay. The result is checked on machines that are drawn from the uncertainty.
-    The loop of each machine is computed exactly.
+    A Delta is an uncertainty that is scaled to size 1. A machine is the plant with one choice of
+    the Deltas. The structured singular value mu is one over the size of the smallest Deltas that
+    make the loop unstable. Deltas of frequencies, damping and parameters are real numbers. All
+    neglected modes together are one full complex block. Unmodelled dynamics and the blocks of
+    `uncertain_system` are real, complex or full, as they were defined. The bound holds at all
+    frequencies, also between grid points. A sampled loop is examined with its sampling and delay.
+    The result is checked on machines that are drawn from the uncertainty. The loop of each machine
+    is computed exactly.
 
     Parameters
     ----------
     uncertain : UncertainPlant
-        Uncertain plant from `plant.uncertain(fit, plant.Neglected())` or `uncertain_system(M,
+        Uncertain plant from ``plant.uncertain(fit, fx.plant.Neglected())`` or `uncertain_system(M,
         blocks)`.
     *blocks : StateSpace, or values with a `system`
         Controller, as for `close_loop`.
@@ -149,9 +150,10 @@ def robust_stability(
         second. The full search takes as long if mu is below `resolution`, otherwise ten seconds or
         more.
     resolution : float
-        Smallest mu that is computed to 0.5 %. If mu is smaller, the search ends with this number as
-        `upper`: 0.25 proves that all machines of four times the uncertainty are stable. At 0.9 the
-        search only decides whether the loop is robust, and takes less time.
+        Smallest mu that is computed to an accuracy of 0.5 %. If mu is smaller, the search ends and
+        `upper` is this number. For example, an `upper` of 0.25 proves that all machines of four
+        times the uncertainty are stable. At 0.9 the search only decides whether the loop is robust,
+        and takes less time.
     machines : int
         Number of machines drawn. Each Delta of a machine is at an end of its interval.
     rng : int, SeedSequence, Generator or None
@@ -169,8 +171,8 @@ def robust_stability(
     AssumptionError
         When the nominal loop is not stable.
     CertificateError
-        When a machine is unstable although stability was proven. Also when sampled machines are too
-        nonlinear in their Deltas.
+        When a machine is unstable although stability was proven. Also, for a sampled plant, when
+        its matrices do not depend linearly enough on the Deltas.
     SolverError
         When the proven intervals do not cover all frequencies.
 
@@ -365,11 +367,12 @@ def worst_case_gain(
 ) -> WorstCaseGain:
     """Return bounds on the largest gain from w to z over an uncertainty, with the machine found.
 
-    The upper bound is a skewed structured singular value. This means that the size of the Deltas is
-    fixed to ``|Delta| <= 1``, and only the block from z to w that represents the gain is scaled.
-    The bound is computed on frequency intervals that cover all frequencies. The lower bound is the
-    gain of a machine that a search found. The loop of this machine is computed exactly, with the
-    sampling and delay of the plant.
+    A machine is the plant with one choice of the Deltas of the uncertainty, which are scaled to
+    ``|Delta| <= 1``. The upper bound is a skewed structured singular value. The gain is represented
+    by one more block from z to w. Unlike for mu, only the size of this block is varied, and the
+    size of the Deltas stays fixed. The bound is computed on frequency intervals that cover all
+    frequencies. The lower bound is the gain of a machine that a search found. The loop of this
+    machine is computed exactly, with the sampling and delay of the plant.
 
     Parameters
     ----------

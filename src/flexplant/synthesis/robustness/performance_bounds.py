@@ -34,9 +34,10 @@ def robust_performance(
 ) -> MuBounds:
     """Return mu of robust performance, which measures stability and weighted gain together.
 
-    If this number is below 1, every machine of the uncertainty is stable and has a weighted gain
-    below 1 from w to z. If it is 2, machines with half the uncertainty are stable and have a
-    weighted gain of at most 2. `design_mu` minimises this number.
+    A machine is the plant with one choice of values within the uncertainty. If mu is below 1, every
+    machine is stable and has a weighted gain below 1 from w to z. If it is 2, machines with half
+    the uncertainty are stable and have a weighted gain of at most 2. `design_mu` minimises this
+    number.
 
     Parameters
     ----------

@@ -110,11 +110,11 @@ def design_structured(
         The controller. Its `structure` is the given one with the parameters found, from which a
         further design can begin. `gamma` is the largest verified norm (divided by `below`), and
         `tried` lists the result of each start. The certificate holds the norm of each plant and
-        objective. For plants by position it is the worst one, also between positions. The
-        certificate also holds two numbers that show how near the result is to a local minimum.
-        `slope` is the norm of the smallest convex combination of the gradients of log gamma.
-        `decrease left` is the relative decrease of gamma by a step of length `radius`, to first
-        order.
+        objective. For plants by position it is the worst one, also between positions. Three further
+        entries show how near the result is to a local minimum. `slope` is the norm of the smallest
+        convex combination of the gradients of log gamma at its peaks; it is zero at a minimum.
+        `decrease left` is the relative decrease of gamma, to first order, that a small step of the
+        parameters can still give. `radius` is the length of this step.
 
     Raises
     ------
