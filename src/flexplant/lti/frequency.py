@@ -486,8 +486,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:
-        """Return a `control.FrequencyResponseData` with the same names and the sampling time dt
-        [s].""" import control
+        """Return a `control.FrequencyResponseData` of the same names and sampling time dt [s]."""
+        import control
 
         return control.FrequencyResponseData(
             self.data,

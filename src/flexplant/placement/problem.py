@@ -343,9 +343,12 @@ class Problem:
 
     @property
     def root(self) -> Branch:
-        """The branch (set of choices) that contains all choices. Only required and excluded
-        candidates limit it; constraints on several candidates are not used.""" return
-        Branch.containing(self.required, self.free, self.count)
+        """The branch (set of choices) that contains all choices.
+
+        Only required and excluded candidates limit it. Constraints that concern several candidates
+        together are not used.
+        """
+        return Branch.containing(self.required, self.free, self.count)
 
     def bound(self) -> float:
         """Return a lower bound on the score of every choice; minus infinity if none is known."""
