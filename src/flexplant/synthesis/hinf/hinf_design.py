@@ -73,9 +73,8 @@ def design_hinf(
         an undamped mode, it adds a small multiple of the sensors to z. `Lmi()` finds gamma by a
         semidefinite program and is suitable for up to 20 states.
     bandwidth : float [Hz], optional
-        Bandwidth of a stage whose plant has no weights. The weights are then those of
-        `stage_weights`, and the POI (point of interest) must have one reference. `design_stage`
-        finds the largest possible bandwidth.
+        Bandwidth of a stage whose plant has no weights. The weights are then the `stage_weights` of
+        this bandwidth. `design_stage` finds the largest possible bandwidth.
     u, y : sequences of str, optional
         For a StateSpace: inputs that the controller drives, and outputs that it reads.
     uncertain : UncertainPlant, optional
@@ -86,10 +85,11 @@ def design_hinf(
         through which a change of its frequency acts. Changes of frequencies are real numbers. These
         channels therefore include the scaling matrix G, which `mu` uses for real uncertainties. A
         first design determines the scale of each channel. `gamma` is then the norm with these
-        channels, and a value above 1 is not a failure. The entry ``all frequencies at once`` of
-        `certificate` is an upper bound of the structured singular value mu over a frequency grid.
-        If it is below 1, no plant of the uncertainty has a closed-loop pole at a frequency of the
-        grid. ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
+        channels. A value above 1 does therefore not mean that the requirements of the weights are
+        missed. The entry ``all frequencies at once`` of `certificate` is an upper bound of the
+        structured singular value mu over a frequency grid. If it is below 1, no plant of the
+        uncertainty has a closed-loop pole at a frequency of the grid.
+        ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
     damped_below : float [Hz]
         Frequency below which the controller actively damps the uncertain modes that the actuators
         excite. Other modes are only tolerated, as described for `uncertain`. The additional channel

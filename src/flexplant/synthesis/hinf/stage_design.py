@@ -74,8 +74,9 @@ def design_stage(
     bandwidth that satisfies three conditions. First, the modulus margin at u is at least `margin`.
     This also holds with the truncated modes (which the design model leaves out), if they are known.
     Second, the modulus margin is at least 7/8 of `margin` if the frequency of any one mode is wrong
-    by its uncertainty. Third, it is at least 7/8 of `margin` on each of 20 machines that are drawn
-    at random. A further machine then satisfies this with a probability of 20/21 (95 %).
+    by its uncertainty. Third, it is at least 7/8 of `margin` on each of 20 machines. These are
+    possible variants of the plant, which are drawn at random. A further machine then satisfies this
+    condition with a probability of 20/21 (95 %).
 
     There are two ways to draw the machines. If the plant comes from a calibrated fit and no
     uncertainties of frequencies are stated, the machines are those of `StandardPlant.machines`,

@@ -62,7 +62,7 @@ def design_servo(
     The controller is ``u = -T C(z) (hat - ref)``, with the estimates hat and the references ref. T
     decouples the axes: ``T = pinv(G(sigma)) / sigma^2``. G is the transfer matrix from u to the
     axes, at the real number s = sigma = 2 pi bandwidth (see `flexplant.plant.driven_axes`). C has
-    one law for each axis. It depends on how the axis responds at the bandwidth w_b [rad/s]:
+    one law for each axis. This law depends on how the axis responds at the bandwidth w_b [rad/s]:
 
     - like a mass, -40 dB per decade: ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``;
     - like a damper, -20 dB per decade: ``k (1 + w_i / s) F(s)``;

@@ -133,8 +133,8 @@ def margins(loop: Loop, *, at: Literal["u", "y"] = "u") -> MarginTable:
     -------
     MarginTable
         Table of the margins. The classical margins are gain, phase and delay at each crossover. A
-        disk margin is the size `alpha` of a disk of complex factors of the loop gain for which the
-        loop stays stable; `DiskMargin` defines its kinds S-T, S and T.
+        disk margin is the size `alpha` of complex changes of the loop gain up to which the loop
+        stays stable. `DiskMargin` defines its kinds S-T, S and T.
 
     Raises
     ------
