@@ -181,9 +181,9 @@ class Placement(Value):
         relaxation exists for criteria that are the log det of a matrix, such as `ModeInformation`.
         If no port has a filter or delay, it also exists for mean squares. Mean squares are
         `PoiVariance` of the plant's own modes, `PoiLqr`, `ClosedLoopH2`, and criteria that wrap
-        them. For the trace of a Gramian the bound is exact. For its smallest eigenvalue, which
-        grows with each device, the bound is the value with all candidates together. If the
-        criterion is a plain function, the bound is minus infinity.
+        them. For the trace of a Gramian the bound is the smallest value without constraints. For
+        its smallest eigenvalue, which grows with each device, the bound is the value with all
+        candidates together. If the criterion is a plain function, the bound is minus infinity.
     evaluations : int
         Number of choices that were scored.
     history : tuple of tuples of float

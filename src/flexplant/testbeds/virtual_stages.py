@@ -48,12 +48,12 @@ def wafer_stage(
     """Return a virtual machine: a free plate with the mass of an actuator that no drawing shows.
 
     The machine is the free plate of Table 1 of [paper]_, an aluminium plate of 0.6 m by 0.6 m by
-    27.2 mm, with rotary inertia. It is described by polynomials that are solved to convergence, so
-    that its frequencies differ from those of any mesh of the drawing. The mass of the actuator is
-    added at (L/2, L/4), where L is the side of the plate (point z_8 of the paper), and another of
-    up to 0.1 kg at a random place. The stiffness is scattered over the plate by 0.3 % and the
-    damping over its modes by 30 %. The sensors have steps of 0.05 nm, and the delay is not a whole
-    number of samples.
+    27.2 mm, with rotary inertia. It is modelled by polynomial shape functions (Ritz method) of such
+    a high order that its frequencies are converged. They therefore differ from those of any mesh of
+    the drawing. The mass of the actuator is added at (L/2, L/4), where L is the side of the plate
+    (point z_8 of the paper), and another of up to 0.1 kg at a random place. The stiffness is
+    scattered over the plate by 0.3 % and the damping over its modes by 30 %. The sensors have steps
+    of 0.05 nm, and the delay is not a whole number of samples.
 
     Parameters
     ----------
@@ -184,14 +184,15 @@ def magnet_stage(
 ) -> WaferStage:
     """Return a virtual machine that floats on magnets, with a mass that no drawing shows.
 
-    The machine is an elastic block, described by polynomials that are solved to convergence. Its
-    frequencies therefore differ from those of any mesh of bricks. Magnets at its corners attract,
-    so that its stiffness is ``K - sum_s |k_s| r_s' r_s`` (k_s is the stiffness of magnet s, and the
-    row r_s gives the motion there). The six rigid-body motions grow until a loop holds them. The
-    stiffnesses of the magnets differ from the drawn ones by up to 10 %. A mass is added on the
-    bottom at (3/4, 1/4) of its sides, and another of up to 0.1 kg at a random place. The stiffness
-    is scattered over the block by 0.3 % and the damping over its modes by 30 %. The sensors have
-    steps of 0.05 nm, and the delay is not a whole number of samples.
+    The machine is an elastic block. It is modelled by polynomial shape functions (Ritz method) of
+    such a high order that its frequencies are converged. They therefore differ from those of any
+    mesh of bricks. Magnets at its corners attract, so that its stiffness is ``K - sum_s |k_s| r_s'
+    r_s`` (k_s is the stiffness of magnet s, and the row r_s gives the motion there). The six
+    rigid-body motions grow until a loop holds them. The stiffnesses of the magnets differ from the
+    drawn ones by up to 10 %. A mass is added on the bottom at (3/4, 1/4) of its sides, and another
+    of up to 0.1 kg at a random place. The stiffness is scattered over the block by 0.3 % and the
+    damping over its modes by 30 %. The sensors have steps of 0.05 nm, and the delay is not a whole
+    number of samples.
 
     Parameters
     ----------

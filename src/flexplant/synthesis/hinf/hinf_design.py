@@ -85,8 +85,8 @@ def design_hinf(
         through which a change of its frequency acts. Changes of frequencies are real numbers. These
         channels therefore include the scaling matrix G, which `mu` uses for real uncertainties. A
         first design determines the scale of each channel. `gamma` is then the norm with these
-        channels. A value above 1 does therefore not mean that the requirements of the weights are
-        missed. The entry ``all frequencies at once`` of `certificate` is an upper bound of the
+        channels. It may therefore be above 1 although the requirements of the weights are
+        satisfied. The entry ``all frequencies at once`` of `certificate` is an upper bound of the
         structured singular value mu over a frequency grid. If it is below 1, no plant of the
         uncertainty has a closed-loop pole at a frequency of the grid.
         ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.

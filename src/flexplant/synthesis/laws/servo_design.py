@@ -220,7 +220,7 @@ def servo_bandwidth(
     ----------
     plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
-        Upper bound on the largest singular value of S at u; 2 is 6 dB. The scaling is that of
+        Upper bound on the largest singular value of S at u; 2 is 6 dB. Axes may be scaled, as in
         `ClosedLoop.modulus_margin`.
 
     Returns
