@@ -228,6 +228,8 @@ def lqg(
     Returns
     -------
     StateSpace
+        Controller from the measurements, and the references if outputs are integrated, to the
+        inputs.
 
     Raises
     ------
@@ -282,6 +284,7 @@ def place(sys: System, poles: npt.ArrayLike) -> FloatArray:
     Returns
     -------
     (m, n) array
+        Gain F of the feedback ``u = -F x``.
 
     Raises
     ------

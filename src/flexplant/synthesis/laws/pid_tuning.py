@@ -113,6 +113,7 @@ def tune_pid(
     Returns
     -------
     PidTuning
+        The `controller` from y to u, its gain and corner frequencies, and its verified `margin`.
 
     Raises
     ------

@@ -165,6 +165,8 @@ def robust_stability(
     Returns
     -------
     RobustStability
+        The bounds `lower` and `upper` of mu. `is_robust` is true if `upper` is below 1: all
+        machines of the uncertainty are then stable.
 
     Raises
     ------
@@ -387,6 +389,8 @@ def worst_case_gain(
     Returns
     -------
     WorstCaseGain
+        The bounds `lower` and `upper` of the largest gain, the gain `nominal` without uncertainty,
+        and the `machine` with the gain `lower`.
 
     Raises
     ------

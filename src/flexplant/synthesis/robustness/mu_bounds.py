@@ -118,6 +118,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     Returns
     -------
     MuBounds
+        The bounds `lower` and `upper`, and the perturbation that gives the lower bound.
 
     Raises
     ------
