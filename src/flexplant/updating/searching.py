@@ -148,7 +148,23 @@ class _Tried:
             if not self.found:
                 size = self.objective.size(self.objective.at(end.p))
                 self.rounding = (ROOT * float(np.linalg.norm(size))) ** 2
+            named = named or self._paired_as_named(end)
             self.found.append(_graded_end(self.objective, end, named=named))
+
+    def _paired_as_named(self, end: SearchEnd) -> bool:
+        """Return whether the modes of a better end are paired as from the given start."""
+        best = self.best
+        if best is None or not best.named or end.cost >= (1 - TYPED) * best.end.cost:
+            return False
+        there = self.objective.at(end.p)
+        line = np.linspace(best.end.p, end.p, GLANCE)[1:]
+        self.objective.path, same = [], False
+        with attempted("following the modes to a better minimum", (ModelError, LabelError)):
+            followed = self.objective.follow([*best.end.trail.p, *line])
+            own, other = map(self.objective.values, (there, followed))
+            same = float(np.linalg.norm(own - other)) <= TYPED * float(np.linalg.norm(own))
+        self.objective.follow(end.trail.p)
+        return same
 
     @property
     def best(self) -> _GradedEnd | None:

@@ -283,8 +283,10 @@ class UpdateResult(Value):
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         rivals = [] if self.starts is None else self.starts.rivals
         for p, more in rivals[:2]:
-            other, sign = ", ".join(said([f"{v:.4g}" for v in p])), "-" if more < 0 else "+"
-            lines.append(f"  ANOTHER MINIMUM, chi2 {sign} {abs(more):.3g}: {other}")
+            other = ", ".join(said([f"{v:.4g}" for v in p]))
+            # a better minimum is the result, unless it takes the poles for those of other modes
+            kind, sign = ("OTHER MODE NUMBERS", "-") if more < 0 else ("ANOTHER MINIMUM", "+")
+            lines.append(f"  {kind}, chi2 {sign} {abs(more):.3g}: {other}")
         if self.discrepancy:
             off = f"{self.discrepancy_text} (relative)"
             lines.append(f"  model error in addition to noise: {off}; the +- include it")
