@@ -98,7 +98,7 @@ def solved(model: fx.FEModel, count: int) -> fx.Modes:
 # %% Identify: x and y do not mix on this machine, so each has its own poles
 def identified(frf: fx.Frf, drawing: fx.Modes) -> fx.MeasuredModes:
     """Return the measured poles with the numbers of the drawing's modes."""
-    found = []
+    found = {}
     for axis in ("x", "y"):
         part = frf.select(
             outputs=[name for name in frf.outputs if name.endswith(axis)],
@@ -106,14 +106,8 @@ def identified(frf: fx.Frf, drawing: fx.Modes) -> fx.MeasuredModes:
         )
         at = {name: name.removeprefix("u ") for name in (*part.outputs, *part.inputs)}
         modes = fx.identify_modes(part, band=BAND, dofs=at)
-        found.append(fx.numbered(modes, drawing, partial=True))
-    poles, modes = (np.concatenate([getattr(one, n) for one in found]) for n in ("poles", "modes"))
-    m, first = len(modes), len(found[0].poles)
-    both = np.zeros((2, m, 2, m))  # of real and imaginary parts of all poles
-    for one, part in zip(found, (slice(first), slice(first, m)), strict=True):
-        count = len(one.poles)
-        both[:, part, :, part] = one.covariance.reshape(2, count, 2, count)
-    return fx.MeasuredModes(poles, modes=modes.tolist(), covariance=both.reshape(2 * m, 2 * m))
+        found[axis] = fx.numbered(modes, drawing, partial=True)
+    return found["x"].merged(found["y"])
 
 
 # %% Update: which parameters explain the measured poles?

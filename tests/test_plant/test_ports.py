@@ -184,9 +184,27 @@ def test_other_kinds_are_refused_at_the_door(make, words):
 
 def test_the_axes_of_a_poi_replace_the_direction_of_its_label():
     two = chain(masses=[1.0, 1.0], stiffnesses=[1e3])
-    poi = Poi("die", at="2:x")
+    poi = Poi("die", at="2:x", axes=("z",))
     with pytest.raises(LabelError, match=r"at '2:x' with the axes \('z',\), .* no DOF '2:z'"):
         assemble_plant(two, Ports(w=[Disturbance("d", at="1:x")], z=[poi]))
+
+
+@pytest.mark.parametrize(
+    ("at", "axis"),
+    [
+        ("2:x", "x"),
+        ("2:rz", "rz"),
+        ((0.1, 0.2, 0.0), "z"),
+        ({"2:x": 1.0, "1:x": -1.0, "1:ry": -0.2}, "x"),
+        ({"1:ry": -0.2, "2:y": 1.0}, "y"),
+        ({"2:rx": 1.0, "1:rx": -1.0}, "rx"),
+        ({(0.1, 0.0, 0.0): 0.5, (0.2, 0.0, 0.0): 0.5}, "z"),
+    ],
+)
+def test_a_poi_without_axes_is_named_by_the_direction_of_its_place(at, axis):
+    poi = Poi("tool", at=at)
+    assert tuple(poi.axes) == (axis,)
+    assert poi.channel(axis) == f"tool:{axis}"
 
 
 def test_an_actuator_and_a_sensor_of_one_name_are_refused_where_the_plant_is_made():

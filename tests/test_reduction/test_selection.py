@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -186,9 +187,46 @@ def test_complex_modes_are_distinguished_as_they_are(criterion):
     assert chosen.condition < 30
 
 
-def test_a_mode_that_only_turns_asks_for_rotations_as_candidates():
+def test_a_mode_that_only_turns_is_kept_by_a_rotation():
     dofs = DofSet([1, 1, 2], ["x", "ry", "x"], [[0, 0, 0], [0, 0, 0], [1, 0, 0]])
     modes = solve_modes(FEModel(np.eye(3), np.diag([1e4, 2e3, 3e4]), dofs=dofs), count=2)
-    with pytest.raises(ModelError, match=r"candidates=modes\.dofs\.labels"):
-        select_dofs(modes, 2)
-    assert set(select_dofs(modes, 2, candidates=modes.dofs.labels).labels) == {"1:x", "1:ry"}
+    with pytest.raises(ModelError, match=r"such as modes\.dofs\.labels"):
+        select_dofs(modes, 2, candidates=["1:x", "2:x"])
+    assert set(select_dofs(modes, 2).labels) == {"1:x", "1:ry"}
+    with pytest.raises(ModelError, match=r"Take 1:ry in place of 2:x: condition 1\."):
+        reduce(modes, DesiredDofs(["1:x", "2:x"]))
+
+
+def bodies(seed):
+    """Two or three rigid bodies with six DOFs each, on six springs at random corners each."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 4))
+    n = 6 * count
+    K = np.zeros((n, n))
+    for body in range(count):
+        for _ in range(8):
+            arm, along = rng.normal(size=3), rng.normal(size=3)
+            row = np.zeros(n)
+            row[6 * body : 6 * body + 6] = np.append(along, np.cross(arm, along))
+            if body:
+                row[6 * body - 6 : 6 * body] = -row[6 * body : 6 * body + 6]
+            K += 10 ** rng.uniform(4, 7) * np.outer(row, row)
+    M = np.diag(np.tile([5.0, 5.0, 5.0, 0.1, 0.2, 0.3], count))
+    nodes = np.repeat(np.arange(1, count + 1), 6)
+    places = np.repeat(rng.normal(size=(count, 3)), 6, axis=0)
+    dofs = DofSet(nodes, ["x", "y", "z", "rx", "ry", "rz"] * count, places)
+    return FEModel(M, K, dofs=dofs)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rotations_are_chosen_where_displacements_do_not_distinguish_the_modes(seed):
+    model = bodies(seed)
+    modes = solve_modes(model, count=model.n_dof - 2)
+    chosen = select_dofs(modes, modes.n_modes)
+    assert any(":r" in label for label in chosen.labels)
+    kept = la.eigh(model.K, model.M, eigvals_only=True)[: modes.n_modes]
+    small = reduce(modes, DesiredDofs(chosen.labels))
+    np.testing.assert_allclose(la.eigh(small.K, small.M, eigvals_only=True), kept, rtol=1e-6)
+    few = solve_modes(model, count=3)
+    straight = [label for label in model.dofs.labels if ":r" not in label]
+    assert set(select_dofs(few, 3).labels) <= set(straight)

@@ -281,3 +281,46 @@ def test_slow_modes_that_limit_nothing_end_no_search(seed):
     found = judged(plant, fx.design_stage(plant, progress=False))
     assert found.serves(0.7 * servo)
     assert np.interp(0.7 * servo, found.freq, found.S[0]) < 1.0
+
+
+def isolated(more=()):
+    """A carriage with a tool, on a base on isolators (1.5 Hz); `more`: masses along y on springs.
+
+    The springs of `more` are in Hz: masses of 3 kg, which neither motor nor encoder touches.
+    """
+    base, carriage, tool = 400.0, 20.0, 2.0
+    masses = np.array([base, carriage, tool, *[3.0] * len(more)])
+    n = masses.size
+    stiffness = {(0,): base * (3.0 * np.pi) ** 2, (1, 2): tool * (240.0 * np.pi) ** 2}
+    stiffness |= {(3 + i,): 3.0 * (2.0 * np.pi * hertz) ** 2 for i, hertz in enumerate(more)}
+    K = np.zeros((n, n))
+    for ends, k in stiffness.items():
+        row = np.zeros(n)
+        row[list(ends)] = [1.0, -1.0][: len(ends)]
+        K += k * np.outer(row, row)
+    nodes = np.arange(1, n + 1)
+    dofs = fx.DofSet(nodes, ["x"] * 3 + ["y"] * len(more), [[n, 0.0, 0.0] for n in nodes])
+    model = fx.structure.sliding(FEModel(np.diag(masses), K, dofs=dofs))
+    modes = solve_modes(model, count=n, damping=ModalDamping(0.01))
+    relative = {"2:x": 1.0, "1:x": -1.0}
+    channels = fx.Ports(
+        w=[fx.Disturbance("cable", at="2:x", asd=1e-2)],
+        u=[fx.Actuator("motor", at=relative)],
+        z=[fx.Poi("tool", at={"3:x": 1.0, "1:x": -1.0}, axes=("x",))],
+        y=[fx.Sensor("encoder", at=relative, asd=1e-10)],
+        references=[fx.Reference("tool")],
+    )
+    return fx.assemble_plant(modes, channels, evaluation=modes).discretized(4e3, delay=1.0)
+
+
+@pytest.mark.long
+def test_modes_that_nothing_touches_are_left_out_of_a_design():
+    alone = fx.design_stage(isolated(), bandwidth=15.0)
+    found = fx.design_stage(isolated(more=(1.1, 20.0, 119.0, 121.0)), bandwidth=15.0)
+    assert any(note.startswith("without modes 2, ") for note in found.notes)
+    assert not any(note.startswith("without") for note in alone.notes)
+    freq = np.geomspace(1.0, 1e3, 200)
+    one, other = (fx.frequency_response(c.system, freq) for c in (alone, found))
+    np.testing.assert_allclose(
+        np.abs(other["motor", "encoder"]), np.abs(one["motor", "encoder"]), rtol=0.02
+    )

@@ -23,7 +23,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..store import Value
-from ..tolerances import TINY
+from ..tolerances import ROUNDING
 from .estimator_channels import sensors
 
 #: weight of a different shape relative to a different frequency when modes are paired
@@ -187,7 +187,12 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
 def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
     """Return the common modes of both, by frequency and compliance."""
     one, two = kept.static[genuine], every.static
-    size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
+    # what no mode passes from a force to a motion is rounding, which distinguishes no modes
+    root = np.sqrt(np.abs(every.poles))
+    seen = np.max(np.abs(every.see) / root, axis=(1, 2), initial=0.0)
+    driven = np.max(np.abs(every.push) / root[:, :, None], axis=(0, 1), initial=0.0)
+    size = np.abs(two).max(axis=0, initial=0.0)
+    size = np.where(size > ROUNDING * np.outer(seen, driven), size, np.inf)
     one, two = ((part / size).reshape(len(part), size.size) for part in (one, two))
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
     alike = np.abs(one @ two.T) / divisor(lengths)

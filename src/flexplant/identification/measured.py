@@ -219,6 +219,59 @@ class MeasuredModes(Value):
             )
         return self.replace(**self._picked(places))
 
+    def merged(self, other: MeasuredModes) -> MeasuredModes:
+        """Return the modes of two measurements: of two bands, directions or sets of sensors.
+
+        A mode that both contain is taken from `other`. The errors of the two are independent. The
+        result has a covariance if both have one, and mode shapes if both have them at the same
+        DOFs.
+
+        Parameters
+        ----------
+        other : MeasuredModes
+            The other measurement, with mode numbers, as this one has them.
+
+        Raises
+        ------
+        ModelError
+            When one of them has no mode numbers.
+
+        Examples
+        --------
+        >>> low = MeasuredModes([-1 + 20j, -2 + 30j], modes=[1, 2])
+        >>> low.merged(MeasuredModes([-2 + 31j, -9 + 900j], modes=[2, 7]))
+        <MeasuredModes: 3 poles, modes 1, 2, 7 at 3.2, 4.9, 143.2 Hz>
+        """
+        instance(other, MeasuredModes, "other", "Pass numbered(identify_modes(frf), model).")
+        if self.modes is None or other.modes is None:
+            raise ModelError(
+                "measurements are merged by their mode numbers, which one of them lacks: pass "
+                "numbered(measured, model), or MeasuredModes(poles, modes=[...])."
+            )
+        own = [i for i, number in enumerate(self.modes) if number not in other.modes]
+        if not own:
+            return other
+        parts: list[MeasuredModes] = [MeasuredModes.select(self, own), other]
+        sizes = [len(part) for part in parts]
+        covariance = None
+        if all(part.covariance is not None for part in parts):
+            halves = np.array_split(np.arange(2 * sum(sizes)), 2)
+            order = [half[at] for at in (np.s_[: sizes[0]], np.s_[sizes[0] :]) for half in halves]
+            both = np.concatenate(order)
+            covariance = np.zeros((both.size, both.size))
+            blocks: list[Any] = [part.covariance for part in parts]
+            covariance[np.ix_(both, both)] = la.block_diag(*blocks)
+        found = MeasuredModes(
+            np.concatenate([part.poles for part in parts]),
+            modes=[number for part in parts for number in part.modes or ()],
+            covariance=covariance,
+        )
+        if self.dofs is None or self.dofs != other.dofs:
+            return found
+        shapes: list[Any] = [part.shapes for part in parts]
+        places = {"dofs": other.dofs, "xyz": other.xyz, "directions": other.directions}
+        return found.replace(shapes=np.hstack(shapes), **places)
+
     def _picked(self, places: list[int]) -> dict[str, Any]:
         both = np.array(places + [place + len(self) for place in places])
         return {

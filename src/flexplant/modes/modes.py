@@ -165,6 +165,11 @@ def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]
     return np.asarray(numbers, dtype=np.int64) - 1, np.asarray(poles, dtype=np.complex128)
 
 
+def calibration_of(model: Any, measured: Any) -> Any:
+    """Return all measured poles of a model: those of earlier calibrations, and new ones."""
+    return measured if model.calibration is None else model.calibration.merged(measured)
+
+
 def calibrated_matrices(
     M: FloatArray, D: FloatArray, K: FloatArray, n_rigid: int, places: IntArray, poles: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -476,7 +481,7 @@ class Modes(Placed, Value):
             certificate=Certificate(),
             residual=(),
             rounding=(),
-            calibration=measured,
+            calibration=calibration_of(self, measured),
         )
 
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, between, whole
-from ..errors import AssumptionError, ModelError
+from ..errors import AssumptionError, ModelError, some_names
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..tolerances import INTERVAL
 from ..updating import FrfResidual
@@ -23,6 +23,7 @@ from .remade import MachineParts
 from .uncertainty.delta import with_changes
 from .uncertainty.mode_delta import ModeDelta
 from .uncertainty.parameter_amounts import ParameterDelta
+from .visibility import untouched_modes
 
 
 class FigureInterval(NamedTuple):
@@ -48,14 +49,30 @@ class FigureInterval(NamedTuple):
 
 
 def fitted_machines(plant: Any) -> Machines | None:
-    """Return the machines of a plant's fit, stated or that of its model; None without any."""
+    """Return the machines of a plant's fit, stated or that of its model; None without any.
+
+    Where modes that the plant's channels do not touch prevent intervals, these are left out.
+    """
     if plant.evaluation is None:
         return None
-    for kind in () if plant.uncertainty is None else plant.uncertainty.kinds:
-        if isinstance(source := getattr(kind, "source", None), Machines):
-            return source
-    found = getattr(plant.model, "machines", None)
-    return found if isinstance(found, Machines) else None
+    stated = () if plant.uncertainty is None else plant.uncertainty.kinds
+    sources = (getattr(kind, "source", None) for kind in stated)
+    for found in (*sources, getattr(plant.model, "machines", None)):
+        if isinstance(found, Machines):
+            return found.without(_untouched(plant, found)) if found.missing else found
+    return None
+
+
+def _untouched(plant: Any, machines: Machines) -> tuple[int, ...]:
+    """Return the untouched modes of a plant, by their numbers in the model that was fitted."""
+    freq = np.array(machines.fit.model.modes().freq)
+    places = np.array(machines.measured.modes) - 1
+    if freq.size != plant.assembled.realisation.n_modes or places.max() >= freq.size:
+        return ()
+    # calibration puts modes in another order where measured frequencies cross
+    freq[places] = machines.measured.freq
+    order = np.argsort(freq, kind="stable")
+    return tuple(sorted(int(order[number - 1]) + 1 for number in untouched_modes(plant)))
 
 
 def fitted_response(plant: Any) -> MeasuredResponse | None:
@@ -110,6 +127,13 @@ class PlantMachines:
         if self.fit is None:
             return ""
         return self.fit.missing or obstacle(self._base.assembled.realisation)
+
+    @property
+    def left_out(self) -> str:
+        """Remark for an interval that is of some modes only; otherwise empty."""
+        numbers = [] if self.fit is None else [*map(str, self.fit.left_out)]
+        named = f"mode{'s' * (len(numbers) > 1)} {some_names(numbers, total=False)}"
+        return f" (without {named}, which the channels do not touch)" if numbers else ""
 
     @cached_property
     def plants(self) -> list[Any]:
@@ -264,6 +288,7 @@ def interval(
         return FigureInterval(None, None, f"no interval: {error}")
     outside = own is not None and not low <= own <= high
     but = f" ({with_unit(own or 0.0, unit or None)} on the design model)" if outside else ""
+    but += machines.left_out
     return FigureInterval(
         low,
         high,

@@ -108,7 +108,9 @@ class Poi(Value):
         an example is ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``.
     axes : sequence of str
         Motions among x, y, z [m], rx, ry, rz [rad]; a Reference uses the first one unless it names
-        others. Labels in a weighted sum keep their own directions.
+        others. By default the direction of the label, that of the first translation (or else
+        rotation) in a weighted sum, and z at a point. Labels in a weighted sum keep their own
+        directions.
     absolute : bool
         Whether its motion is absolute, so that it includes the motion of a BaseAcceleration, or
         relative to the floor.
@@ -127,15 +129,13 @@ class Poi(Value):
     home: ClassVar = "z"
     name: str
     at: Place
-    axes: Sequence[str] = ("z",)
+    axes: Sequence[str] = ()
     absolute: bool = False
     moves: Any = None
 
     def __post_init__(self) -> None:
-        axes = name_list(self.axes, f"axes of POI {self.name!r}")
+        axes = name_list(self.axes, f"axes of POI {self.name!r}") or _directions_of(self.at)[:1]
         require_known(f"axis of POI {self.name!r}", axes, DIRECTIONS)
-        if not axes:
-            raise LabelError(f"POI {self.name!r} has no axes: name at least one, such as ('z',).")
         check_names(axes, f"axes of POI {self.name!r}")
         if isinstance(self.at, Mapping) and len(axes) > 1:
             raise LabelError(
@@ -183,6 +183,14 @@ class Poi(Value):
     def _at(self, axis: str) -> Place:
         """Return the place of an axis: of a label the direction is replaced."""
         return f"{self.at.split(':')[0]}:{axis}" if isinstance(self.at, str) else self.at
+
+
+def _directions_of(at: Place) -> tuple[str, ...]:
+    """Return the directions of a place that has labels, translations first; z for points."""
+    labels = [at] if isinstance(at, str) else [*at] if isinstance(at, Mapping) else []
+    named = [label.rpartition(":")[2] for label in labels if isinstance(label, str)]
+    known = [direction for direction in named if direction in DIRECTIONS]
+    return (*sorted(known, key=lambda direction: direction[:1] == "r"), "z")
 
 
 #: what each side holds

@@ -12,7 +12,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..lti.blocks_of_states import block_diagonal
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import SAME, TINY
+from ..tolerances import SAME, TINY, TYPED
 from .partitioned import PartitionedSystem
 from .realisation import natural
 
@@ -159,6 +159,19 @@ def mode_visibility(plant: PartitionedSystem) -> tuple[ModeVisibility, ...]:
             {side: each[k] for side, each in best.items()},
         )
         for k in range(omega.size)
+    )
+
+
+def untouched_modes(
+    plant: PartitionedSystem, *, inputs: str = "wu", outputs: str = "zy"
+) -> tuple[int, ...]:
+    """Return the numbers of elastic modes that no input moves, or no output sees."""
+    # the asymmetry of a symmetric structure whose matrices were typed does not touch a mode
+    seen = ((mode.mode, mode.shares.get) for mode in mode_visibility(plant))
+    return tuple(
+        number
+        for number, share in seen
+        if min(max(share(side, 0.0) for side in sides) for sides in (inputs, outputs)) < TYPED
     )
 
 

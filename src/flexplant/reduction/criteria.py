@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray, divisor, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
 from ..store import Value
-from ..tolerances import ROUNDING, TINY
+from ..tolerances import ROUNDING, TINY, TYPED
 from ..words import instance, name_list
 
 #: shapes at DOFs, real or complex
@@ -263,6 +263,16 @@ class DofSelection(Value):
         return len(self.labels)
 
 
+def _candidates(modes: Modes) -> list[str]:
+    """Return the displacements, or all labels where displacements do not distinguish the modes."""
+    straight = [label for label in modes.dofs.labels if ":r" not in label]
+    if len(straight) == len(modes.dofs):
+        return straight
+    rows = modes.basis[modes.dofs.indices(straight)]
+    sizes = la.eigvalsh(rows.conj().T @ rows)
+    return straight if sizes[0] > TYPED**2 * sizes[-1] else list(modes.dofs.labels)
+
+
 def select_dofs(
     modes: Modes,
     count: int,
@@ -285,7 +295,8 @@ def select_dofs(
         Number of DOFs, at most the number of modes plus the number of attachment vectors. With
         exactly this sum, `DesiredDofs` keeps all modes. With fewer DOFs, it keeps fewer modes.
     candidates : iterable of str, optional
-        Labels to choose from. None: all displacements, but no rotations.
+        Labels to choose from. None: all displacements, and the rotations too where displacements
+        do not distinguish the modes, as of bodies that turn.
     required : iterable of str
         DOFs that are kept in any case.
     criterion : PivotedQr, EffectiveIndependence or Greedy, optional
@@ -318,8 +329,7 @@ def select_dofs(
     kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):
         raise LabelError(f"required DOFs appear twice: {kept}.")
-    straight = [label for label in modes.dofs.labels if ":r" not in label]
-    pool = straight if candidates is None else name_list(candidates, "candidates")
+    pool = _candidates(modes) if candidates is None else name_list(candidates, "candidates")
     pool = [label for label in dict.fromkeys(pool) if label not in set(kept)]
     rows, open_rows = modes.dofs.indices(kept), modes.dofs.indices(pool)
     k = basis.shape[1]
@@ -332,8 +342,8 @@ def select_dofs(
     missing = number - len(kept)
     if missing > len(pool):
         raise ShapeError(
-            f"{missing} DOFs are wanted, but there are {len(pool)} candidates: name more "
-            "candidates."
+            f"{missing} DOFs are wanted, but there are {len(pool)} candidates: name more, "
+            "candidates=modes.dofs.labels for all."
         )
     taken = rule.chosen(basis[rows], basis[open_rows], missing) if missing else []
     chosen = kept + [pool[i] for i in taken]
@@ -343,13 +353,8 @@ def select_dofs(
     if not singular[-1] * top > singular[0]:
         raise ModelError(
             f"no {number} of these DOFs distinguish the modes (condition above {top:.3g}): the "
-            "required ones depend on each other, or all candidates lie on node lines. "
-            + (
-                "Without candidates= only displacements are tried: modes in which a body turns "
-                "about its node need rotations, candidates=modes.dofs.labels."
-                if candidates is None and len(straight) < len(modes.dofs)
-                else "Name other candidates."
-            )
+            "required ones depend on each other, or all candidates lie on node lines. Name other "
+            "candidates, such as modes.dofs.labels."
         )
     condition = float(singular[0] / singular[-1])
     return DofSelection(tuple(chosen), condition, rule.values(picked), rule)

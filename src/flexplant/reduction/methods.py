@@ -360,7 +360,7 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
         with attempted(f"a choice of {k - len(kept)} of {len(candidates)} DOFs"):
             held, free = basis[dofs.indices(kept)], basis[dofs.indices(candidates)]
             taken = PivotedQr().chosen(held, free, k - len(kept))
-        if taken is None:
+        if taken is None or len(taken) < k - len(kept):
             continue
         fresh = [candidates[i] for i in taken]
         values = la.svdvals(basis[dofs.indices([*kept, *fresh])])

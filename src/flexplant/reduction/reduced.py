@@ -13,7 +13,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
+from ..modes.modes import Modes, calibrated_matrices, calibration_of, measured_poles, require_real
 from ..modes.normal_forms import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
@@ -287,6 +287,7 @@ class ReducedModel(Value):
         ----------
         measured : MeasuredModes
             Measured poles with their mode numbers, which count from 1 and include rigid-body modes.
+            A model can be calibrated by several measurements, one after the other.
 
         Raises
         ------
@@ -305,7 +306,10 @@ class ReducedModel(Value):
         free = self.rigid_body.shape[1]
         places, poles = measured_poles(measured, range(free + 1, self.n_dof - self.n_vectors + 1))
         D, K = calibrated_matrices(self.M, self.D, self.K, free, places, poles)
-        return self.replace(D=D, K=K, bound=None, calibration=measured)
+        known, machines = calibration_of(self, measured), self.machines
+        if machines is not None:  # those of the fit agree with all that was measured
+            machines = machines.replace(measured=known)
+        return self.replace(D=D, K=K, bound=None, calibration=known, machines=machines)
 
     def completed(self) -> ReducedModel:
         """Return the model with the truncated modes as further coordinates.

@@ -13,6 +13,7 @@ from ..arrays import FloatArray, whole
 from ..errors import ModelError, counted
 from ..identification import MeasuredModes
 from ..modes import Modes
+from ..modes.matching import ALIKE
 from ..seeds import REFUSED
 from ..store import Value
 from ..tolerances import TYPED
@@ -78,6 +79,9 @@ class Machines(Value):
         Number of machines that are drawn for the interval of a result.
     seed : int
         Seed of the random draws. Machine i is the same for every `count`.
+    left_out : sequence of int
+        Numbers of modes that do not matter: they need no measurement, and their measured poles are
+        not used. `left_out` is set by plants (see `StandardPlant.machines`).
 
     Examples
     --------
@@ -96,6 +100,7 @@ class Machines(Value):
     measured: MeasuredModes
     count: int = COUNT
     seed: int = 0
+    left_out: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         instance(self.measured, MeasuredModes, "measured", "Pass identify_modes(frf), numbered.")
@@ -106,12 +111,35 @@ class Machines(Value):
     @cached_property
     def trend(self) -> Trend:
         """Test for a residual of measured frequencies that grows with frequency; see `Trend`."""
-        return trend_of(self.fit, self.measured)
+        return trend_of(self.fit, self.measured, self.left_out)
 
     @cached_property
     def missing(self) -> str:
         """Reason why no interval of a result can be computed. It is empty if this is possible."""
         return self.trend.missing or next(iter(self.fit.unlike_shapes(self.measured)), "")
+
+    def without(self, untouched: tuple[int, ...]) -> Machines:
+        """Return the machines without those modes in the way of an interval that do not matter."""
+        known: dict[tuple[int, ...], Machines] = self.__dict__.setdefault("_without", {})
+        if untouched not in known:
+            found = self
+            while causes := {*found._causes} & {*untouched} - {*found.left_out}:
+                numbers = found.measured.modes or ()
+                kept = [i for i, number in enumerate(numbers) if number not in causes]
+                if not kept:
+                    break
+                out = tuple(sorted({*found.left_out, *causes}))
+                found = found.replace(measured=found.measured.select(kept), left_out=out)
+            known[untouched] = found
+        return known[untouched]
+
+    @property
+    def _causes(self) -> tuple[int, ...]:
+        """Numbers of the modes that prevent an interval."""
+        if self.trend.missing:
+            return self.trend.in_the_way
+        likeness = self.fit.likeness(self.measured)
+        return tuple(mode for mode, mac in likeness.items() if mac < ALIKE)
 
     @cached_property
     def damping_changes(self) -> FloatArray:

@@ -154,7 +154,9 @@ class _Tried:
     def _paired_as_named(self, end: SearchEnd) -> bool:
         """Return whether the modes of a better end are paired as from the given start."""
         best = self.best
-        if best is None or not best.named or end.cost >= (1 - TYPED) * best.end.cost:
+        if best is None or not (best.named and end.converged):
+            return False
+        if end.cost >= (1 - TYPED) * best.end.cost:
             return False
         there = self.objective.at(end.p)
         line = np.linspace(best.end.p, end.p, GLANCE)[1:]

@@ -190,36 +190,46 @@ class Trend(Value):
     @property
     def missing(self) -> str:
         """Reason why the uncertainty of machines cannot be computed, or an empty text if it can."""
+        return self._obstacle[0]
+
+    @property
+    def in_the_way(self) -> tuple[int, ...]:
+        """Numbers of the modes for which the uncertainty of machines cannot be computed."""
+        return self._obstacle[1]
+
+    @property
+    def _obstacle(self) -> tuple[str, tuple[int, ...]]:
+        """The reason in words, and the modes that cause it."""
         q = self.S.shape[1]
         if self.dof < 1:
             return (
                 f"{len(self.modes)} measured frequencies are too few for {q} parameters, a trend "
                 f"and a judgement: measure {q + 2} modes or more"
-            )
+            ), ()
         if self.outlier is not None:
             mode, off = self.outlier
             return (
                 f"mode {mode} deviates by {100 * off:+.2g} % from the other modes: its number "
                 "may be wrong, or its pole does not belong to this structure"
-            )
+            ), (mode,)
         if self.is_significant:
             return (
                 f"the model neglects an effect that grows with frequency ({self.text}): shear, "
                 "rotary inertia or smaller elements"
-            )
+            ), ()
         if self.half_measured_pairs:
             mode, other = self.half_measured_pairs[0]
             return (
                 f"mode {other} was not measured, and mode {mode}, which is close to it, may be a "
                 "mixture of both: measure both, or number them with a smaller least_mac="
-            )
+            ), (mode, other)
         if self.unshaped_pairs:
             pairs = ", ".join(f"{a} and {b}" for a, b in self.unshaped_pairs)
             return (
                 f"modes {pairs} may be swapped: measure their shapes, numbered(identify_modes(frf),"
                 " model, at=...)"
-            )
-        return ""
+            ), tuple(mode for pair in self.unshaped_pairs for mode in pair)
+        return "", ()
 
     @property
     def text(self) -> str:
@@ -251,8 +261,8 @@ class Trend(Value):
         return f"<Trend: {self.text}, {held} (p {self.p_value:.2g}, {self.dof} dof)>"
 
 
-def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
-    """Return the trend of a fit's model over measured modes."""
+def trend_of(fit: Any, measured: MeasuredModes, left_out: tuple[int, ...] = ()) -> Trend:
+    """Return the trend of a fit's model over measured modes; some others need no measurement."""
     about = [q.about(v) for q, v in zip(fit.unknowns, fit.values.tolist(), strict=True)]
     numbers = measured.modes
     if numbers is None:
@@ -266,14 +276,15 @@ def trend_of(fit: Any, measured: MeasuredModes) -> Trend:
     relative, std = np.real(S / poles[:, None]), measured.std
     size = np.abs(relative).max(axis=0, initial=0.0) * _amounts(fit)
     moves = np.flatnonzero(size > ROUNDING * np.max(size, initial=0.0))
+    freq = np.abs(measured.poles) / (2 * np.pi)
     return Trend(
         tuple(numbers),
-        np.abs(measured.poles) / (2 * np.pi),
+        freq,
         np.abs(poles) / (2 * np.pi),
         relative[:, moves],
         tuple(moves.tolist()),
         measured.shapes is not None,
-        *_unmeasured(fit, numbers, float(np.max(np.abs(measured.poles))) / (2 * np.pi)),
+        *_unmeasured(fit, (*numbers, *left_out), float(np.max(freq))),
         np.zeros(len(numbers)) if std is None else std.imag / np.abs(measured.poles),
     )
 

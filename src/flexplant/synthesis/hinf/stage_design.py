@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import positive
 from ...certificates import Certificate, Verified
-from ...errors import InfeasibleError, ModelError, SolverError
+from ...errors import InfeasibleError, ModelError, SolverError, some_names
 from ...loop import ClosedLoop, close_loop
 from ...loop.machine_figures import axis_bandwidths
 from ...loop.other_machines import BEYOND, mode_tolerances
@@ -24,6 +24,7 @@ from ...plant.realisation import natural
 from ...plant.uncertainty.frequencies import Frequencies
 from ...plant.uncertainty.mode_delta import DampingDelta
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
+from ...plant.visibility import untouched_modes
 from ...updating.residuals.modal_residuals import USUAL
 from ..controller import Controller
 from ..pipeline import Design, Solution, designed, solved, verified
@@ -91,7 +92,8 @@ def design_stage(
         Continuous or sampled plant of a machine that follows references, or that is held at rest
         (without references). If no uncertainty is stated, all frequencies are uncertain by 0.5 %.
         ``plant.uncertain(frequency={...})`` and ``plant.uncertain(fit)`` are more accurate. The
-        design itself uses only the uncertainties of the frequencies.
+        design itself uses only the uncertainties of the frequencies. A mode that
+        no actuator moves or no sensor sees is left out.
     bandwidth : float [Hz], optional
         Bandwidth of the loop; by default the largest possible one. It is the frequency at which |S|
         from reference to error crosses 1 on the slowest axis. The weights are adjusted until the
@@ -136,21 +138,23 @@ def design_stage(
     known = given.uncertainty
     stated = known is not None and any(isinstance(kind, Frequencies) for kind in known.kinds)
     uncertain = given.uncertain(frequency=0.005) if known is None else known
+    untouched = untouched_modes(uncertain.plant.machine, inputs="u", outputs="y")
+    ranges = {n: off for n, off in uncertain.frequencies.items() if n not in untouched}
     margin = positive(margin, "margin")
     wanted = None if bandwidth is None else positive(bandwidth, "bandwidth")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
-    if not uncertain.frequencies:
+    if not ranges:
         raise ModelError(
-            f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
-            "plant.uncertain(frequency=0.005)."
+            f"no frequency of {uncertain!r} is uncertain, of a mode that the actuators move and "
+            "the sensors see: nothing limits the bandwidth. Pass plant.uncertain(frequency=0.005)."
         )
     weights = partial(
         stage_weights, uncertain.nominal, poi=poi, disturbance=disturbance, effort=effort
     )
     own = uncertain.plant
     errors = reference_errors(own, poi=poi) if own.assembled.ports.references else None
-    task = _StageTask(uncertain, stated, margin, weights, errors, wanted, progress)
+    task = _StageTask(uncertain, ranges, stated, margin, weights, errors, wanted, progress)
     return designed(task, own, own)
 
 
@@ -159,6 +163,8 @@ class _StageTask(Design):
     """The designs of rising bandwidths and their results."""
 
     uncertain: UncertainPlant[Any]
+    #: relative errors of the frequencies of modes that the actuators move and the sensors see
+    ranges: dict[int, float]
     stated: bool
     margin: float
     #: those of a bandwidth [Hz]
@@ -170,7 +176,7 @@ class _StageTask(Design):
     progress: bool | None
 
     def __post_init__(self) -> None:
-        self.ranges, self.plant = self.uncertain.frequencies, self.uncertain.plant
+        self.plant = self.uncertain.plant
         #: with the truncated modes: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
         pairs = self.plant.assembled.realisation.pairs[np.array(sorted(self.ranges)) - 1]
@@ -234,9 +240,18 @@ class _StageTask(Design):
             system=solution.K,
             method="H-infinity of a stage",
             certificate=Certificate((*answer.certificate.checks, *checks)),
+            notes=(*answer.notes, *self._without()),
             tried=Certificate(tuple(tries)),
             reached=Certificate(),
         )
+
+    def _without(self) -> list[str]:
+        """Return a note on the uncertain modes that do not matter to the loop."""
+        left = [str(mode) for mode in self.uncertain.frequencies if mode not in self.ranges]
+        if not left:
+            return []
+        named = f"mode{'s' * (len(left) > 1)} {some_names(left, total=False)}"
+        return [f"without {named}, which the actuators do not move or the sensors do not see"]
 
     def _fitted(self) -> Iterator[AnyPlant] | None:
         """Return machines that agree with the measurement of a fit, None where it is not known."""
@@ -362,7 +377,7 @@ class _StageTask(Design):
 
     def search(self, bar: Progress) -> None:
         """Try rising bandwidths until one fails, or falling ones until one holds; then between."""
-        # the first bandwidth is of the first mode of uncertain frequency
+        # the first bandwidth is of the first mode that matters
         now = min(_FIRST * float(self.frequencies[0]) / _CROSSES, self.highest)
         up = self.holds(now)
         step = _STEP
