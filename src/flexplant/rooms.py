@@ -43,7 +43,7 @@ def hint(name: str) -> str:
     package = sys.modules["flexplant"]
     rooms = [one for one in package.__all__ if isinstance(getattr(package, one), ModuleType)]
     homes = [f"flexplant.{room}" for room in rooms if name in dir(getattr(package, room))]
-    homes += ["flexplant"] if name in package.__all__ else []
+    homes = ["flexplant"] if name in package.__all__ else homes
     where = "".join(f" Use {home}.{name}." for home in homes)
     ours = OURS.get(name)
     return where or (f" What MATLAB or python-control call so is flexplant.{ours}." if ours else "")

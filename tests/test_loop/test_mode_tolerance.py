@@ -220,11 +220,12 @@ def test_a_loop_on_an_uncertain_plant_says_what_its_modes_hold_to():
     certificate = found.tolerances.certificate
     assert certificate[f"mode {mode} holds to"] == pytest.approx(fragile.least[worst], rel=1e-3)
     assert certificate[f"mode {mode} known to"] == 0.001
-    assert f"mode {mode} holds to" in repr(found)
+    assert f"mode {mode} ({fragile.freq[worst]:.4g} Hz) shifted by " in repr(found)
+    assert "(known to 0.1 %)" in repr(found)
     sure = loop().tolerances  # nothing was stated of that plant
     assert sure.known is None
     assert sure.least[worst] == pytest.approx(fragile.least[worst], rel=1e-3)
-    assert f"mode {mode} holds to" in repr(loop())
+    assert f"mode {mode} ({fragile.freq[worst]:.4g} Hz) shifted by " in repr(loop())
 
 
 def radius_around(machine):

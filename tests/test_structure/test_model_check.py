@@ -330,3 +330,35 @@ def test_check_and_solve_modes_judge_alike(given, taken):
     modes = fx.solve_modes(model, count=min(12, model.n_dof))
     assert report.n_zero == report.n_rigid == modes.n_rigid
     assert (report.n_zero, fx.check(model).ok) == (modes.n_rigid, True)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_axis_of_a_link_on_a_pedestal_that_stays_at_rest(seed):
+    """Nodes along x with the DOFs y and rz, one of them held in y, a motor and a pedestal (rz)."""
+    rng = np.random.default_rng(seed)
+    hinge = int(rng.integers(0, 5))
+    xs, height = np.sort(rng.uniform(-1.0, 1.0, 5)), rng.uniform(0.1, 1.0)
+    n = 2 + 2 * len(xs)  # pedestal, motor, then y and rz of the nodes
+    K = np.zeros((n, n))
+
+    def spring(k, entries):
+        row = np.zeros(n)
+        for place, value in entries.items():
+            row[place] += value
+        K[:] += k * np.outer(row, row)
+
+    spring(3e5, {0: 1.0})
+    spring(2e4, {1: 1.0, 3 + 2 * hinge: -1.0})
+    spring(1e7, {2 + 2 * hinge: 1.0})
+    for i, length in enumerate(np.diff(xs)):
+        a, b = 2 + 2 * i, 4 + 2 * i
+        spring(1e4, {a + 1: 1.0, b + 1: -1.0})
+        spring(1e6, {b: 1.0, a: -1.0, a + 1: -length / 2, b + 1: -length / 2})
+    nodes = [1, 2, *np.repeat(np.arange(len(xs)) + 10, 2)]
+    xyz = [[xs[hinge], 0.0, 0.0]] * 2 + [[x, 0.0, height] for x in np.repeat(xs, 2)]
+    dofs = fx.DofSet(nodes, ["rz", "rz"] + ["y", "rz"] * len(xs), xyz)
+    M = np.diag([0.9, 0.6] + [1.0, 0.01] * len(xs))
+    line = str(fx.check(fx.FEModel(M, K, dofs=dofs)))
+    assert f"free to turn about the axis through ({xs[hinge]:.4g}, 0, " in line
+    assert "m along (0, 0, 1); else grounded in y, rx, rz" in line
+    assert "inertia about it   0 (rx)" in line

@@ -515,6 +515,12 @@ def _sizes_agree(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -
 
 def _rows(places: list[Any], modes: Modes) -> FloatArray:
     """Return the entries (n, n_modes) of shapes at places."""
+    for place in places:
+        if isinstance(place, str) and place not in modes.dofs.labels:
+            raise LabelError(
+                f"the model has no DOF {place!r}, a row of the measured shapes. Give its place: "
+                f"numbered(measured, model, at={{{place!r}: place or sensor}})."
+            )
     rows = [
         modes.at(place.at, place.direction) if hasattr(place, "direction") else modes.at(place)
         for place in places

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray
-from ..certificates import one_line
 from ..errors import ModelError, only_one, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
@@ -114,8 +113,7 @@ class ClosedLoop(Value):
         if self.obstacle is None and self.plant.dt and (intervals := interval_line(self)):
             lines.append(f"  {intervals}")
         if self.tolerances is not None:
-            found = self.tolerances.certificate
-            lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
+            lines.append(f"  {self.tolerances.summary}")
         return "\n".join(lines)
 
     @property

@@ -282,6 +282,7 @@ class ModeTolerances(Value):
             f"mode {self.modes[worst]} ({self.freq[worst]:.4g} Hz) shifted by "
             f"{100 * change:+.2g} % "
             f"leads to {to}"
+            + ("" if self.known is None else f" (known to {100 * self.known[worst]:.2g} %)")
         )
 
     @property

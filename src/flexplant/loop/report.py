@@ -328,6 +328,8 @@ def _gain_crossings(
     )
     ends = [*([0] if abs(slope) < _LEVEL else []), *([-1] if sampled else [])]
     ends = [i for i in ends if abs(L[i].imag) < _REAL * abs(L[i].real)]
+    # a change of sign that rounding puts next to an end is that end
+    ends = [i for i in ends if not np.any(np.abs(turns - freq[i]) <= SPLIT * freq[i])]
     reals += [L[i].real for i in ends]
     places = [*turns.tolist(), *(float(freq[i]) for i in ends)]
     found = [(place, 1.0 / float(x)) for place, x in zip(places, reals, strict=True) if x > 0.0]

@@ -508,6 +508,7 @@ def _mass_lines(found: Facts) -> Iterator[Line]:
         yield ("ok", "centre of gravity", f"({at}) m", "")
     turns = np.diag(found.body.inertia)
     if np.isfinite(turns).any():
+        turns = np.where(np.abs(turns) < TYPED * np.nanmax(np.abs(turns)), 0.0, turns)
         of = [
             f"{j:.6g} ({d})" for j, d in zip(turns, DIRECTIONS[3:], strict=True) if np.isfinite(j)
         ]
@@ -547,10 +548,14 @@ def _combined_motions(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
     # a motion `t + w x (r - r_0)` turns about the axis along w through `r_0 + w x t / |w|^2`, and
     # moves along it by `t . w / |w|` per radian
     center = dofs.xyz.mean(axis=0)
-    every = rigid_motions(dofs, center)
     size = float(np.abs(dofs.xyz - center).max()) or 1.0
     unit = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size])
-    made = la.lstsq(every * unit, motions.rigid)[0]
+    every, rigid = rigid_motions(dofs, center) * unit, motions.rigid
+    made = _combined(every, rigid)
+    if np.linalg.norm(every @ made - rigid) > TYPED * np.linalg.norm(rigid):
+        # one part turns, and what carries it stays at rest
+        moving = np.any(np.abs(rigid) > TYPED * np.abs(rigid).max(), axis=1)
+        made = _combined(every[moving], rigid[moving])
     made[[name in motions.free for name in DIRECTIONS]] = 0.0
     basis, sizes, _ = la.svd(made, full_matrices=False)
     basis = basis[:, sizes > TYPED * sizes.max(initial=0.0)]
@@ -558,6 +563,16 @@ def _combined_motions(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
     _, _, pivots = la.qr(basis.T, pivoting=True)
     basis = basis @ la.inv(basis[pivots[: basis.shape[1]]])
     return [_axis(column * unit, center, size) for column in basis.T]
+
+
+def _combined(every: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return coefficients of motions by as few of six rigid-body motions as possible."""
+    Q, R, order = la.qr(every, mode="economic", pivoting=True)
+    size = np.abs(np.diag(R))
+    rank = int(np.count_nonzero(size > TYPED * size[0]))
+    made = np.zeros((every.shape[1], motions.shape[1]))
+    made[order[:rank]] = la.solve_triangular(R[:rank, :rank], Q[:, :rank].T @ motions)
+    return made
 
 
 def _axis(motion: FloatArray, center: FloatArray, size: float) -> str:

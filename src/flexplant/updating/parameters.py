@@ -111,7 +111,7 @@ class PointParameter(Parameter):
     units: ClassVar[tuple[str, str]] = ("", "")
     acts_on: ClassVar[int] = 0
     #: directions that mean several motions
-    together: ClassVar[tuple[str, ...]] = ()
+    together: ClassVar[tuple[str, ...]] = ("xyz",)
 
     def __post_init__(self) -> None:
         require_known("direction", [self.direction], (*DIRECTIONS, *self.together))
@@ -182,9 +182,9 @@ class AddedMass(PointParameter):
         Place of the mass: a DOF label, a point (interpolated between nodes) or {label: weight}. The
         mass has inertia in one direction only, except with "xyz".
     direction : str
-        Direction of the motion at a point. A label contains its direction. With "xyz", the mass has
-        inertia in every translation that the model has, as a `PointMass`. On a plate in bending,
-        this is only z.
+        Direction of the motion at a point. A label contains its direction. With "xyz", the parameter
+        acts along every translation that the model has, as a `PointMass` does. On a plate in
+        bending, this is only z.
     name : str, optional
         Name of the parameter in results. None: the name is made from the place.
     to : str, (3,) array [m] or mapping, optional
@@ -208,7 +208,6 @@ class AddedMass(PointParameter):
     quantity = "mass"
     units = "kg", "kg m^2"
     acts_on = 0
-    together = ("xyz",)
 
 
 class AddedDamping(PointParameter):
