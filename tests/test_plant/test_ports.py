@@ -111,8 +111,6 @@ def test_bad_directions_and_quantities():
         Poi("p", at=P, axes=("z", "rz2"))
     with pytest.raises(LabelError, match=r"no quantity of 'p' 'speed'.*'velocity'"):
         Sensor("p", at=P, quantity="speed")
-    with pytest.raises(LabelError, match="no axes: name at least one"):
-        Poi("p", at=P, axes=())
     with pytest.raises(LabelError, match="more than once"):
         Poi("p", at=P, axes=("z", "z"))
     with pytest.raises(LabelError, match="combination of DOFs, so it has one axis"):

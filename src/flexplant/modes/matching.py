@@ -178,3 +178,8 @@ def groups_alike(alike: FloatArray, spans: Sequence[IntArray] = ()) -> IntArray:
     for i, j in np.argwhere(np.triu(alike > ALIKE, 1)).tolist():
         group[group == group[j]] = group[i]
     return group
+
+
+def calibration_of(model: Any, measured: Any) -> Any:
+    """Return all measured poles of a model: those of earlier calibrations, and new ones."""
+    return measured if model.calibration is None else model.calibration.merged(measured)

@@ -26,7 +26,7 @@ from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
 from ..tolerances import FOUR_DIGITS, MOST_STEPS, RESIDUAL, SAME
 from ..words import instance
-from .matching import pair_modes
+from .matching import calibration_of, pair_modes
 from .normal_forms import pole_pairs
 
 #: largest number of places at which shapes of two meshes are compared
@@ -163,11 +163,6 @@ def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]
         )
     require_known("elastic mode", numbers, known)
     return np.asarray(numbers, dtype=np.int64) - 1, np.asarray(poles, dtype=np.complex128)
-
-
-def calibration_of(model: Any, measured: Any) -> Any:
-    """Return all measured poles of a model: those of earlier calibrations, and new ones."""
-    return measured if model.calibration is None else model.calibration.merged(measured)
 
 
 def calibrated_matrices(

@@ -13,7 +13,8 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, IntArray, complex_array, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..modes.modes import Modes, calibrated_matrices, calibration_of, measured_poles, require_real
+from ..modes.matching import calibration_of
+from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
 from ..modes.normal_forms import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress

@@ -182,9 +182,9 @@ class AddedMass(PointParameter):
         Place of the mass: a DOF label, a point (interpolated between nodes) or {label: weight}. The
         mass has inertia in one direction only, except with "xyz".
     direction : str
-        Direction of the motion at a point. A label contains its direction. With "xyz", the parameter
-        acts along every translation that the model has, as a `PointMass` does. On a plate in
-        bending, this is only z.
+        Direction of the motion at a point. A label contains its direction. With "xyz", the
+        parameter acts along every translation that the model has, as a `PointMass` does. On a plate
+        in bending, this is only z.
     name : str, optional
         Name of the parameter in results. None: the name is made from the place.
     to : str, (3,) array [m] or mapping, optional
