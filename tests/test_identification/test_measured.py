@@ -137,3 +137,37 @@ def test_frequencies_and_dampings_with_their_deviations():
         MeasuredModes.from_freq(f, [1.0, 2.0])
     with pytest.raises(ModelError, match="or neither"):
         MeasuredModes.from_freq(f, z, freq_std=1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_measurements_are_merged_by_mode_number(seed):
+    rng = np.random.default_rng(seed)
+
+    def drawn(numbers):
+        m = len(numbers)
+        root = rng.normal(size=(2 * m, 2 * m))
+        poles = -rng.uniform(1.0, 9.0, m) + 1j * 100.0 * np.array(numbers)
+        shapes = rng.normal(size=(3, m)) + 1j * rng.normal(size=(3, m))
+        covariance = root @ root.T + np.eye(2 * m)
+        labels = ["1:x", "2:x", "3:x"]
+        return MeasuredModes(
+            poles, modes=numbers, covariance=covariance, shapes=shapes, dofs=labels
+        )
+
+    low, high = drawn([4, 2, 3]), drawn([7, 3, 9, 5])
+    both = low.merged(high)
+    assert both.modes == (4, 2, 7, 3, 9, 5)
+    for part, numbers in ((low, [2, 4]), (high, [3, 5, 7, 9])):
+        own, other = (
+            one.select([one.modes.index(number) for number in numbers]) for one in (both, part)
+        )
+        for name in ("poles", "covariance", "shapes"):
+            np.testing.assert_array_equal(getattr(own, name), getattr(other, name))
+    # errors of two measurements are independent
+    apart = [0, 1, 6, 7], [2, 3, 4, 5, 8, 9, 10, 11]
+    assert not np.any(both.covariance[np.ix_(*apart)])
+    elsewhere = high.replace(dofs=("4:x", "5:x", "6:x"))
+    assert low.merged(elsewhere).shapes is None
+    assert low.merged(high.replace(covariance=None)).covariance is None
+    with pytest.raises(ModelError, match="merged by their mode numbers, which one of them lacks"):
+        low.merged(MeasuredModes(POLES))

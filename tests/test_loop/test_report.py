@@ -476,3 +476,14 @@ def test_a_loop_that_is_not_judged_has_no_margin_alone():
     assert "stability not judged, modulus margin" in repr(report_loops((frf, K)))
     with pytest.raises(ModelError, match="no line above 0 Hz"):
         fx.modulus_margin((Frf([0.0], [[[1.0]]], inputs=["u"], outputs=["y"]), K))
+
+
+def test_rounding_next_to_half_the_rate_is_no_second_gain_margin():
+    """The table of margins had the crossing at 2000 Hz twice."""
+    freq = np.geomspace(1.0, 2000.0, 400)
+
+    def gain(f):
+        return np.asarray(1e-3 + 1e-16j * (f - 2000.0 * (1 - 1e-9)))
+
+    found = loop_margins("u", freq, gain(freq), gain, sampled=True)
+    assert sum(place > 1999.0 for place, _ in found.gains) == 1

@@ -120,3 +120,31 @@ def test_a_mode_that_matters_must_be_measured():
     said = fx.design_kalman(plant(both=True, seen="both")).interval("tool:x").sentence
     assert said.startswith("no interval: mode ")
     assert "was not measured" in said
+
+
+def test_calibrations_one_after_the_other_are_those_of_both():
+    """Intervals were those of the last one: 530 to 956 nm about an error of 157 nm."""
+    model = drawn(both=False)
+    modes = fx.solve_modes(model, count=N, damping=fx.ModalDamping(0.005))
+    own = freqs(*chains(*TRUE))[:7]
+    low, high = (
+        fx.MeasuredModes.from_freq(
+            own[some], 0.006, modes=np.arange(1, 8)[some], freq_std=1e-5 * own[some], zeta_std=1e-5
+        )
+        for some in (slice(3), slice(3, 7))
+    )
+    fit = fx.update(
+        fx.reduce(modes, fx.DesiredDofs(modes.dofs.labels)),
+        [fx.AddedMass(f"{N}:x")],
+        [fx.Eigenvalues(low.merged(high).replace(covariance=None))],
+    )
+    each, together = fit.calibrated(low).calibrated(high), fit.calibrated(low.merged(high))
+    np.testing.assert_allclose(each.modes().poles, together.modes().poles, rtol=1e-9)
+    assert each.machines.measured.modes == together.machines.measured.modes == (*range(1, 8),)
+    whole = modes.calibrated(low).calibrated(high)
+    np.testing.assert_allclose(whole.freq[:7], own, rtol=1e-12)
+    assert whole.calibration.modes == (*range(1, 8),)
+    again = each.calibrated(low.replace(poles=1.001 * low.poles))
+    np.testing.assert_allclose(
+        again.modes().freq[:7], np.append(1.001 * own[:3], own[3:]), rtol=1e-6
+    )

@@ -104,7 +104,7 @@ def test_a_stage_is_as_fast_as_its_uncertainty_allows():
         assert loop.modulus_margin >= 0.4
         assert (loop.mode_tolerances(margin=0.35).least > share).all()
         assert len(found.tried) >= 3
-    fast, slow = (one.certificate["weights for Hz"] for one in (sure, unsure))
+    fast, slow = (one.certificate["bandwidth of the weights [Hz]"] for one in (sure, unsure))
     assert fast > 1.2 * slow
 
 

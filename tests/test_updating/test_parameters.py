@@ -100,8 +100,10 @@ def test_a_mass_rides_on_all_translations_as_a_point_mass_does():
     for at in ("14:z", {"14:z": 1.0}):
         with pytest.raises(LabelError, match="names one motion: give a point"):
             AddedMass(at, direction="xyz")
-    with pytest.raises(LabelError, match="direction"):
-        AddedStiffness(place, direction="xyz")
+    far = (0.02, 0.2, 0.0)
+    isolator = AddedStiffness(place, direction="xyz", to=far).matrices(block)[2].toarray()
+    rows = [block.dofs.row(place, axis) - block.dofs.row(far, axis) for axis in "xyz"]
+    np.testing.assert_allclose(isolator, sum(np.outer(row, row) for row in rows), atol=1e-12)
 
 
 @pytest.mark.slow

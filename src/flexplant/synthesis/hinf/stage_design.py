@@ -225,8 +225,11 @@ class _StageTask(Design):
         answer = verified(best.design, best.solution)
         checks = [
             Verified(f"least modulus margin of {_DRAWS} machines drawn", best.drawn),
-            Verified("weights for Hz", best.bandwidth),
+            Verified("bandwidth of the weights [Hz]", best.bandwidth),
         ]
+        if self.errors is not None:
+            reached = self._crossing(best.solution.K)
+            checks.append(Verified("|S| of the references below 1 up to [Hz]", reached))
         fitted = self._fitted() if self.stated else None
         if fitted is not None:
             least = self._least(self._loop(best.solution.K), fitted, 0.0)
