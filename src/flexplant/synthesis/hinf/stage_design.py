@@ -25,6 +25,7 @@ from ...plant.uncertainty.frequencies import Frequencies
 from ...plant.uncertainty.mode_delta import DampingDelta
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...plant.visibility import untouched_modes
+from ...tolerances import SAME
 from ...updating.residuals.modal_residuals import USUAL
 from ..controller import Controller
 from ..pipeline import Design, Solution, designed, solved, verified
@@ -273,7 +274,10 @@ class _StageTask(Design):
             return list(fitted)
         known = {d.mode: d.scale for d in self.uncertain.deltas if isinstance(d, DampingDelta)}
         plant = self.plant.machine
-        unsure = plant.uncertain(frequency=self.ranges, damping=known or _DAMPING)
+        # modes that do not matter are known: they do not mix with others
+        every = self.uncertain.frequencies
+        ranges = {mode: self.ranges.get(mode, SAME * off) for mode, off in every.items()}
+        unsure = plant.uncertain(frequency=ranges, damping=known or _DAMPING)
         return PlantMachines(unsure.nominal).drawn(_DRAWS)
 
     def holds(self, bandwidth: float) -> bool:
