@@ -303,9 +303,9 @@ class ClosedLoop(Value):
         """Smallest distance of the loop gain, with the loop opened at u, to the critical point.
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances; 0 for an unstable loop. If actuators have different units, or need forces
-        that differ by more than a factor of 5 for equal motions of the axes, axes are scaled as in
-        `LoopReport.scaled_margin`.
+        loop's resonances; 0 for an unstable loop. If actuators have different units, or forces so
+        different that the decoupling of the axes is twice as well conditioned in scaled forces,
+        axes are scaled as in `LoopReport.scaled_margin`.
         """
         return self.broken.margin()
 

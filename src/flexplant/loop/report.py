@@ -136,8 +136,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         does not depend on units. It is the upper bound of the structured singular value mu with one
         uncertainty for each axis. Its relative tolerance is 2 %.
     units : tuple of str
-        Units of the channels, if they differ. Actuators of one unit that need forces of different
-        sizes for equal motions have multiples of it: ``("133 N", "1 N")``.
+        Units of the channels, if they differ. Actuators of one unit whose forces are not
+        comparable have multiples of it: ``("133 N", "1 N")``.
     """
 
     loops: tuple[LoopMargins, ...]

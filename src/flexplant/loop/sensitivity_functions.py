@@ -307,8 +307,8 @@ def modulus_margin(loop: Loop) -> float:
         unstable poles. If a response is proportional to 1/f^2 at the lowest frequencies, the motion
         counts as a free rigid-body motion. For a measured plant, S is evaluated at its frequencies,
         and between them at the modes that are visible in the data. If the actuators have several
-        units (N and N m), or those of a ClosedLoop need forces that differ by more than a factor of
-        5 for equal motions, the result is the margin with scaled axes, `LoopReport.scaled_margin`.
+        units (N and N m), or those of a ClosedLoop have forces that are not comparable (as in
+        `ClosedLoop.modulus_margin`), it is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,11 @@ from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive
 from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
-from ..tolerances import SAME, TYPED
+from ..tolerances import TYPED
 from ..words import name_list
 from .assumptions import axes_in_words
 from .building import rigid_shapes
-from .partitioned import Partition, PartitionedSystem
+from .partitioned import Partition
 from .ports import Poi
 from .realisation import natural
 
@@ -27,11 +27,9 @@ _APART = 1e-2
 _SWEEPS = 20
 #: a usual bandwidth as a part of the rate, and of the slowest oscillation of a continuous plant
 _OF_RATE, _OF_MODE = 0.01, 0.2
-#: least size of a channel, relative to the largest of its kind: one that takes hardly any part
-IDLE = 0.03
-#: ratio of the forces for equal motion above which actuators do not have the same unit of force:
-#: those of one kind differ by up to 4.6 in the examples, as their arms do
-_ALIKE = 5.0
+#: factor of the condition number of the decoupling that units of actuators may cost: it is a factor
+#: of |S| at u, and 6 dB of it are all that a loop is to have
+_UNLIKE = 2.0
 #: what counts as rest, relative to a usual bandwidth: squared it is below what tests of rest see
 _RESTING = 1e-4
 
@@ -290,7 +288,12 @@ def _distance(G: FloatArray) -> float:
     """Return how independent the rows of a gain (r, m) are, from 0 to 1."""
     if not G.size or G.shape[0] > G.shape[1] or not np.all(np.any(G, axis=1)):
         return 0.0
-    sizes = np.linalg.svd(_balanced(G)[0], compute_uv=False)
+    return _evenness(_balanced(G)[0])
+
+
+def _evenness(G: FloatArray) -> float:
+    """Return the smallest over the largest singular value."""
+    sizes = np.linalg.svd(G, compute_uv=False)
     return float(sizes[-1] / sizes[0])
 
 
@@ -304,44 +307,21 @@ def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
     return scaled, columns
 
 
-class EqualMotion(NamedTuple):
-    """What belongs to motions of the axes that show equally far at the sensors."""
-
-    #: length d (r,) by which each axis is divided, and the sensors (p, r) of unit axes
-    shown: FloatArray
-    sensors: FloatArray
-    #: of each actuator (m,)
-    forces: FloatArray
-
-    @classmethod
-    def of(cls, plant: PartitionedSystem, driven: DrivenAxes, sigma: float) -> EqualMotion:
-        """Return the motions at s = sigma [rad/s]."""
-        # Y = G_yu T of unit axes, d_i = rms(Y_i) / rms(Y_1); T / d are forces of equal motion
-        T = sigma**2 * driven.T
-        names = [s.name for s in plant.assembled.ports.y]
-        late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
-        Y = real_gain(plant.system, sigma, names, plant.u) @ T / late
-        shown = np.linalg.norm(Y, axis=0)
-        first, r, m = float(shown[0]), len(driven.channels), len(plant.u)
-        d = shown / first if first and np.all(shown > SAME * first) else np.ones(r)
-        forces = np.sqrt(m / r) * np.linalg.norm(T / d, axis=1)
-        # an actuator that the decoupling leaves at rest has a size nevertheless
-        return cls(d, Y, np.maximum(forces, IDLE * forces.max()))
-
-
 def force_units(plant: Partition) -> dict[str, str]:
-    """Return the unit of force of each actuator, a multiple of its own one, if they differ much."""
+    """Return the unit of force of each actuator, a multiple of its own one, if that matters."""
+    # the loop at u is T C G, whose |S| is that of the axes times up to the condition number of T
     try:
-        driven = driven_axes(plant)
+        T = driven_axes(plant).T
     except (AssumptionError, ModelError):  # without axes there is nothing to compare by
         return {}
-    sizes = EqualMotion.of(plant, driven, 2.0 * np.pi * driven.freq[0]).forces
-    if sizes.max() <= _ALIKE * sizes.min():
+    scaled, sizes = _balanced(T.T)
+    if _evenness(scaled) <= _UNLIKE * _evenness(T / np.linalg.norm(T, axis=0)):
         return {}
+    forces = sizes.max() / sizes
     units = [plant.units.get(name, "") for name in plant.u]
     return {
-        name: f"{size:.3g} {unit}".strip()
-        for name, size, unit in zip(plant.u, sizes / sizes.min(), units, strict=True)
+        name: f"{force:.3g} {unit}".strip()
+        for name, force, unit in zip(plant.u, forces, units, strict=True)
     }
 
 

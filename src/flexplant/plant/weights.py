@@ -15,7 +15,8 @@ from ..lti.filters import high_pass_filter, inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..store import Value
-from .axes import IDLE, DrivenAxes, EqualMotion, apart, driven_axes, real_gain, resting_frequency
+from ..tolerances import SAME
+from .axes import DrivenAxes, apart, driven_axes, real_gain, resting_frequency
 from .building import at_rate
 from .port import DERIVATIVES
 from .rest_expansion import followed_at_rest
@@ -30,6 +31,8 @@ _HEADROOM = 1.6
 _SURE, _UNSURE = (3.0, 3.0), (20.0, 10.0)
 #: size of a disturbance elsewhere than at the actuators, relative to one of the same effect there
 _ELSEWHERE = 0.01
+#: least size of a channel, relative to the largest of its kind: one that takes hardly any part
+_IDLE = 0.03
 
 
 def reference_errors(plant: StandardPlant, *, poi: str | None = None, order: int = 0) -> StateSpace:
@@ -273,12 +276,21 @@ class _Sizes:
     @classmethod
     def of(cls, plant: AnyPlant, driven: DrivenAxes, sigma: float) -> _Sizes:
         """Return the sizes by the decoupled response on the real axis."""
-        ports, r, m = plant.assembled.ports, len(driven.channels), len(plant.u)
+        # Y = G_yu T of unit axes, d_i = rms(Y_i) / rms(Y_1); T / d are forces of equal motion
+        ports = plant.assembled.ports
         sensors, pushed = [s.name for s in ports.y], [p.name for p in ports.w if not p.added_to]
+        T = sigma**2 * driven.T
         held = np.exp(-0.5 * sigma * plant.dt)  # what the hold leaves of an input, without delay
-        d, Y, forces = EqualMotion.of(plant, driven, sigma)
+        late = held * np.exp(-sigma * plant.dt * plant.delay)
+        Y = real_gain(plant.system, sigma, sensors, plant.u) @ T / late
+        shown = np.linalg.norm(Y, axis=0)
+        first, r, m = float(shown[0]), len(driven.channels), len(plant.u)
+        d = shown / first if first and np.all(shown > SAME * first) else np.ones(r)
+        forces = np.sqrt(m / r) * np.linalg.norm(T / d, axis=1)
+        # an actuator that the decoupling leaves at rest has a size nevertheless
+        forces = np.maximum(forces, _IDLE * forces.max())
         noises = np.linalg.norm(Y / d, axis=1) / np.sqrt(r)
-        noises = np.maximum(noises, IDLE * noises.max(initial=0.0))
+        noises = np.maximum(noises, _IDLE * noises.max(initial=0.0))
         W = real_gain(plant.system, sigma, driven.channels, pushed) / held
         moved = np.linalg.norm(d[:, None] * W, axis=0) * np.sqrt(m / r)
         noisy = tuple(port.name for port in ports.u if port.asd > 0)

@@ -558,14 +558,15 @@ class ServoTask:
                 "on this plant."
             )
         left = float(np.rad2deg(self.phase_margins(self.law(bandwidth)).min()))
+        taken = 360.0 * bandwidth * self.plant.dt * (0.5 + self.plant.delay)
         asked = float(np.rad2deg(2.0 * np.arcsin(0.5 / peak)))
         cause = (
-            f"rate and delay leave a phase margin of {left:.2g} deg on the axes' lines, and this "
-            f"peak needs at least {asked:.2g} deg. Raise the rate, or lower the delay"
-            if left < asked
-            else "the cause is the flexible modes or the observer, since rate and delay leave a "
-            f"phase margin of {left:.2g} deg on the axes' lines. Place a notch at that frequency, "
-            "change the observer's noise intensities, give each axis its bandwidth in design_servo"
+            f"rate and delay take {taken:.2g} deg of phase and leave {left:.2g} deg on the axes' "
+            f"lines, and this peak needs at least {asked:.2g} deg. Raise the rate, lower the delay"
+            if left < asked <= left + taken
+            else "the cause is the flexible modes, the observer or the law, since rate and delay "
+            f"take only {taken:.2g} deg of phase. Place a notch at that frequency, change the "
+            "observer's noise intensities, give each axis its bandwidth in design_servo"
         )
         return (
             f"; the least is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at {at:.4g} Hz. "
