@@ -222,15 +222,8 @@ def test_refusals():
         design_servo(plant, bandwidth=50.0, observer=slower)
     with pytest.raises(ModelError, match="peak must be above 1"):
         servo_bandwidth(plant, peak=1.0)
-    with pytest.raises(SolverError, match=r"no bandwidth from .*phase margin of .*Raise the rate"):
+    # the law is the cause: at a few hertz rate and delay take hardly any phase
+    with pytest.raises(SolverError, match=r"no bandwidth from .*rate and delay take only") as none:
         servo_bandwidth(plant, peak=1.02)
+    assert "aise the rate" not in str(none.value)
     assert isinstance(static.system, StateSpace)
-
-
-@pytest.mark.slow
-def test_the_rate_is_not_blamed_where_it_takes_no_phase():
-    """At 0.4 Hz of 2 kHz it takes 0.1 degrees: the law alone leaves too little for 0.8 dB."""
-    plant = three_masses()
-    with pytest.raises(SolverError, match="take only 0.11 deg") as found:
-        servo_bandwidth(plant, observer=design_kalman(plant), peak=1.1)
-    assert "aise the rate" not in str(found.value)
