@@ -302,14 +302,15 @@ def _gain_trace(joint: _Joint) -> FloatArray:
     right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]
     # the columns of all rows side by side, by one Schur form
     cross = shifted_columns(A.T, np.tile(values, len(keep)), np.hstack(list(right)))
+    # Y of the modes is `load / (1 - conj(values) values')`; what its trace with the noise has in
+    # common for all rows is formed once
+    weight = (driven.conj() @ driven.T) / (1 - np.outer(values.conj(), values))
+    entering, both = coupling.conj() @ weight, noise @ driven.T
     found = []
     for row, mine, across in zip(see, own, np.split(cross, len(keep), axis=1), strict=True):
-        back = coupling.conj().T @ across * values
-        load = coupling.conj().T @ mine @ coupling + back + back.conj().T
-        inner = (load + np.outer(row.conj(), row)) / (1 - np.outer(values.conj(), values))
-        total = np.sum(driven.conj() * (inner @ driven)).real
-        total += 2 * np.sum(noise * (across @ driven)).real
-        found.append(float(total + np.sum(noise * (mine @ noise))))
+        total = np.sum((mine @ coupling) * entering) + row.conj() @ weight @ row
+        total += 2 * np.sum(across * (entering * values + both))
+        found.append(float(total.real + np.sum(noise * (mine @ noise))))
     return np.array(found)
 
 

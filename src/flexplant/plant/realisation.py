@@ -116,16 +116,28 @@ class ModalRealisation(Value):
 
     def force(self, row: FloatArray) -> FloatArray:
         """Return the column (2 b,) of B for a unit force along a row of DOFs."""
-        return np.asarray(row @ self.inputs)
+        return self._along(row, "inputs")
 
     def motion(self, row: FloatArray, derivative: int) -> FloatArray:
         """Return the row (2 b,) of C for a displacement's derivative; rows (p, n) give (p, 2 b)."""
-        C = np.asarray(row @ self.outputs).reshape(-1, self.pairs.shape[0], 1, 2)
+        known = self._along(row, "outputs") if row.ndim == 1 else np.asarray(row @ self.outputs)
+        C = known.reshape(-1, self.pairs.shape[0], 1, 2)
         for _ in range(derivative):
             slowed = 0.0 if self.coupling is None else C[:, :, 0, 1] @ self.coupling
             C = C @ self.pairs
             C[:, :, 0, 1] -= slowed
         return C.reshape(*np.shape(row)[:-1], -1)
+
+    def _along(self, row: FloatArray, table: str) -> FloatArray:
+        """Return a row over DOFs times a table; that of a place is found once."""
+        used = np.flatnonzero(row)
+
+        def found() -> FloatArray:
+            product = np.asarray(row @ getattr(self, table))
+            product.flags.writeable = False
+            return product
+
+        return self.once((table, used.tobytes(), row[used].tobytes()), found)
 
     def at_once(self, row: FloatArray) -> FloatArray:
         """Return the displacement along a row (n,) that unit forces at the DOFs (n,) cause at once.
