@@ -124,7 +124,7 @@ def plant_of(case: dict[str, Any], kind: str, force: float = 1e-3) -> fx.Standar
 
 # %% Estimation: four ways from the sensors to the die, each with more knowledge of the machine
 def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
-    """Return, for each axis, predicted errors and those of 5 runs of 1.2 s under a slow servo."""
+    """Return, for each axis, predicted errors and those of 3 runs of 2 s under a slow servo."""
     nominal, fit = (plant_of(case, kind, force) for kind in ("drawing", "measured"))
     static, alone = fx.design_static(fit), fit.replace(evaluation=None)
     designs = {
@@ -135,7 +135,7 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
     }
     servo = fx.design_servo(alone, bandwidth=10.0, observer=static)
     blocks = static, servo, *fx.simulation.reading_along(designs)
-    run = case["machine"].run(ports(force), *blocks, duration=2.2, rng=seed, runs=5)
+    run = case["machine"].run(ports(force), *blocks, duration=3.0, rng=seed, runs=3)
     axes = ("die:z", "die:rx", "die:ry")
     return {axis: fx.simulation.compare_estimators(designs, run, axis, start=1.0) for axis in axes}
 
