@@ -261,7 +261,8 @@ class IdentifiedModes(MeasuredModes):
 
     The fit has the poles lambda_k, the shapes psi_k and the participation vectors l_k, which state
     how strongly each input excites the mode. E(s) contains the residual terms, which represent the
-    modes outside the band. M and D are the mass and damping matrices of the structure.
+    modes outside the band. M and D in the
+    descriptions below are the mass and damping matrices of the structure.
 
     Parameters
     ----------

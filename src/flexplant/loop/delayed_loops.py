@@ -255,9 +255,9 @@ class DelayedLoop(Value):
     def lsim(self, reference: Callable[[float], float], time: npt.ArrayLike) -> FloatArray:
         """Return y (p, n) of the loop that starts at rest and follows a reference.
 
-        The method of steps is used. On each interval as long as the delay, the delayed error is
-        already known, so that an ordinary differential equation remains. SciPy's solver of order 8
-        solves it with a relative tolerance of 1e-9.
+        The method of steps is used. Time is divided into intervals whose length is the delay. On
+        each of them the delayed error is already known, so that an ordinary differential equation
+        remains. SciPy's solver of order 8 solves it with a relative tolerance of 1e-9.
 
         Parameters
         ----------

@@ -528,9 +528,10 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     """Return the frequency response ``C (s I - A)^-1 B + D``.
 
-    Here s = 2 pi i f; for a sampled system it is exp(2 pi i f dt). If A has 1 x 1 and 2 x 2
-    diagonal blocks, each block is solved in closed form; the cost of a frequency is then
-    proportional to the number of states when A is block diagonal. Otherwise the response is
+    Here s = 2 pi i f; for a sampled system it is exp(2 pi i f dt). If A is
+    block triangular with 1 x 1 and 2 x 2 diagonal blocks, each block is solved in closed form. If A
+    is even block diagonal, the cost of a frequency is proportional to the number of states.
+    Otherwise the response is
     computed from the poles and residues, or from the Schur form of A if its eigenvectors are
     ill-conditioned.
 

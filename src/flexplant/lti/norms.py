@@ -210,7 +210,7 @@ def h2_norm(sys: System) -> float:
     Raises
     ------
     SolverError
-        When a Gramian is too badly conditioned for its residual.
+        When the equation of a Gramian is so badly conditioned that its residual is too large.
     CertificateError
         When the two Gramians give different norms.
 

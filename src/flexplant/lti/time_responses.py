@@ -199,7 +199,7 @@ def lsim(
     Returns
     -------
     TimeResponse
-        Response with one column: `response["y1"]` is (n_time,).
+        Response to this one input signal: `response["y1"]` is (n_time,).
 
     Raises
     ------

@@ -329,7 +329,7 @@ class Problem:
 
     @cached_property
     def subsets(self) -> int:
-        """Number of choices of `units`, including those that violate other constraints."""
+        """Number of choices of `count` candidates, before constraints on several are applied."""
         numbers = {size: len(units) for size, units in self._by_size.items()}
         return sum(prod(comb(numbers[s], n) for s, n in mix.items()) for mix in self._mixes())
 
@@ -346,8 +346,8 @@ class Problem:
     def root(self) -> Branch:
         """The branch (set of choices) that contains all choices.
 
-        Only required and excluded candidates limit it. Constraints that concern several candidates
-        together are not used.
+        Its choices contain all required candidates. They need not satisfy the constraints that
+        concern several candidates together.
         """
         return Branch.containing(self.required, self.free, self.count)
 

@@ -41,7 +41,9 @@ Port: TypeAlias = ForcePort | SensorPort | Poi
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachineParts(Value):
-    """Parts of a machine that Deltas change and from which its plant is made: modes, ports, delay.
+    """Parts of a machine from which its plant is made: modes, ports, delay.
+
+    The Deltas (normalised uncertain numbers) of a plant change these parts.
 
     Parameters
     ----------

@@ -195,7 +195,7 @@ def frf(
     also: Sequence[str] | str = (),
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
+    """Draw the magnitude of one channel of several responses ([paper]_, Figs. 4, 10 and 11).
 
     Measurements are black points under the lines. If the label of the first response has no fixed
     style (the labels with a fixed style are listed in `flexplant.plot`), its line is thick, so that

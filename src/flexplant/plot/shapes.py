@@ -52,7 +52,7 @@ def mode_shape(
     joined: FEModel | IntArray | None = None,
     ax: Any = None,
 ) -> Any:
-    """Draw a mode of a plate, a solid or a frame in three dimensions (paper, Figs. 5 and 6).
+    """Draw a mode of a plate, a solid or a frame in three dimensions ([paper]_, Figs. 5 and 6).
 
     The surface is found from the nodes; for a solid it has two sides. If the nodes form no surface,
     lines are drawn between neighbouring nodes, or between those that are `joined`. The colour shows
@@ -340,7 +340,7 @@ def layout(
     marked: Mapping[str, Any] | None = None,
     ax: Axes | None = None,
 ) -> Any:
-    """Draw the places of nodes, desired DOFs, actuators, sensors and POIs (paper, Fig. 3).
+    """Draw the places of nodes, desired DOFs, actuators, sensors and POIs ([paper]_, Fig. 3).
 
     A plate is drawn from above. A solid is drawn in three dimensions; arrows show the directions in
     which its actuators push and its sensors measure.

@@ -356,7 +356,7 @@ def _draw_responses(ax: Axes, residual: FrfResidual, before: Any, after: Any) ->
 
 
 def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = None) -> Axes:
-    """Draw the convergence of the eigenvalues to the measured ones (paper, Fig. 7).
+    """Draw the convergence of the eigenvalues to the measured ones ([paper]_, Fig. 7).
 
     Parameters
     ----------
@@ -404,7 +404,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
 
 
 def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
-    """Draw the distance of model and measurement over iterations (paper, eq. (12), Fig. 8).
+    """Draw the distance of model and measurement over iterations ([paper]_, eq. (12), Fig. 8).
 
     Parameters
     ----------
@@ -436,7 +436,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
 def parameters(
     fit: UpdateResult, *, truth: dict[str, float] | None = None, axs: list[Axes] | None = None
 ) -> list[Axes]:
-    """Draw the parameters over iterations (paper, Fig. 9), each on separate axes of one figure.
+    """Draw the parameters over iterations ([paper]_, Fig. 9), each on separate axes of one figure.
 
     Parameters
     ----------

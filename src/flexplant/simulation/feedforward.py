@@ -162,21 +162,22 @@ def design_feedforward(
     """Return the feedforward of a plant or a loop, with gains for the derivatives of a set-point.
 
     For a plant the feedforward is its inverse at low frequency, as a power series. P is the
-    response of the axes to forces along them, which T distributes to the actuators. It includes the
-    hold and all delays and filters of sensors and actuators. The gains are the coefficients of
-    ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the mass and k_3 the mass
-    times the delay. k_4 contains half the square of the delay, and the negative compliance of the
-    flexible modes between actuators and POI (point of interest). For a machine on springs k_0 and
-    k_1 are stiffness and damping. The coefficients are Cauchy integrals on a circle around zero.
-    The circle is the largest one for which the results of two radii agree and inside which the
-    series equals the inverse. Zeros of P lie outside of it.
+    response of the axes to forces along them, with a matrix T that distributes these forces to the
+    actuators. It includes the hold and all delays and filters of sensors and actuators. The gains
+    are the coefficients of ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``. For a free machine k_2 is the
+    mass and k_3 the mass times the delay. k_4 contains half the square of the delay, and the
+    negative compliance of the flexible modes between actuators and POI (point of interest). For a
+    machine on springs k_0 and k_1 are stiffness and damping. The coefficients are Cauchy integrals
+    on a circle around zero. The circle is as large as possible. On it and on a smaller circle the
+    integrals must agree, and inside it the series must equal the inverse. Zeros of P lie outside of
+    it.
 
-    The frame of a machine on isolators gives P zeros at low frequency. Above their frequency, the
-    power series is wrong. If the plant is sampled, its stable zeros below a hundredth of the rate
-    are therefore inverted exactly by filters (`zeros`). The input of these filters is the highest
-    derivative, and their output is zero at rest. A warning names unstable slow zeros. The output of
-    filters depends on the past. They are therefore not combined with gains that vary along places
-    (`along`).
+    If the frame of a machine stands on isolators, P has zeros at low frequency. Above their
+    frequency, the power series is wrong. If the plant is sampled, its stable zeros below a
+    hundredth of the rate are therefore inverted exactly by filters (`zeros`). The input of these
+    filters is the highest derivative, and their output is zero at rest. A warning names unstable
+    slow zeros. The output of filters depends on the past. They are therefore not combined with
+    gains that vary along places (`along`).
 
     All axes that the actuators move independently (`flexplant.plant.driven_axes`) are treated
     together. The feedforward includes the forces that keep the axes without a reference at rest.
@@ -184,11 +185,11 @@ def design_feedforward(
     For a loop the gains minimise the error ``G_u F + G_r - 1`` of the loop by least squares. F is
     the feedforward, and G_u and G_r are the closed-loop responses of the POI to forces and to the
     reference. The inverse of P is not used here, because the feedback opposes it if sensors and POI
-    move differently. Poles of the controller and zeros of P may be as slow as the moves. The errors
-    are weighted with the spectrum of the move. If no move is given, the spectrum is that of a move
-    with a duration of about ``3 / bandwidth`` of the loop. The feedforward then has no force at
-    rest if the plant needs no force to stay at a position. With a lower `order`, the gains are the
-    best ones of that order.
+    move differently. Poles of the controller and zeros of P that are as slow as the moves are
+    allowed. The errors are weighted with the spectrum of the move. If no move is given, the
+    spectrum is that of a move with a duration of about ``3 / bandwidth`` of the loop. The
+    feedforward then has no force at rest if the plant needs no force to stay at a position. With a
+    lower `order`, the gains are the best ones of that order.
 
     Parameters
     ----------

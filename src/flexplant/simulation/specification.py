@@ -172,7 +172,7 @@ class Specification(Value):
     ----------
     ma, msd : float, optional [m or rad]
         Largest allowed moving average |MA| and moving standard deviation MSD of the error over the
-        exposures (see `exposure_errors`).
+        exposures, which are the times in which the machine works (see `exposure_errors`).
     rms, peak : float, optional [m or rad]
         Largest allowed rms and magnitude of the error in the run, from `start` on.
     settling : float, optional [s]

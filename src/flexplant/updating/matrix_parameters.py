@@ -473,9 +473,9 @@ class PolynomialParameter(_GivenParameter):
         return np.asarray(value**k), np.asarray(k * value ** (k - 1))
 
     def about(self, value: float) -> PolynomialParameter:
-        """Return the same parameter for a model whose matrices already include a value of it.
+        """Return the parameter of the change from a value that the model already has.
 
-        The new parameter is the change from this value. Its value zero stands for these matrices.
+        The value zero of the new parameter stands for the matrices of the model.
         """
         moved: dict[str, Any] = {}
         for label in PARTS:

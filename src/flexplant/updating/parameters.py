@@ -78,9 +78,9 @@ class Parameter(Value):
         return total[0], total[1], total[2]
 
     def about(self, value: float) -> Parameter:
-        """Return the same parameter for a model whose matrices already include a value of it.
+        """Return the parameter of the change from a value that the model already has.
 
-        The new parameter is the change from this value. Its value zero stands for these matrices.
+        The value zero of the new parameter stands for the matrices of the model.
         """
         return self
 

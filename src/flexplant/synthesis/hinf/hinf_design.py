@@ -82,13 +82,15 @@ def design_hinf(
         ``plant.uncertain(frequency=0.005)``. It is not needed if `plant` is an UncertainPlant. The
         design then aims at a loop that remains stable for all modal frequencies within their
         uncertainties. For this purpose each uncertain mode gets one additional input and output,
-        through which a change of its frequency acts. Changes of frequencies are real numbers. These
-        channels therefore include the scaling matrix G, which `mu` uses for real uncertainties. A
+        through which a change of its frequency acts. Changes of frequencies are real numbers.
+        Therefore these channels are scaled with the matrices D and G that `mu` uses for real
+        uncertainties. A
         first design determines the scale of each channel. `gamma` is then the norm with these
         channels. It may therefore be above 1 although the requirements of the weights are
         satisfied. The entry ``all frequencies at once`` of `certificate` is an upper bound of the
         structured singular value mu over a frequency grid. If it is below 1, no plant of the
-        uncertainty has a closed-loop pole at a frequency of the grid.
+        uncertainty has a closed-loop pole on the imaginary axis (unit circle) at a frequency of the
+        grid.
         ``ClosedLoop.mode_tolerances`` gives the allowed error of each frequency.
     damped_below : float [Hz]
         Frequency below which the controller actively damps the uncertain modes that the actuators

@@ -100,11 +100,11 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
         mu(M) = 1 / min { |Delta| : det(I - M Delta) = 0 },   Delta = diag(delta_1 I, ..., Delta_F)
 
     The size of Delta is its largest singular value. The upper bound uses scaling matrices D and G
-    that satisfy ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system, each pair of scalings is
-    proven for an interval of frequencies, whose ends follow from the eigenvalues of a Hamiltonian
-    matrix. The intervals cover all frequencies, so that no peak is missed. The lower bound is found
-    by power iterations with random restarts. For a system it is verified by the eigenvalues of the
-    closed loop with the perturbation.
+    that satisfy ``mu^2 D - M* D M + j (G M - M* G) > 0``. For a system, the bound of each pair (D,
+    G) is proven for an interval of frequencies, whose ends follow from the eigenvalues of a
+    Hamiltonian matrix. The intervals cover all frequencies, so that no peak is missed. The lower
+    bound is found by power iterations with random restarts. For a system it is verified by the
+    eigenvalues of the closed loop with the perturbation.
 
     Parameters
     ----------

@@ -321,7 +321,10 @@ class UpdateMethod(Value):
 
     @property
     def penalised(self) -> bool:
-        """Whether the result depends on the start values, so that its covariance is not known."""
+        """Whether the search adds a penalty to the sum of squares, such as one on large steps.
+
+        The result then depends on the start values, and its covariance is not known.
+        """
         return False
 
     @abstractmethod
