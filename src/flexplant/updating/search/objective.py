@@ -321,7 +321,7 @@ class UpdateMethod(Value):
 
     @property
     def penalised(self) -> bool:
-        """Whether the search adds a penalty to the sum of squares, such as one on large steps.
+        """Whether the search does not move in directions that the data determine badly.
 
         The result then depends on the start values, and its covariance is not known.
         """
