@@ -45,11 +45,11 @@ KINDS = {
     },
     "soft pair": {
         "size": (0.45, 0.3), "thickness": 0.02, "zeta": 0.003, "cells": (42, 28),
-        "known": (0.1, 0.2), "bandwidth": 40.0, "poles": 11, "soft": 0.53,
+        "known": (0.1, 0.2), "bandwidth": 40.0, "poles": 11, "soft": 0.53, "order": 27,
         "push": [(0.09, 0.06), (0.36, 0.075), (0.1, 0.24), (0.33, 0.22)],
     },
     "solid on springs": {
-        "size": (0.6, 0.4, 0.03), "zeta": 0.01, "cells": (16, 11, 2), "known": (0.2, 0.3),
+        "size": (0.6, 0.4, 0.03), "zeta": 0.01, "cells": (30, 20, 2), "known": (0.2, 0.3),
         "inset": (0.2, 0.75), "bandwidth": 50.0, "poles": 11, "springs": 43e3,
     },
 }  # fmt: skip
@@ -145,7 +145,8 @@ def machine_of(kind, seed):
     young = modulus(kind, kind["soft"] * rng.normal(1.0, 0.03)) if "soft" in kind else 70e9
     return unlike_machines.plate_machine(
         rng, kind["size"], kind["thickness"], 2702.0, young, 0.33, forces=forces, sensors=sensors,
-        poi=poi, zeta=kind["zeta"], masses=masses
+        poi=poi, zeta=kind["zeta"], masses=masses,
+        order=kind.get("order", unlike_machines.ORDER),
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from ..tolerances import SAME, TINY, TYPED
 from ..updating.machines import Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
 from ..updating.trend import MIXED
+from .measured_shapes import MeasuredShapes
 from .realisation import MODAL, ModalRealisation, modes_as_states, natural
 from .uncertainty.delta import Delta
 from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, changed_pairs
@@ -219,6 +220,17 @@ class MachineFamily:
         rows = [self.whole.row(tuple(at.tolist()), direction) for at, direction in points]
         return np.asarray(np.array(rows) @ self.over)
 
+    @cached_property
+    def _shapes(self) -> MeasuredShapes | None:
+        """The measured shapes, None without any at known places."""
+        known = self.machines.measured
+        if known.shapes is None or known.xyz is None:
+            return None
+        return MeasuredShapes(
+            self._seen, known.shapes, self.omega, self.measured, self.pairs,
+            2.0 * self._together**2, self.machines.trend.deviation,
+        )  # fmt: skip
+
     def _turned(self, V: FloatArray, own: IntArray) -> FloatArray:
         """Return shapes whose close pairs are turned in their plane to the measured shapes."""
         # two modes of almost one frequency mix by the ratio of scatter to gap: what was measured
@@ -337,6 +349,8 @@ class MachineFamily:
             K += amount * change.stiffness
         lighter = np.exp(-draw.as_mass * trend)
         M = lighter[:, None] * mass * lighter
+        if self._shapes is not None:
+            M, K = self._shapes.given(M, K, draw.deviation, rng)
         return 0.5 * (M + M.T), 0.5 * (K + K.T)
 
 

@@ -50,7 +50,7 @@ class Machines(Value):
     ``fit.machines(measured)`` and is passed to a plant by ``plant.uncertain(machines)``. A plant of
     ``fit.calibrated(measured)`` includes it automatically. Machines are drawn in modal coordinates
     of the plant's evaluation model. There, the mass matrix is the unit matrix I, and Omega is the
-    diagonal matrix of the frequencies. Each draw has four steps:
+    diagonal matrix of the frequencies. Each draw has five steps:
 
     - The deviation s of frequencies, the changes dp of the parameters and the slope b are drawn
       from their posterior distribution (`Trend`).
@@ -66,6 +66,9 @@ class Machines(Value):
       the ratio of the two frequencies. Such a low mode is a motion on isolators, which strains
       other springs than the measured modes. The masses of rigid-body modes have the relative
       deviation 2 s, because they are not measured.
+    - Where shapes were measured at known places, E is conditioned on them (Gaussian conditioning).
+      The noise of the shapes is drawn from its posterior distribution, which the difference of
+      measured and computed shapes gives. It contains errors of the model's shapes.
     - The poles of measured modes are drawn from their covariance. The damping ratios of other modes
       follow the predictive distribution (Student's) of the measured ratios.
 
