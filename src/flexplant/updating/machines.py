@@ -72,6 +72,9 @@ class Machines(Value):
     - The poles of measured modes are drawn from their covariance. The damping ratios of other modes
       follow the predictive distribution (Student's) of the measured ratios.
 
+    Errors that the evaluation model's mesh has above the measured band are not drawn. Take at least
+    eight elements per bending wave at the sampling rate of the plant, and `Modes.extrapolated`.
+
     Parameters
     ----------
     fit : UpdateResult
