@@ -40,7 +40,7 @@ _REACHED, _DESIGNS = 0.01, 8
 #: first guess: |S| crosses 1 at this fraction of the first frequency that the actuators move
 _FIRST = 1.0 / 3.0
 #: factor between bandwidths tried, how many, and halvings of an interval of it: 3 % of a bandwidth.
-#: If all of these hold, the first mode does not limit the bandwidth (a cable carrier's swing at
+#: If all of these agree, the first mode does not limit the bandwidth (a cable carrier's swing at
 #: 0.2 Hz on an axis of 60 Hz): each further step has one power more, up to twice as many steps
 _STEP, _MOST, _HALVINGS = 1.3, 8, 2
 #: modulus margin that is kept with any one mode off, as a fraction of the nominal one
@@ -388,7 +388,7 @@ class _StageTask(Design):
         now = min(_FIRST * float(self.frequencies[0]) / _CROSSES, self.highest)
         up = self.holds(now)
         step = _STEP
-        for k in range(2 * _MOST if up and self.plant.dt else _MOST):
+        for k in range(2 * _MOST if self.plant.dt else _MOST):
             bar.advance()
             step = _STEP ** max(1, 2 + k - _MOST)
             other = now * step if up else now / step
