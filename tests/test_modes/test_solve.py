@@ -169,7 +169,7 @@ def test_a_lost_partner_is_found_again(monkeypatch):
     assert_modes_of(model, modes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_count_that_does_not_agree_raises(monkeypatch):
     model = make_plate(elements=(24, 24))
     below = counted.modes_below

@@ -77,7 +77,7 @@ def test_the_workbench_begins_with_a_stable_loop(kind):
     np.testing.assert_allclose(shown.L[some], C * inner, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", FOLLOWED)
 def test_a_scan_and_its_report(kind, tmp_path):
     """Constant velocity of the first reference: feedforward makes the error far smaller."""
