@@ -43,7 +43,7 @@ class BrokenLoop:
     dt: float
     measured: FloatArray | None = None
     units: Mapping[str, str] = field(default_factory=dict)
-    #: units of the actuators that are much unlike, as multiples of their own
+    #: units of actuators whose forces differ much, as multiples of the unit of each
     forces: Callable[[], Mapping[str, str]] = dict
 
     def respond(self, freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:

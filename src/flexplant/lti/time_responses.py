@@ -127,8 +127,8 @@ def impulse(
     """Return the responses to an impulse of area 1 at each input, from rest.
 
     The result is ``y(t) = C e^(A t) B``. A direct gain D also passes the impulse itself at t = 0;
-    this part is left out. The input of a sampled system is a pulse of the height ``1 / dt`` that
-    lasts one sample. Its response includes the effect of D.
+    the impulse itself is left out. The input of a sampled system is a pulse of the height ``1 /
+    dt`` that lasts one sample. Its response includes the effect of D.
 
     Parameters
     ----------

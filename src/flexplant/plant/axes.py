@@ -308,7 +308,7 @@ def _balanced(G: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def force_units(plant: Partition) -> dict[str, str]:
-    """Return the unit of force of each actuator, a multiple of its own one, if that matters."""
+    """Return the unit of force of each actuator, as a multiple of its unit, if that matters."""
     # the loop at u is T C G, whose |S| is that of the axes times up to the condition number of T
     try:
         T = driven_axes(plant).T

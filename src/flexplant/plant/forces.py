@@ -115,7 +115,7 @@ class BaseAcceleration(ForcePort):
     represent. This is sufficient for free or suspended structures. For a structure that is held at
     some DOFs, pass the FEModel. An FEModel that was held by `fixed` keeps the part of the mass
     matrix that couples its free DOFs to the held ones. Matrices from which another program removed
-    the held DOFs have lost this part.
+    the held DOFs have lost these forces.
 
     Examples
     --------

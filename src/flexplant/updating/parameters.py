@@ -191,7 +191,7 @@ class AddedMass(PointParameter):
         Second place, for an inertia against the relative motion of two places. The vector r is
         then that of `at` minus that of `to`. None: the inertia acts against the absolute motion.
     bounds : (lowest, highest), optional
-        Limits of the parameter. None or infinity: there is no limit.
+        Limits of the parameter. None or infinity: not limited.
     prior : (mean, standard deviation), optional
         Normal distribution of the parameter that is known before the update.
 

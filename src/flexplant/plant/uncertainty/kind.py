@@ -94,7 +94,7 @@ class Uncertainty(Value):
         return ()
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return a system with the channels of `delta_blocks` in front of its own channels.
+        """Return a system whose first channels are those of `delta_blocks`.
 
         A kind without such blocks returns the system unchanged. `system` is the system of the
         plant, or one made from it, for example a continuous system that the bilinear map gives for

@@ -107,7 +107,7 @@ class UncertainPlant(Value, Generic[P]):
         return tuple(found)
 
     def with_blocks(self, system: StateSpace) -> StateSpace:
-        """Return a system of the plant with the channels of `delta_blocks` in front of its own."""
+        """Return a system of the plant whose first channels are those of `delta_blocks`."""
         for kind in self.kinds:
             system = kind.with_blocks(self.plant, system)
         return system

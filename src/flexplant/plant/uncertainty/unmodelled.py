@@ -123,7 +123,7 @@ class UnmodelledDynamics(Uncertainty):
         return [FullBlock(len(y or u), len(u or y), name=name)]
 
     def with_blocks(self, plant: Partition, system: StateSpace) -> StateSpace:
-        """Return a system of the plant with the channels of the Delta in front of its own."""
+        """Return a system of the plant whose first channels are those of the Delta."""
         if system.dt:  # by its bilinear image, in which a block has the same gain
             image = self.with_blocks(plant, bilinear(system, 1.0 / system.dt))
             return tustin(image, 1.0 / system.dt)

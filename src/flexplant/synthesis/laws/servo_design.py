@@ -105,7 +105,7 @@ def design_servo(
     notches : sequence of float [Hz], optional
         Frequencies of resonances to notch, each below half the rate. By default they are modes of
         the plant. They are added one by one while |S| at u is above 6 dB (or the loop is unstable)
-        and a notch lowers it. With an empty sequence there are no notches.
+        and a notch lowers it. An empty sequence means a law without notches.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
         Block whose outputs are the estimates `die:hat`, ...; by default the loop is checked with
         the true motion of the POI in their place.
