@@ -151,6 +151,8 @@ def test_refusals():
         worst_case_gain(uncertain(std=0.3), lead(gain=60.0), w=["d"], z=["tip:x"])
     with pytest.raises(ModelError, match=r"plant\.uncertain"):
         robust_stability(plant(), lead())
+    with pytest.raises(ModelError, match="would not be decided"):
+        robust_stability(uncertain(), lead(gain=15.0), resolution=1.0)
     late = plant(True).uncertain(Delay(0.2))
     with pytest.raises(ModelError, match=r"1 \+- 0.2 samples passes a whole number"):
         robust_stability(late, lead(True))

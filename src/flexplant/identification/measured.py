@@ -222,9 +222,9 @@ class MeasuredModes(Value):
     def merged(self, other: MeasuredModes) -> MeasuredModes:
         """Return the modes of two measurements: of two bands, directions or sets of sensors.
 
-        A mode that both contain is taken from `other`. The errors of the two are independent. The
-        result has a covariance if both have one, and mode shapes if both have them at the same
-        DOFs.
+        The modes of this measurement come first. A mode that both contain is taken from `other`.
+        The errors of the two are independent. The result has a covariance if both have one, and
+        mode shapes if both have them at the same DOFs.
 
         Parameters
         ----------

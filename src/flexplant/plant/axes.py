@@ -315,7 +315,7 @@ def force_units(plant: Partition) -> dict[str, str]:
     except (AssumptionError, ModelError):  # without axes there is nothing to compare by
         return {}
     scaled, sizes = _balanced(T.T)
-    if _evenness(scaled) <= _UNLIKE * _evenness(T / np.linalg.norm(T, axis=0)):
+    if _evenness(scaled) <= _UNLIKE * _evenness(T / divisor(np.linalg.norm(T, axis=0))):
         return {}
     forces = sizes.max() / sizes
     units = [plant.units.get(name, "") for name in plant.u]

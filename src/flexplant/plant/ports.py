@@ -103,9 +103,9 @@ class Poi(Value):
     name : str
         Name of the POI; its channels in z are `name:axis`.
     at : str, (3,) array [m] or mapping {place: weight}
-        A DOF label, any point of the structure, or a weighted sum of places. The direction of a
-        single label is ignored, because `axes` gives the directions. A weighted sum has one axis;
-        an example is ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``.
+        A DOF label, any point of the structure, or a weighted sum of places. If `axes` is
+        given, it replaces the direction of a single label. A weighted sum has one axis; an example
+        is ``{"1:z": 0.5, (0.3, 0.3, 0.0): 0.5}``.
     axes : sequence of str
         Motions among x, y, z [m], rx, ry, rz [rad]; a Reference uses the first one unless it names
         others. By default the direction of the label, that of the first translation (or else

@@ -288,7 +288,8 @@ class ReducedModel(Value):
         ----------
         measured : MeasuredModes
             Measured poles with their mode numbers, which count from 1 and include rigid-body modes.
-            A model can be calibrated by several measurements, one after the other.
+            A model can be calibrated by several measurements, one after the other, which are then
+            joined as by `MeasuredModes.merged` (shapes at other DOFs are lost).
 
         Raises
         ------

@@ -41,7 +41,8 @@ _REACHED, _DESIGNS = 0.01, 8
 _FIRST = 1.0 / 3.0
 #: factor between bandwidths tried, how many, and halvings of an interval of it: 3 % of a bandwidth.
 #: If all of these agree, the first mode does not limit the bandwidth (a cable carrier's swing at
-#: 0.2 Hz on an axis of 60 Hz): each further step has one power more, up to twice as many steps
+#: 0.2 Hz on an axis of 60 Hz): each further step has one power more, up to twice as many steps.
+#: Without a rate no bandwidth is too high, so that the search could go on for ever: it takes _MOST
 _STEP, _MOST, _HALVINGS = 1.3, 8, 2
 #: modulus margin that is kept with any one mode off, as a fraction of the nominal one
 _KEPT = 0.875

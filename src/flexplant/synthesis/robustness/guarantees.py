@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, positive, whole
+from ...arrays import ComplexArray, FloatArray, between, whole
 from ...certificates import Certificate, Verified, stability
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
@@ -192,7 +192,9 @@ def robust_stability(
     True
     """
     count = whole(machines, "machines", minimum=0, maximum=MOST)
-    least, chance = positive(resolution, "resolution"), generator(rng)
+    hint = "A mu between 1 and it would not be decided. Pass 0.25, or less for a sharper bound."
+    least = between(resolution, "resolution", 0.0, 1.0, hint)
+    chance = generator(rng)
     if quick:
         first = _quick(uncertain, blocks, count, chance)
         if first is not None:

@@ -324,8 +324,7 @@ class Cover:
         """Return scalings that hold at a frequency; the level is raised where it is too low."""
         enough = 0.97 * self.level
         found = upper_level(M, self.scalings, self._nearest(omega), enough=enough, widest=WIDE)
-        has_G = np.any(self.scalings.of_G) and not self.scalings.skewed
-        if found.level > enough and has_G:  # the level is raised only by what no G lowers
+        if found.level > enough and self.shares:  # the level is raised only by what no G lowers
             freer = upper_level(M, self.scalings, found.x, enough=enough)
             found = min(found, freer, key=itemgetter(0))
         self.found.append((omega, found.level))
