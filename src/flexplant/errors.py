@@ -229,10 +229,12 @@ def only_one(kind: str, names: Iterable[str], given: Any, how: str) -> str:
     known = list(names)
     if given is not None:
         require_known(kind, [given], known)
+    elif not known:
+        raise LabelError(f"there is no {kind}. Add one to the plant's ports, or say {how}.")
     elif len(known) != 1:
-        listed = f" ({some_names(known)})" if known else ""
-        named = repr(known[0]) if known and how.endswith("=") else ""
-        raise LabelError(f"there are {counted(len(known), kind)}{listed}: say which, {how}{named}.")
+        named = repr(known[0]) if how.endswith("=") else ""
+        listed = f"{counted(len(known), kind)} ({some_names(known)})"
+        raise LabelError(f"there are {listed}: say which, {how}{named}.")
     return known[0] if given is None else str(given)
 
 

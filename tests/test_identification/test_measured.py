@@ -163,6 +163,9 @@ def test_two_measurements_are_merged_by_mode_number(seed):
         )
         for name in ("poles", "covariance", "shapes"):
             np.testing.assert_array_equal(getattr(own, name), getattr(other, name))
+    # the same DOFs in another order are the same DOFs
+    turned = low.replace(shapes=low.shapes[::-1], dofs=low.dofs[::-1])
+    np.testing.assert_array_equal(turned.merged(high).shapes, both.shapes)
     # errors of two measurements are independent
     apart = [0, 1, 6, 7], [2, 3, 4, 5, 8, 9, 10, 11]
     assert not np.any(both.covariance[np.ix_(*apart)])

@@ -224,7 +224,7 @@ class MeasuredModes(Value):
 
         The modes of this measurement come first. A mode that both contain is taken from `other`.
         The errors of the two are independent. The result has a covariance if both have one, and
-        mode shapes if both have them at the same DOFs.
+        mode shapes if both have them at the same DOFs, in any order.
 
         Parameters
         ----------
@@ -266,9 +266,10 @@ class MeasuredModes(Value):
             modes=[number for part in parts for number in part.modes or ()],
             covariance=covariance,
         )
-        if self.dofs is None or self.dofs != other.dofs:
+        if self.dofs is None or other.dofs is None or {*self.dofs} != {*other.dofs}:
             return found
         shapes: list[Any] = [part.shapes for part in parts]
+        shapes[0] = shapes[0][[self.dofs.index(label) for label in other.dofs]]
         places = {"dofs": other.dofs, "xyz": other.xyz, "directions": other.directions}
         return found.replace(shapes=np.hstack(shapes), **places)
 
