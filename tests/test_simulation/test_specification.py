@@ -115,6 +115,6 @@ def test_the_only_error_is_meant_or_one_is_named():
             found = fx.Specification(**servo).check(loop)
             assert found["noise"] == loop.rms("tip:error")
         else:
-            with pytest.raises(LabelError, match=r"0 error channels: say which, .* channel="):
+            with pytest.raises(LabelError, match=r"no error channel\. .* channel="):
                 fx.Specification(**servo).check(loop)
             assert fx.Specification(**servo, channel="tip:x").check(loop)["noise"] > 0
