@@ -247,3 +247,13 @@ def test_narrow_poles_of_the_controller_below_and_between_the_lines_are_counted_
         known[bool(np.any(la.eigvals(Ak).real > 0.0)), found is not None] += 1
         assert found in (None, np.count_nonzero(poles.real > 0.0)), seed
     assert known[True, True] > 8 and known[False, True] > 8
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_a_line_on_the_critical_point_is_named(axes):
+    freq, names = np.arange(1.0, 41.0), [f"y{i}" for i in range(axes)]
+    data = np.eye(axes)[:, :, None] * (10.0 / (10.0 + 1j * (freq - 10.0)))
+    K = StateSpace([], [], [], np.eye(axes), inputs=names, outputs=[f"u{i}" for i in range(axes)])
+    found = broken_count(measured_between(Frf(freq, data, K.outputs, names), K, {}), None, 0)
+    assert found.unstable is None
+    assert "a line lies on the critical point" in found.reason

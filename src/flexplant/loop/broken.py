@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, short
 from ..lti.frequency_sweep import SOUGHT, climbed_grid, highest, resonance_grid
-from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
+from ..lti.measured_lines import FEWEST, HiddenModes, MeasuredPlant
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
@@ -41,7 +41,7 @@ class BrokenLoop:
     plant: Responder
     poles: Callable[[], ComplexArray]
     dt: float
-    measured: FloatArray | None = None
+    measured: MeasuredPlant | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     #: units of actuators whose forces differ much, as multiples of the unit of each
     forces: Callable[[], Mapping[str, str]] = dict
@@ -63,19 +63,19 @@ class BrokenLoop:
     def grid(self) -> FloatArray:
         """Frequencies [Hz] through the resonances of the closed loop, or the measured lines."""
         if self.measured is not None:
-            return self.measured
+            return self.measured.freq
         return resonance_grid(self.poles(), self.dt)
 
     @cached_property
     def hidden(self) -> HiddenModes:
-        """Modes between the lines of a measured plant."""
-        lines = self.grid
-        return hidden_modes(lines, self.plant(lines), self.controller(lines))
+        """Modes between the lines of a measured plant, or between the frequencies of the grid."""
+        plant = self.measured or MeasuredPlant(self.grid, self.plant(self.grid))
+        return plant.hidden(self.controller(self.grid))
 
     @cached_property
     def followed(self) -> FloatArray:
         """The grid, and frequencies through the modes between the lines of a measured plant."""
-        if self.measured is None or self.measured.size < FEWEST:
+        if self.measured is None or self.grid.size < FEWEST:
             return self.grid
         return np.union1d(self.grid, self.hidden.found)
 

@@ -11,7 +11,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..lti.frequency import Frf, frequency_response
 from ..lti.frequency_sweep import around_resonance
-from ..lti.measured_lines import FEWEST, SHOWN, STEP, HiddenModes, free_motions, low_slope, on_lines
+from ..lti.measured_lines import FEWEST, SHOWN, STEP, HiddenModes, MeasuredPlant, on_lines
 from ..lti.response_solvers import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import MOST_STEPS, SAME, TINY
@@ -127,14 +127,13 @@ def measured_between(plant: Frf, controller: StateSpace, quantities: dict[str, s
     controller = controller.select(driven)
     # at 0 Hz a free body and an integrator are infinite
     lines, P = np.array(plant.freq), plant.select(controller.inputs, driven).data
-    lines, P = lines[lines > 0], P[:, :, lines > 0]
-    if not lines.size:
+    measured = MeasuredPlant(lines[lines > 0], P[:, :, lines > 0])
+    if not measured.freq.size:
         raise ModelError("the Frf has no line above 0 Hz, which a loop needs: measure more lines.")
     return BrokenLoop(
         tuple(driven), tuple(controller.inputs),
-        lambda freq: frequency_response(controller, freq).data,
-        lambda freq: on_lines(lines, P, freq),
-        controller.poles, controller.dt, lines, {**controller.units, **plant.channel_units},
+        lambda freq: frequency_response(controller, freq).data, measured.at,
+        controller.poles, controller.dt, measured, {**controller.units, **plant.channel_units},
     )  # fmt: skip
 
 
@@ -256,8 +255,7 @@ class NyquistCount(NamedTuple):
 
 
 def nyquist_count(
-    lines: FloatArray,
-    plant: ComplexArray,
+    plant: MeasuredPlant,
     controller: Responder,
     hidden: HiddenModes,
     *,
@@ -275,28 +273,27 @@ def nyquist_count(
     controller, which is known everywhere, F is followed between the lines and below them. A count
     that hangs on an error of the continued plant is not known.
     """
-    slowest = float(np.abs(poles).min(initial=np.inf))
+    lines, slowest = plant.freq, float(np.abs(poles).min(initial=np.inf))
     reach = _BELOW * min(1.0, slowest / float(lines[0]))
     low = lines[0] * np.geomspace(reach, 1.0, round(-_DENSE * np.log10(reach)))[:-1]
-    freq = np.concatenate([low, lines])
+    freq, respond = np.concatenate([low, lines]), _continued(plant, rigid)
 
     def gain(at: FloatArray) -> ComplexArray:
-        P = _continued(lines, plant, rigid, at)
-        return np.asarray(np.einsum("uyf,yvf->fuv", controller(at), P))
+        return np.asarray(np.einsum("uyf,yvf->fuv", controller(at), respond(at)))
 
-    F = np.linalg.det(np.eye(plant.shape[1]) - gain(freq))
+    F = np.concatenate([np.linalg.det(np.eye(plant.data.shape[1]) - gain(low)), hidden.F])
     if not np.all(np.abs(F) > 0.0):
         return NyquistCount(None, "a line lies on the critical point")
     path = _past_poles(freq, poles)
     places, turns = _followed(gain, freq, path, below=low.size)
-    direct = np.angle(F[1:] / F[:-1])
+    direct = np.angle(F[1:][places] / F[:-1][places])
     steps, unknown, undecided = (
         np.concatenate([np.zeros(low.size, dtype=part.dtype), part])
         for part in (hidden.step, hidden.unknown, hidden.undecided)
     )
-    other = np.abs(turns - direct[places]) > np.pi
+    other = np.abs(turns - direct) > np.pi
     # where a mode of the plant and a pole of the controller turn F, neither path holds both
-    both = other & (places >= low.size) & (np.abs(steps - direct)[places] > np.pi)
+    both = other & (places >= low.size) & (np.abs(steps[places] - direct) > np.pi)
     unknown[places] |= both | np.isnan(turns)
     steps[places] = np.where(other | (places < low.size), turns, steps[places])
     for open_, what in (
@@ -369,11 +366,11 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         )
     zero = np.abs(distance) <= SAME * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
-    plant = parts.plant(grid)
-    rigid = free_motions(grid, plant) if rigid is None else rigid
+    plant = parts.measured
+    rigid = plant.free_motions if rigid is None else rigid
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
     swing = distance[~zero] / (2j * np.pi * (parts.dt or 1.0))
-    slope = low_slope(grid, plant)
+    slope = plant.slope
     if abs(slope - (2 if rigid else 0)) > 1.0:
         return NyquistCount(
             None,
@@ -382,7 +379,7 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
             "rigid=, or measure at lower frequencies",
         )
     return nyquist_count(
-        grid, plant, parts.controller, parts.hidden,
+        plant, parts.controller, parts.hidden,
         rigid=rigid, at_zero=at_zero, unstable=unstable + own, poles=swing,
     )  # fmt: skip
 
@@ -426,22 +423,22 @@ def _followed(
     return places, steps[places]
 
 
-def _continued(
-    lines: FloatArray, plant: ComplexArray, rigid: int, freq: FloatArray
-) -> ComplexArray:
-    """Return a measured plant (ny, nu, n) on its lines, between them and below them."""
+def _continued(plant: MeasuredPlant, rigid: int) -> Responder:
+    """Return the response of a measured plant on its lines, between them and below them."""
     # below the lines: the largest directions, those of the rigid-body modes, fall with f^2, the
     # others are constant; the imaginary part (delay) falls with another factor f
-    low = freq[freq < lines[0]] / lines[0]
-    first = plant[:, :, 0]
+    first, lowest = plant.data[:, :, 0], plant.freq[0]
     left, sizes, right = np.linalg.svd(first.real)
     to, fro = left[:, :rigid], right[:rigid]
     free = (to * sizes[:rigid]) @ fro + 1j * (to @ to.T @ first.imag @ fro.T @ fro)
-    held = first - free
 
-    def over(part: ComplexArray, fall: FloatArray) -> ComplexArray:
+    def over(part: ComplexArray, low: FloatArray, fall: FloatArray) -> ComplexArray:
         whole = part[:, :, None]
         return np.asarray((whole.real + 1j * low * whole.imag) / fall)
 
-    below = over(free, low**2) + over(held, np.ones(low.size))
-    return np.concatenate([below, on_lines(lines, plant, freq[low.size :])], axis=2)
+    def found(freq: FloatArray) -> ComplexArray:
+        low = freq[freq < lowest] / lowest
+        below = over(free, low, low**2) + over(first - free, low, np.ones(low.size))
+        return np.concatenate([below, plant.at(freq[low.size :])], axis=2)
+
+    return found

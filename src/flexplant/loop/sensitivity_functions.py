@@ -280,7 +280,7 @@ def _checked_freq(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
         raise ShapeError("freq must hold at least one frequency [Hz], got none. Pass one.")
     if grid[0] <= 0:
         raise ModelError("freq must be positive: integrators and free bodies are infinite at 0.")
-    if parts.measured is not None and not np.all(np.isin(grid, parts.measured)):
+    if parts.measured is not None and not np.all(np.isin(grid, parts.grid)):
         raise ModelError(
             "the plant is a measured Frf, known only at its own frequencies: leave freq out."
         )

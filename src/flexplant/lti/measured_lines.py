@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,8 +168,10 @@ FEWEST = LINES + 2
 
 
 class HiddenModes(NamedTuple):
-    """Information on a loop in each interval between two lines of its plant."""
+    """The loop on the lines of its plant, and in each interval between two of them."""
 
+    #: det(I - K P) on the lines
+    F: ComplexArray
     step: FloatArray
     unknown: npt.NDArray[np.bool_]
     undecided: npt.NDArray[np.bool_]
@@ -183,108 +186,148 @@ def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
     return -float(np.polyfit(np.log(freq[low]), np.log(size), 1)[0])
 
 
-def free_motions(freq: FloatArray, plant: ComplexArray) -> int:
-    """Return the number of directions of P (ny, nu, n) with slope 2 at the lowest lines."""
-    low = _lowest(freq)
-    sizes = np.linalg.svd(np.moveaxis(plant[:, :, low], -1, 0), compute_uv=False)
-    slopes = -np.polyfit(np.log(freq[low]), np.log(np.maximum(sizes, TINY)), 1)[0]
-    free = (slopes > 1.0) & (sizes[0] > ROUNDING * sizes[0, 0])
-    return int(np.cumprod(free).sum())
-
-
 def _lowest(freq: FloatArray) -> BoolArray:
     """Return the lines that show how a plant continues to lower frequencies."""
     return np.asarray(freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)]))
 
 
-def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray) -> HiddenModes:
-    """Return what lies between lines."""
-    # with S K that of one end, `det(I - L)` changes over an interval as `1 - g`, `g = tr(S K P) = a
-    # + b f + rho / (f - p)`: a mode p of the plant becomes `p + d` in the loop, where d is rho over
-    # the rest of 1 - g. Three fits through four lines each, with S K of both ends, find p and d.
-    # Where they agree there is a mode, which is unstable in the loop when its half-width Im p is
-    # below -Im d; where they do not agree, d bounds a hidden mode
-    slope = 2 if low_slope(freq, plant) > 1.0 else 0  # f^slope P is level at the lowest lines
-    plant, controller = (np.moveaxis(part, -1, 0) for part in (plant, controller))
-    n, L = freq.size, controller @ plant
-    eye = np.eye(L.shape[-1])
-    F, SK = np.linalg.det(eye - L), np.linalg.inv(eye - L) @ controller
-    i, wide, middle = np.arange(n - 1), np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
-    level = plant * (freq**slope)[:, None, None]
-    first = np.clip(i - 2, 0, n - FEWEST)
-    h = np.array([freq[first + j] - middle for j in range(FEWEST)])
-    is_single = level[0].size == 1
-    if is_single:  # a factor on the plant moves no pole
-        single = _three_fits(h, level[first + np.arange(FEWEST)[:, None], 0, 0])
-    poles, moves, others = [], [], []
-    for base in (0, 1):
-        at = freq[i + base]
-        weight = SK[i + base] / (at**slope)[:, None, None]
-        ends = [np.einsum("fuy,fyu->f", weight, level[i + end]) for end in (0, 1)]
-        if is_single:
-            p, rho, tail = single[0], weight[:, 0, 0] * single[1], abs(weight[:, 0, 0]) * single[2]
-        else:
-            g = [np.einsum("fuy,fyu->f", weight, level[first + j]) for j in range(FEWEST)]
-            p, rho, tail = _three_fits(h, np.array(g))
+class _Fits(NamedTuple):
+    """Three fits of ``g = a + b f + rho / (f - p)``, p from the middle, in each interval."""
+
+    pole: ComplexArray
+    #: rho at a line next to it, and the rest of g there
+    residue: ComplexArray
+    rest: ComplexArray
+    #: rho of another mode in the middle, if one fit shows more
+    other: FloatArray
+
+
+class MeasuredPlant:
+    """A plant (ny, nu, n_freq) at its lines [Hz], and what follows from it for all its loops."""
+
+    def __init__(self, freq: FloatArray, data: ComplexArray) -> None:
+        self.freq, self.data = freq, data
+
+    def at(self, freq: FloatArray) -> ComplexArray:
+        """Return the response at frequencies within the lines."""
+        return on_lines(self.freq, self.data, freq)
+
+    @cached_property
+    def slope(self) -> float:
+        """The slope at the lowest lines: 2 for a free body, 0 for a held one."""
+        return low_slope(self.freq, self.data)
+
+    @cached_property
+    def free_motions(self) -> int:
+        """The number of directions with slope 2 at the lowest lines."""
+        low = _lowest(self.freq)
+        sizes = np.linalg.svd(np.moveaxis(self.data[:, :, low], -1, 0), compute_uv=False)
+        slopes = -np.polyfit(np.log(self.freq[low]), np.log(np.maximum(sizes, TINY)), 1)[0]
+        free = (slopes > 1.0) & (sizes[0] > ROUNDING * sizes[0, 0])
+        return int(np.cumprod(free).sum())
+
+    def hidden(self, controller: ComplexArray) -> HiddenModes:
+        """Return what lies between lines in the loop with K (nu, ny, n_freq)."""
+        # with S K that of one end, `det(I - L)` changes over an interval as `1 - g`, `g = tr(S K P)
+        # = a + b f + rho / (f - p)`: a mode p of the plant becomes `p + d` in the loop, where d is
+        # rho over the rest of 1 - g. Three fits through four lines each, with S K of both ends,
+        # find p and d. Where they agree there is a mode, which is unstable in the loop when its
+        # half-width Im p is below -Im d; where they do not agree, d bounds a hidden mode
+        K, P = np.moveaxis(controller, -1, 0), np.moveaxis(self.data, -1, 0)
+        difference = np.eye(K.shape[1]) - K @ P
+        poles, moves, others = [], [], []
+        is_single = P[0].size == 1
+        F = difference[:, 0, 0] if is_single else np.linalg.det(difference)
+        if not np.all(np.abs(F) > 0.0):  # a line lies on the critical point
+            step = np.zeros(F.size - 1)
+            return HiddenModes(F, step, step == 0.0, step != 0.0, step, step[:0])
+        SK = K / difference if is_single else np.linalg.inv(difference) @ K
+        for base in (0, 1):
+            part = slice(base, self.freq.size - 1 + base)
+            weight = SK[part] / (self.freq[part] ** self._power)[:, None, None]
+            if is_single:  # a factor on the plant moves no pole
+                factor, fits = np.asarray(weight[:, 0, 0]), self._single[base]
+            else:
+                g = [np.einsum("fuy,fyu->f", weight, self._level[at]) for at in self._near]
+                factor, fits = np.ones(1, complex), self._fits(np.array(g), base)
+            scale = 1.0 + factor * fits.rest
+            poles.append(fits.pole)
+            moves.append(np.asarray(factor * fits.residue / scale))
+            others.append(np.abs(factor / scale) * fits.other)
+        p, d = np.concatenate(poles), np.concatenate(moves)
+        return _hidden_modes(self.freq, F, p, d, np.concatenate(others))
+
+    @cached_property
+    def _power(self) -> int:
+        """The power of f that makes P level at the lowest lines."""
+        return 2 if self.slope > 1.0 else 0
+
+    @cached_property
+    def _level(self) -> ComplexArray:
+        return np.asarray(np.moveaxis(self.data, -1, 0) * (self.freq**self._power)[:, None, None])
+
+    @cached_property
+    def _near(self) -> IntArray:
+        """The lines (FEWEST, n - 1) of the fits of each interval."""
+        first = np.clip(np.arange(self.freq.size - 1) - 2, 0, self.freq.size - FEWEST)
+        return np.asarray(first + np.arange(FEWEST)[:, None])
+
+    @cached_property
+    def _single(self) -> tuple[_Fits, _Fits]:
+        g = self._level[self._near, 0, 0]
+        return self._fits(g, 0), self._fits(g, 1)
+
+    def _fits(self, g: ComplexArray, base: int) -> _Fits:
+        """Return the fits to g (FEWEST, n - 1) near each interval, for S K of one of its ends."""
+        freq, i = self.freq, np.arange(self.freq.size - 1)
+        wide, middle = np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
+        h = freq[self._near] - middle
+        parts = [slice(j, j + LINES) for j in range(FEWEST - LINES + 1)]
+        each = zip(*(pole_between(h[some], g[some]) for some in parts), strict=True)
+        p, rho, tail = map(np.array, each)
+        ends = [g[i - self._near[0] + k, i] for k in (0, 1)]
         near = np.clip(p.real, -0.5 * wide, 0.5 * wide)
         left, right = (ends[k] - rho / ((k - 0.5) * wide - p) for k in (0, 1))
-        moved = (at / (middle + near)) ** slope
-        scale = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
-        poles.append(p)
-        moves.append(moved * rho / scale)
-        # rho of another mode in the middle, if one fit shows more
-        more = np.max(np.abs(p[:, None] - p) * tail, axis=1)
-        others.append(more / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(scale)))
-    found = (np.concatenate(parts) for parts in (poles, moves, others))
-    return _hidden_modes(freq, F, *found)
-
-
-def _three_fits(h: FloatArray, g: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return `pole_between` of the first four, the middle and the last four of some lines."""
-    parts = [slice(j, j + LINES) for j in range(FEWEST - LINES + 1)]
-    p, rho, tail = zip(*(pole_between(h[some], g[some]) for some in parts), strict=True)
-    return np.array(p), np.array(rho), np.array(tail)
+        moved = (freq[i + base] / (middle + near)) ** self._power
+        rest = ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
+        other = np.max(np.abs(p[:, None] - p) * tail, axis=1)
+        return _Fits(p, moved * rho, rest, other / np.maximum(np.abs(p), 0.5 * wide))
 
 
 def _hidden_modes(
     freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, others: FloatArray
 ) -> HiddenModes:
     """Return results of fits (k, n - 1): poles p from the middle of each interval, and shifts d."""
-    other = others.max(axis=0)
     wide, middle = np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
-    step, least = np.angle(F[1:] / F[:-1]), _LEAST * middle
+    step, least, other = np.angle(F[1:] / F[:-1]), _LEAST * middle, others.max(axis=0)
     acts = (np.abs(p.real) <= (0.5 + _ASIDE) * wide) & (np.abs(d) > least)
-    there, size = acts.any(axis=0), np.abs(d)
-    error = _SAFETY * _box_size(p)
+    far = np.abs(step) > STEP  # also next to a mode of a neighbouring interval
+    unknown, undecided = np.zeros((2, step.size), dtype=bool)
+    narrow, most = np.where(other > least, other, 0.0), SHOWN * wide
+    at = np.flatnonzero(acts.any(axis=0) | far)  # no mode acts in the other intervals
+    p, d, acts, far = p[:, at], d[:, at], acts[:, at], far[at]
+    wide, middle, least = wide[at], middle[at], least[at]
+    size, error = np.abs(d), _SAFETY * _box_size(p)
     width, needed = p.imag, -d.imag
     alike = (error < _FOUND * wide) & (_box_size(d) < _ALIKE * size.max(axis=0))
-    found = there & alike & (width.min(axis=0) > -error)
+    found = acts.any(axis=0) & alike & (width.min(axis=0) > -error)
     turn = _phase_change(p + d, wide) - _phase_change(p, wide)
-    turns = np.round((turn - step) / (2.0 * np.pi))
-    followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < STEP
+    turns = np.round((turn - step[at]) / (2.0 * np.pi))
+    followed = np.abs(turn - step[at] - 2.0 * np.pi * turns).max(axis=0) < STEP
     followed &= turns.max(axis=0) == turns.min(axis=0)
-    far = np.abs(step) > STEP  # also next to a mode of a neighbouring interval
-    turns = np.where(found | (far & alike & followed), turns[0], 0.0)
-    unknown = np.where(found, ~followed, far & ~(alike & followed))
+    unknown[at] = np.where(found, ~followed, far & ~(alike & followed))
     critical = np.max(np.where(acts, np.where(found, needed, size), 0.0), axis=0, initial=0.0)
     safe = (critical <= least) | (width.min(axis=0) - error > critical)
     unstable = found & (width.max(axis=0) + error < needed.min(axis=0))
-    undecided = found & ~safe & ~unstable & ((p + d).imag.min(axis=0) < 0.0)
-    narrow = np.maximum(
-        np.where(safe | unstable, 0.0, critical), np.where(other > least, other, 0.0)
-    )
-    near = [middle + at.mean(axis=0) for at in (p, p + d)]
+    undecided[at] = found & ~safe & ~unstable & ((p + d).imag.min(axis=0) < 0.0)
+    narrow[at] = np.maximum(narrow[at], np.where(safe | unstable, 0.0, critical))
+    step[at] += 2.0 * np.pi * np.where(found | (far & alike & followed), turns[0], 0.0)
+    near = [middle + pole.mean(axis=0) for pole in (p, p + d)]
     through = np.concatenate(
-        [at[found].real + np.abs(at[found].imag) * around_resonance()[:, None] for at in near]
+        [one[found].real + np.abs(one[found].imag) * around_resonance()[:, None] for one in near]
     )
-    through = through[(through > freq[0]) & (through < freq[-1])]
-    return HiddenModes(
-        step + 2.0 * np.pi * turns,
-        unknown,
-        undecided,
-        np.minimum(2.0 * narrow, SHOWN * wide),
-        np.unique(through),
-    )
+    through = np.unique(through[(through > freq[0]) & (through < freq[-1])])
+    return HiddenModes(F, step, unknown, undecided, np.minimum(2.0 * narrow, most), through)
 
 
 def _box_size(values: ComplexArray) -> FloatArray:

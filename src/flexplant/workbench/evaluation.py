@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,8 +20,8 @@ from ..loop.sensitivity_functions import broken_bandwidth
 from ..lti.frequency import Frf
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.interconnection import loop_poles, side_by_side
-from ..lti.measured_lines import low_slope, on_lines
-from ..lti.response_solvers import Responder, responder
+from ..lti.measured_lines import MeasuredPlant, low_slope
+from ..lti.response_solvers import Responder, remembered, responder
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from ..synthesis.laws.law import Axes, Law
@@ -55,8 +54,7 @@ class BenchMachine:
         """The response (n, n, k) of the axes at frequencies [Hz], between measured lines too."""
         if not self.is_measured:
             return responder(self.axes.plant)
-        lines, data = self.axes.plant.freq, self.axes.plant.data
-        return lambda freq: on_lines(lines, data, freq)
+        return MeasuredPlant(self.axes.plant.freq, self.axes.plant.data).at
 
     @cached_property
     def freq(self) -> FloatArray:
@@ -102,10 +100,12 @@ _NONE = NyquistCount(0)
 class OthersClosed:
     """The plant of one axis with the loops of all other axes closed."""
 
+    #: response (n_freq,) at the frequencies of the machine, and (1, 1, k) at any
     G: ComplexArray
-    respond: Callable[[FloatArray], ComplexArray]
+    respond: Responder
     count: NyquistCount
     closed: tuple[str, ...]
+    measured: MeasuredPlant | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class AxisLoop:
     @cached_property
     def C(self) -> ComplexArray:
         """The response of the control law."""
-        return self.law.at(self.freq)
+        return np.asarray(-self.parts.controller(self.freq)[0, 0])
 
     @cached_property
     def margins(self) -> LoopMargins:
@@ -193,15 +193,14 @@ class Evaluator:
 
     def __init__(self) -> None:
         self._kept: dict[tuple[int, str], _Kept] = {}
+        self._law: Law | None = None
 
     def loop(self, machine: BenchMachine, design: LoopDesign, name: str) -> AxisLoop:
         """Return the loop of one axis, with the loops of the others on or off as in the design."""
         law, others = design.laws[name], self._with_others(machine, design, name)
         parts = self._broken(machine, design, name, others)
-        rigid = 0
-        if machine.is_measured:
-            free = low_slope(machine.freq, others.G[None, None]) > _FREE
-            rigid = int(free and design.rigid > 0)
+        free = others.measured is not None and others.measured.slope > _FREE
+        rigid = int(free and design.rigid > 0)
         count = broken_count(parts, rigid, design.unstable + (others.count.unstable or 0))
         if others.count.unstable is None:  # the count of this axis needs that of the others
             count = NyquistCount(None, f"the other axes: {others.count.reason}")
@@ -216,11 +215,6 @@ class Evaluator:
         laws = design.laws
         law = laws[name]
 
-        def plant(freq: FloatArray) -> ComplexArray:
-            if machine.is_measured:
-                return on_lines(machine.freq, others.G, freq)[None, None]
-            return others.respond(freq)[None, None]
-
         def poles() -> ComplexArray:
             if machine.is_measured:
                 return law.system.poles()
@@ -231,9 +225,16 @@ class Evaluator:
             return loop_poles(machine.axes.plant.select(chosen, inputs), K)
 
         return BrokenLoop(
-            (name,), (name,), lambda freq: -law.at(freq)[None, None], plant, poles,
-            1.0 / law.rate if law.rate else 0.0, machine.freq if machine.is_measured else None,
+            (name,), (name,), self._controller(law), others.respond, poles,
+            1.0 / law.rate if law.rate else 0.0, others.measured,
         )  # fmt: skip
+
+    def _controller(self, law: Law) -> Responder:
+        """Return minus the response of a law, stored on the lines that machines share."""
+        if self._law is not law:
+            self._law = law
+            self._respond = remembered(lambda freq: -law.at(freq)[None, None])
+        return self._respond
 
     def _with_others(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
         """Return the axis with the others closed; kept until one of them changes."""
@@ -256,19 +257,26 @@ def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> Othe
     names = list(design.axes)
     a = names.index(name)
     closed = tuple(n for n in names if n != name and design.axes[n].closed)
-    if not closed:
-        return OthersClosed(machine.G[a, a], lambda f: machine.respond(f)[a, a], _NONE, closed)
     o, laws = [names.index(n) for n in closed], [design.laws[n] for n in closed]
 
     def reduced(freq: FloatArray, G: ComplexArray) -> ComplexArray:
+        if not closed:
+            return np.asarray(G[a, a])
         C = np.array([law.at(freq) for law in laws])
         back = np.eye(len(o))[:, :, None] + G[np.ix_(o, o)] * C
         fed = np.linalg.solve(np.moveaxis(back, 2, 0), np.moveaxis(G[np.ix_(o, [a])], 2, 0))
         return np.asarray(G[a, a] - np.einsum("of,fo->f", G[a, o] * C, fed[:, :, 0]))
 
-    count = _count_others(machine, design, o, laws) if machine.is_measured else _NONE
     G = reduced(machine.freq, machine.G)
-    return OthersClosed(G, lambda f: reduced(f, machine.respond(f)), count, closed)
+    if not machine.is_measured:
+
+        def respond(freq: FloatArray) -> ComplexArray:
+            return reduced(freq, machine.respond(freq))[None, None]
+
+        return OthersClosed(G, respond, _NONE, closed, None)
+    count = _count_others(machine, design, o, laws) if closed else _NONE
+    measured = MeasuredPlant(machine.freq, G[None, None])
+    return OthersClosed(G, measured.at, count, closed, measured)
 
 
 def _count_others(
@@ -286,9 +294,10 @@ def _count_others(
     poles = np.concatenate([law.system.poles() for law in laws])
     each = [low_slope(machine.freq, machine.G[i : i + 1, i : i + 1]) for i in o]
     rigid = sum(slope > _FREE for slope in each) if design.rigid else 0
+    measured = MeasuredPlant(machine.freq, machine.G[chosen])
     parts = BrokenLoop(
-        names, names, controller, lambda freq: machine.respond(freq)[chosen], lambda: poles,
-        1.0 / design.rate if design.rate else 0.0, machine.freq,
+        names, names, controller, measured.at, lambda: poles,
+        1.0 / design.rate if design.rate else 0.0, measured,
     )  # fmt: skip
     return broken_count(parts, rigid, 0)
 

@@ -14,7 +14,7 @@ from ...arrays import ComplexArray, FloatArray, IntArray
 from ...errors import SolverError
 from ...loop.measured_loop import nyquist_count
 from ...lti.frequency_sweep import local_maxima
-from ...lti.measured_lines import FEWEST, between_lines, hidden_modes, steps_between
+from ...lti.measured_lines import FEWEST, MeasuredPlant, between_lines, steps_between
 from ...tolerances import DEVIATIONS, TINY
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section, product, tustin_s
@@ -422,10 +422,10 @@ def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid:
     if freq.size < FEWEST:
         return False
     integrators = sum(any(isinstance(f, Pid) and f.i for f in law.factors) for law in laws)
-    hidden, at_zero = hidden_modes(freq, P, respond(freq)), 2 * rigid + integrators
+    plant = MeasuredPlant(freq, P)
     count = nyquist_count(
-        freq, P, respond, hidden,
-        rigid=rigid, at_zero=at_zero, unstable=0, poles=np.zeros(0, dtype=complex),
+        plant, respond, plant.hidden(respond(freq)),
+        rigid=rigid, at_zero=2 * rigid + integrators, unstable=0, poles=np.zeros(0, dtype=complex),
     )  # fmt: skip
     return count.unstable == 0
 
