@@ -87,15 +87,17 @@ functions in other tools.
 - run a controller in C with the machine, at 10 kHz: `examples/real_time.py`
 
 **Compared with other packages.** CPU seconds on one core of a server, for flexplant and another
-package (peer) in one run of ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio
-above 1 means that flexplant is faster. Before the times are taken, the results are compared. Times
-vary by about 20 % from run to run. In this run other work used both cores (load 11 to 13), which
-makes quick calls up to 50 % slower.
+package (peer), each row in one run of
+``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio above 1 means that flexplant
+is faster. Before the times are taken, the results are compared. Times vary by about 20 % from run
+to run. Meanwhile other work used both cores (load 8 to 13), which makes quick calls up to 50 %
+slower.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 4.4 s | scipy eigsh | 36 s | 8.2 |
-| 24 modes of a plate, 30 603 DOFs | 1.5 s | scipy eigsh on CHOLMOD | 1.7 s | 1.1 |
+| 24 modes of a solid, 27 783 DOFs | 2.9 s | scipy eigsh | 23 s | 7.8 |
+| 24 modes of a plate, 30 603 DOFs | 0.95 s | scipy eigsh on CHOLMOD | 0.98 s | 1 |
+| 24 modes of a plate, 30 603 DOFs | 1 s | scipy eigsh on PARDISO | 0.76 s | 0.76 |
 | all 243 modes of a plate, dense | 15 ms | scipy eigh | 5.5 ms | 0.37 |
 | 200 lines of a plate's responses, 30 000 DOFs | 2.2 s | scipy splu (4 of them) | 560 s | 250 |
 | 8 x 8 frequency responses, 10 000 lines | 9.1 ms | python-control, slycot | 0.21 s | 23 |
@@ -119,9 +121,12 @@ plate, a third of the time goes into residuals. Another third goes into the sepa
 motions and the full accuracy of soft modes. The zero-order hold returns a checked system with
 names. For H-infinity of 3 states, the smallest possible norm is bounded to 1 %, and the norm of
 the loop is computed twice. For mu there is also a lower bound, from a perturbation that reaches it.
-With a factor of CHOLMOD, eigsh is 1.4 times faster than `solve_modes` on a plate of 10 000 DOFs. It
-is as fast on plates of 30 000 and 99 000 DOFs, and takes twice as long on a solid of 28 000 DOFs
-(``tests/benchmarks/modes_peers.py``, whose peer is the wheel `sksparse-minimal`).
+With a factor of CHOLMOD or of MKL PARDISO, eigsh is twice as fast as `solve_modes` on a plate of
+10 000 DOFs. With PARDISO it is 1.3 times faster on a plate of 30 000 DOFs, 1.2 times on one of 99
+000, and as fast on a solid of 28 000. With CHOLMOD it is as fast on the first, and 1.2 and 2.3
+times slower on the others (``tests/benchmarks/modes_peers.py``, whose peers are the wheels
+`sksparse-minimal` and `pypardiso`). `solve_modes` on a factor of PARDISO was at most 1.2 times
+faster than on its own, because count, orthogonalisation and checks are the larger part.
 ``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` measures many more times.
 
 **Limits**
@@ -192,7 +197,7 @@ is as fast on plates of 30 000 and 99 000 DOFs, and takes twice as long on a sol
 | ``estimation.check_gain`` | gone: `KalmanEstimator.certificate` |
 | ``placement.Mirrored``, ``placement.Penalised`` | a `placement.Constraint` of yours |
 | ``plot.PolePicker``, ``plot.animate_mode`` | `plot.stabilisation`, `plot.mode_shape` |
-| ``sparse.Pardiso`` | gone: the library's own factor was faster on solids; `sparse.Cholmod` |
+| ``sparse.Pardiso`` | gone: hardly faster than the library's own factor; `sparse.Cholmod` |
 | ``io.read_sierra`` | gone: save K, M as .mat or .mtx; `io.read_exodus_modes` stays |
 
 **Licences.** flexplant has the MIT licence. At run time it needs NumPy, SciPy, python-control,

@@ -1,6 +1,6 @@
 """One measurement in a process of its own: 24 modes of a mesh by one method, as one JSON line.
 
-python modes_peers.py plate 181 METHOD: ours, ours_on_cholmod, default, superlu or cholmod.
+python modes_peers.py plate 181 METHOD: ours, ours_on_cholmod, default, superlu, cholmod or pardiso.
 """
 
 import json
@@ -88,6 +88,18 @@ def cholmod(A):
     A.sort_indices()
     A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
     return SparseCholesky(A).solve_A
+
+
+def pardiso(A):
+    """MKL PARDISO, by pypardiso: METIS, no refinement, no check that the matrix is the same."""
+    from pypardiso import PyPardisoSolver
+
+    upper, solver = sp.csr_matrix(sp.triu(A)), PyPardisoSolver(mtype=2)  # positive definite
+    solver.set_iparm(1, 1)
+    solver.set_iparm(2, 2)
+    solver.factorize(upper)
+    solver.set_phase(33)
+    return lambda b: solver._call_pardiso(upper, b)
 
 
 FACTORS = {"ours_on_cholmod": fx.sparse.Cholmod()}

@@ -75,14 +75,18 @@ def modes_of_a_solid():
     )
 
 
-def modes_of_a_plate():
-    """The peer needs sksparse-minimal, which no extra installs: without it the row has no time."""
+def modes_of_a_plate(method="cholmod", package="sksparse_minimal"):
+    """The peer needs a package that no extra installs: without it the row has no time."""
     ours, peer = large.measured("plate", 100, "ours"), {"modes": None}
-    if find_spec("sksparse_minimal"):
-        peer = large.measured("plate", 100, "cholmod")
+    if find_spec(package):
+        peer = large.measured("plate", 100, method)
         near(ours["freq"][:10], peer["freq"][:10], 1e-6)
     what = f"24 modes of a plate, {ours['n']:_} DOFs".replace("_", " ")
-    return what, "scipy eigsh on CHOLMOD", ours["modes"], peer["modes"]
+    return what, f"scipy eigsh on {method.upper()}", ours["modes"], peer["modes"]
+
+
+def modes_beside_pardiso():
+    return modes_of_a_plate("pardiso", "pypardiso")
 
 
 def modes_of_a_small_plate():
@@ -320,6 +324,7 @@ def read():
 ROWS = (
     modes_of_a_solid,
     modes_of_a_plate,
+    modes_beside_pardiso,
     modes_of_a_small_plate,
     responses_of_a_plate,
     frequency_response,
