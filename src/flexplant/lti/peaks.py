@@ -199,9 +199,8 @@ def _examined(
     ends = np.stack([T0 + r * T1, T0 - r * T1])
     bound = _frobenius(ends).max(axis=0) + rest
     unsure = np.flatnonzero((bound > level) & (rest < level))
-    for size in (_largest_at_most, _largest):
-        bound[unsure] = size(ends[:, unsure]).max(axis=0) + rest[unsure]
-        unsure = unsure[bound[unsure] > level]
+    bound[unsure] = _largest(ends[:, unsure]).max(axis=0) + rest[unsure]
+    unsure = unsure[bound[unsure] > level]
     return centre[unsure[_largest(T0[unsure]) > level]], bound <= level
 
 
@@ -209,21 +208,13 @@ def _frobenius(X: ComplexArray) -> FloatArray:
     """Return the Frobenius norm of each of a stack of matrices."""
     *stack, p, m = X.shape
     parts = np.ascontiguousarray(X).reshape(*stack, p * m).view(np.float64)
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", parts, parts)))
-
-
-def _largest_at_most(X: ComplexArray) -> FloatArray:
-    """Return an upper bound of `_largest`: the root of the sum of its powers of 8."""
-    unit = divisor(_frobenius(X))
-    scaled = X / unit[..., None, None]
-    square = scaled.conj().swapaxes(-1, -2) @ scaled
-    return np.asarray(unit * _frobenius(square @ square) ** 0.25)
+    return np.asarray(np.sqrt(np.vecdot(parts, parts)))
 
 
 def _largest(X: ComplexArray) -> FloatArray:
     """Return the largest singular value of each of a stack of matrices."""
     if X.shape[-1] == 1 or not X.size:
-        return np.asarray(np.linalg.norm(X, axis=(-2, -1)))
+        return _frobenius(X)
     return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
 
 
@@ -250,15 +241,16 @@ class Residues(NamedTuple):
         """The frequencies (n,) next to which peaks lie: ``|p| (1 - 2 zeta^2)^(1/2)``."""
         return np.sqrt(np.maximum(self.poles.imag**2 - self.poles.real**2, 0.0))
 
-    def apart(self, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distances (n, n_omega) to the poles and to their conjugates."""
-        real, swing = self.poles.real[:, None] ** 2, self.poles.imag[:, None]
-        near, far = omega - swing, omega + swing
-        return np.sqrt(near * near + real), np.sqrt(far * far + real)
+    def apart(self, omega: FloatArray) -> FloatArray:
+        """Return the distances (2 n, n_omega) to the poles, then to their conjugates."""
+        swing, real = np.outer([1.0, -1.0], self.poles.imag), self.poles.real**2
+        gap = omega - swing[:, :, None]
+        return np.sqrt(gap * gap + real[:, None]).reshape(-1, omega.size)
 
     def nearest(self, omega: FloatArray) -> FloatArray:
         """Return the distance of each frequency to its nearest pole."""
-        return np.asarray(self.apart(omega)[0].min(axis=0))
+        near = omega - self.poles.imag[:, None]
+        return np.sqrt((near * near + self.poles.real[:, None] ** 2).min(axis=0))
 
     def series(self, omega: FloatArray, order: int) -> list[ComplexArray]:
         """Return T_0 to T_order (n_omega, p, m) of ``G(omega + d) = sum T_k d^k``."""
@@ -285,13 +277,11 @@ class Residues(NamedTuple):
         Each pole at the distance a contributes a geometric series,
         ``1 / (a^(order+1) (a - radius))``; nearly infinite where a pole is closer than the radius.
         """
-        total = np.zeros(omega.size)
-        for apart in self.apart(omega):
-            free = np.maximum(apart - radius, np.cbrt(TINY))
-            for _ in range(order + 1):
-                free *= apart
-            total += self.sizes @ (1.0 / free)
-        return total
+        apart = self.apart(omega)
+        free = np.maximum(apart - radius, np.cbrt(TINY))
+        for _ in range(order + 1):
+            free *= apart
+        return np.asarray(np.tile(self.sizes, 2) @ (1.0 / free))
 
     @property
     def transposed(self) -> Residues:
@@ -304,13 +294,12 @@ class Residues(NamedTuple):
 def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``."""
     # block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
-    # are ill-conditioned or too many, or a pole lies at z = -1. Also returns the eigenvalues of A
-    # where they were computed
+    # are ill-conditioned or too many, or a pole lies at z = -1. Also returns the eigenvalues of A,
+    # that of a block of one state twice, where they were computed
     if g.n_states * g.D.size > LARGEST:
         return None, None
-    closed = block_form(g)
-    poles, left, right = closed or diagonal_form(g.A, g.B, g.C)
-    known = None if closed else poles
+    poles, left, right = block_form(g) or diagonal_form(g.A, g.B, g.C)
+    known = poles
     if left is None or right is None or (g.dt and np.any(poles == -1.0)):
         return None, known
     found, through = left.T[:, :, None] * right[:, None, :], g.D

@@ -133,11 +133,10 @@ def _modal(g: Subsystem) -> Solver:
     N[:, 1, 1] = -N[:, 0, 0]
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
     real = slots >= 0
-    B, C = g.B[slots] * real[:, :, None], (g.C[:, slots] * real).transpose(1, 2, 0)
+    B, C = g.B[slots] * real[:, :, None], (g.C[:, slots] * real).transpose(1, 0, 2)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     channels = len(g.C) * g.B.shape[1]
-    with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)
-    without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(channels, -1)
+    with_s, without = (np.moveaxis(C @ own, 0, 2).reshape(channels, -1) for own in (B, N @ B))
     moving, fixed = _nonzero_columns(with_s), _nonzero_columns(without)
     residues = np.hstack([with_s[:, moving], without[:, fixed]])
     n_moving = with_s[:, moving].shape[1]
