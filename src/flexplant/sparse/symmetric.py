@@ -17,8 +17,9 @@ from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT
 _FULL = 0.8
 #: ratio of eigenvalues below which one solution finds all with a relative error of 1e-9
 SPREAD = SPLIT
-#: number of rows processed together
-_ROWS = 65536
+#: number of rows, or of numbers in a group of columns, processed together: arrays below 128 kB, for
+#: which no memory is fetched from the system
+_ROWS = 16_000
 #: number of units in the last place below which an eigenvalue counts as zero
 ZERO = 30 * PRECISION
 

@@ -271,7 +271,7 @@ def elastic_modes(
     kept = n - r if count is None else min(count, n - r)
     scaled, scale = unit_diagonal(M)
     try:
-        lower = la.cholesky(dense(scaled), lower=True)
+        lower = la.cholesky(dense(scaled), lower=True, overwrite_a=True)
     except la.LinAlgError as error:
         raise ModelError(
             "M is not positive definite: some motion would have no inertia, or a negative one."
