@@ -245,12 +245,12 @@ class Residues(NamedTuple):
         """Return the distances (2 n, n_omega) to the poles, then to their conjugates."""
         swing, real = np.outer([1.0, -1.0], self.poles.imag), self.poles.real**2
         gap = omega - swing[:, :, None]
-        return np.sqrt(gap * gap + real[:, None]).reshape(-1, omega.size)
+        return np.asarray(np.sqrt(gap * gap + real[:, None]).reshape(-1, omega.size))
 
     def nearest(self, omega: FloatArray) -> FloatArray:
         """Return the distance of each frequency to its nearest pole."""
         near = omega - self.poles.imag[:, None]
-        return np.sqrt((near * near + self.poles.real[:, None] ** 2).min(axis=0))
+        return np.asarray(np.sqrt((near * near + self.poles.real[:, None] ** 2).min(axis=0)))
 
     def series(self, omega: FloatArray, order: int) -> list[ComplexArray]:
         """Return T_0 to T_order (n_omega, p, m) of ``G(omega + d) = sum T_k d^k``."""
