@@ -242,13 +242,13 @@ def test_a_plant_without_weights_is_solved_in_any_units():
 def test_a_loop_that_hangs_on_rounding_is_refused():
     """Sixteen lags in a row, each of gain 1000: 1e48 from the first state to the last.
 
-    One rounding of each entry of the plant moves the loop's norm by 0.2 to 0.6 %, on four kernels.
+    One rounding of each entry of the plant moves the loop's norm by 0.2 to 1.5 %, on five kernels.
     """
     n = 16
     A = np.diag(np.full(n - 1, 1e3), 1) - np.eye(n)
     B, C = np.eye(n)[:, [0, -1]] @ np.ones((2, 2)), np.ones((2, n))
     P = StateSpace(A, B, C, [[0.0, 1], [1, 0]], inputs=["w", "u"], outputs=["z", "y"])
-    with pytest.raises(SolverError, match=r"one rounding of each entry .* changes it by 0\.\d+ %"):
+    with pytest.raises(SolverError, match=r"one rounding of each entry .* changes it by \d\.\d+ %"):
         design_hinf(P, u="u", y="y", progress=False)
 
 
