@@ -239,24 +239,31 @@ def dense_solver(g: Subsystem) -> tuple[Solver, int, int]:
     """Return what solves for any A, how many frequencies at a time, times states, and least parts.
 
     Parts that share no state, such as the axes of a servo, each with its own channels; those of one
-    A, as axes of one law have, together.
+    A, as axes of one law have, together, and so are those of the same channels where poles give
+    their gains: a mode channel of a weighted plant is a state of its own.
     """
     alike: dict[bytes, list[IntArray]] = {}
     for own in _separate_states(g.A):
         alike.setdefault(g.A[np.ix_(own, own)].tobytes(), []).append(own)
     solvers: list[tuple[_Gains, _Channels]] = []
     sizes = max(MODAL_CHUNK, 64 * len(g.A)), PARTS
+    known: dict[tuple[bytes, ...], tuple[_Channels, list[_Poles]]] = {}
     for parts in alike.values():
         seen = [np.flatnonzero(g.C[:, own].any(axis=1)) for own in parts]
         fed = [np.flatnonzero(g.B[own].any(axis=0)) for own in parts]
-        A = g.A[np.ix_(parts[0], parts[0])]
+        A, channels = g.A[np.ix_(parts[0], parts[0])], list(zip(seen, fed, strict=True))
         Bs = [g.B[np.ix_(own, j)] for own, j in zip(parts, fed, strict=True)]
         Cs = [g.C[np.ix_(i, own)] for own, i in zip(parts, seen, strict=True)]
-        if any(C.size * B.size for C, B in zip(Cs, Bs, strict=True)):
-            gains = _by_poles(A, Bs, Cs)
-            if gains is None:
-                gains, sizes = _schur_gains(A, Bs, Cs), (CACHED // (g.B.shape[1] + 2), 1)
-            solvers.append((gains, list(zip(seen, fed, strict=True))))
+        if not any(C.size * B.size for C, B in zip(Cs, Bs, strict=True)):
+            continue
+        found = _by_poles(A, Bs, Cs)
+        if found is None:
+            solvers.append((_schur_gains(A, Bs, Cs), channels))
+            sizes = CACHED // (g.B.shape[1] + 2), 1
+        else:
+            key = tuple(side.tobytes() for pair in channels for side in pair)
+            known.setdefault(key, (channels, []))[1].append(found)
+    solvers += [(_pole_gains(every, channels), channels) for channels, every in known.values()]
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
         for gains, channels in solvers:
@@ -288,8 +295,15 @@ def _separate_states(A: FloatArray) -> list[IntArray]:
     return parts
 
 
-def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gains | None:
-    """Real residues times functions of s: a pole off the real axis stands for its conjugate too."""
+class _Poles(NamedTuple):
+    """Poles (n,), one of each pair, and residues (channels, n), those of several parts in turn."""
+
+    poles: ComplexArray
+    residues: ComplexArray
+
+
+def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Poles | None:
+    """Return poles and residues; a pole off the real axis stands for its conjugate too."""
     poles, left, right = diagonal_form(A, np.hstack(Bs), np.vstack(Cs))
     if left is None or right is None:
         return None
@@ -298,13 +312,19 @@ def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gai
     right[poles.imag == 0] *= 0.5  # counted twice
     sizes = [(len(C), B.shape[1]) for C, B in zip(Cs, Bs, strict=True)]
     rows, columns = (np.cumsum([0, *(size[i] for size in sizes)]) for i in (0, 1))
-    residues = np.concatenate(
-        [
-            (left[i : i + p, None] * right[:, j : j + m].T).reshape(p * m, poles.size)
-            for i, j, (p, m) in zip(rows, columns, sizes, strict=False)
-        ]
-    )
+    residues = [
+        (left[i : i + p, None] * right[:, j : j + m].T).reshape(p * m, poles.size)
+        for i, j, (p, m) in zip(rows, columns, sizes, strict=False)
+    ]
+    return _Poles(poles, np.concatenate(residues))
+
+
+def _pole_gains(every: list[_Poles], channels: _Channels) -> _Gains:
+    """Real residues times functions of s, of all poles with the same channels."""
+    poles = np.concatenate([one.poles for one in every])
+    residues = np.hstack([one.residues for one in every])
     parts = np.hstack([residues.real, residues.imag])
+    sizes = [(i.size, j.size) for i, j in channels]
     ends = np.cumsum([p * m for p, m in sizes])[:-1]
 
     def gains(s: ComplexArray) -> list[ComplexArray]:
