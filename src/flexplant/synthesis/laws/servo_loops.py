@@ -83,7 +83,7 @@ class Axis:
         """Error to command."""
         return self.shape * (1.0 / self.gain)
 
-    @property
+    @cached_property
     def shape(self) -> Law:
         """The law of a plant of gain 1 at the bandwidth, which axes have in common."""
         return _shape(replace(self, gain=1.0))
