@@ -17,7 +17,7 @@ from ...lti.frequency_sweep import local_maxima
 from ...lti.measured_lines import FEWEST, MeasuredPlant, between_lines, steps_between
 from ...tolerances import DEVIATIONS, TINY
 from .controller_elements import LowPass, Notch, Pid
-from .law import Law, Section, product, tustin_s
+from .law import Law, tustin_s
 
 #: power of 1 / s of a mass's response
 _MASS = 2
@@ -78,7 +78,7 @@ class AxisLaw:
         pid = Pid.corners(1.0, integrator=_INTEGRATOR * w, zero=w / a, pole=w * b)
         action = {2: (pid,), 1: (), 0: (Pid(0.0, i=1.0),)}[self.axis.power]
         factors = (*action, LowPass(w * c), *(Notch(*one) for one in notches.tolist()))
-        return Law(factors, self._scale(numbers), self.axis.rate)
+        return Law(factors, float(self._scale(numbers)[0]), self.axis.rate)
 
     def room(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Return what the distance to the critical point has to spare, at some of the points."""
@@ -98,8 +98,11 @@ class AxisLaw:
         return np.asarray(room - 1.0 / self.peak)
 
     def response(self, numbers: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Return the response of `law`, whose elements are not made, at any s of Tustin's rule."""
-        return self._scale(numbers) * product(self.sections(numbers), s)
+        """Return responses (..., n) of `law`, whose elements are not made, by numbers (..., k).
+
+        s is any of Tustin's rule.
+        """
+        return np.asarray(self._scale(numbers) * self._shape(numbers, s))
 
     def is_stable(self, numbers: FloatArray) -> bool:
         """Return whether the loop is stable, by the Nyquist count of what the lines resolve."""
@@ -109,28 +112,38 @@ class AxisLaw:
             return bool(_turns_stably(loop, axis.integrators))
         return are_stable([self.law(numbers)], axis.freq, axis.G[None, None], rigid=int(axis.free))
 
-    def _scale(self, numbers: FloatArray) -> float:
-        """Return the gain with which the loop of the rigid body crosses 1 at the bandwidth."""
-        w = float(np.exp(numbers[0]))
-        there = product(self.sections(numbers), tustin_s(np.array([w]), self.axis.rate))
-        return float(self.axis.inertia * (2.0 * np.pi * w) ** self.axis.power / abs(there[0]))
+    def _scale(self, numbers: FloatArray) -> FloatArray:
+        """Return the gains (..., 1) with which the loop of the rigid body crosses 1 at w_b."""
+        w = np.exp(numbers[..., :1])
+        there = self._shape(numbers, tustin_s(w, self.axis.rate))
+        return np.asarray(self.axis.inertia * (2.0 * np.pi * w) ** self.axis.power / np.abs(there))
 
-    def sections(self, numbers: FloatArray) -> list[Section]:
-        """Return the factors of the law: PID with lead, low-pass, notches."""
-        (w, a, b, c), notches = np.exp(numbers[:4]).tolist(), np.exp(numbers[4:]).reshape(-1, 3)
-        slow, ab = _INTEGRATOR / b, a * b
+    def _shape(self, numbers: FloatArray, s: ComplexArray) -> ComplexArray:
+        return self.stopped(self.bodies(numbers, s), numbers[..., 4:], s)
+
+    def bodies(self, numbers: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return responses (..., n) of the factors without notches: PID with lead, low-pass."""
+        w, a, b, c = (np.exp(numbers[..., i : i + 1]) for i in range(4))
+        slow, ab, p = _INTEGRATOR / b, a * b, s / (2.0 * np.pi * b * w)
         lead = {
-            2: Section((ab, 1.0 + ab * slow, slow), (1.0, 1.0, 0.0), 2.0 * np.pi * b * w),
-            1: Section((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 1.0),
-            0: Section((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 1.0),
-        }[self.axis.power]
-        others = [((0.0, 0.0, 1.0), np.sqrt(2.0), c * w)]
-        others += [((1.0, 2 * d * z, 1.0), 2.0 * z, f) for f, d, z in notches.tolist()]
-        centred = [
-            Section(above, (1.0, damped, 1.0), 2.0 * np.pi * f, 2.0 * np.pi * f).at(self.axis.rate)
-            for above, damped, f in others
-        ]
-        return [lead, *centred]
+            2: lambda: ((ab * p + (1.0 + ab * slow)) * p + slow) / ((p + 1.0) * p),
+            1: lambda: np.ones_like(p),
+            0: lambda: 1.0 / s,
+        }[self.axis.power]()
+        p = s / self._warped(c * w)
+        return np.asarray(lead / ((p + np.sqrt(2.0)) * p + 1.0))
+
+    def stopped(self, gain: ComplexArray, notches: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return responses (..., n) times those of notches by their numbers."""
+        for i in range(0, notches.shape[-1], 3):
+            f, d, z = (np.exp(notches[..., k : k + 1]) for k in range(i, i + 3))
+            p = s / self._warped(f)
+            gain = gain * (((p + 2.0 * d * z) * p + 1.0) / ((p + 2.0 * z) * p + 1.0))
+        return gain
+
+    def _warped(self, freq: FloatArray) -> FloatArray:
+        """Return frequencies [rad/s] of factors that Tustin's rule brings to some [Hz]."""
+        return np.asarray(tustin_s(freq, self.axis.rate).imag)
 
     def notes(self, numbers: FloatArray) -> list[str]:
         """Return what a user has to know of the law: its sign, and lines that ended the search."""
@@ -239,12 +252,8 @@ class AxisLaw:
 
     def _slopes(self, x: FloatArray, room: FloatArray, rows: IntArray) -> FloatArray:
         """Return the derivatives of some of the room by the numbers, by differences."""
-        found = np.zeros((rows.size, x.size))
-        for k in range(x.size):
-            step = np.zeros(x.size)
-            step[k] = _DIFFERENCE
-            found[:, k] = (self._spare(x + step, rows) - room[rows]) / _DIFFERENCE
-        return found
+        moved = x + _DIFFERENCE * np.eye(x.size)
+        return np.asarray((self._spare(moved, rows) - room[rows]).T / _DIFFERENCE)
 
     def _with_notch(self, numbers: FloatArray) -> FloatArray | None:
         """Return the law with the notch that raises the bandwidth most; None when none is worth it.
@@ -541,10 +550,9 @@ def _best_starts(
     top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
     leads = _LEADS if of.axis.power == _MASS else ((1.0, 1.0),)
     shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in leads for c in _TAILS})
-    numbers = [np.log([w, *shape]) for shape in shapes]
-    bodies = np.array([product(of.sections(one), s) for one in numbers])
-    stops = np.array([product(of.sections(np.append(numbers[0], one))[2:], s) for one in sets])
-    gain = stops[:, None] * bodies
+    numbers = np.log([[w, *shape] for shape in shapes])
+    bodies = of.bodies(numbers, s)
+    gain = np.array([of.stopped(bodies, one, s) for one in sets])
     level = of.axis.inertia * (2.0 * np.pi * w) ** of.axis.power
     gain = gain[..., :-1] * level / np.abs(gain[..., -1:])
     room = np.min(of.room_of(gain, rows), axis=-1)

@@ -475,8 +475,8 @@ class JointSearch:
         for law, own in zip(self.of, self._split(x), strict=True):
             here = law.response(own, s)
             moved = own + _DIFFERENCE * np.eye(own.size)
-            found += [(law.response(one, s) - here) / _DIFFERENCE for one in moved]
-        return np.array(found).T
+            found.append((law.response(moved, s) - here) / _DIFFERENCE)
+        return np.concatenate(found).T
 
     @property
     def _owners(self) -> IntArray:
