@@ -130,6 +130,16 @@ def test_the_margin_falls_to_what_was_stated():
 
 
 @pytest.mark.slow
+def test_a_loop_below_the_margin_without_a_change_is_judged_on_stability():
+    one = loop()
+    below = mode_tolerances(one.plant, one.broken, margin=0.9)
+    assert one.modulus_margin < 0.9 and not np.any(below.within)
+    np.testing.assert_array_equal(below.least, np.abs(tolerances().stable).min(axis=1))
+    assert below.summary.startswith("the modulus margin is below 0.9, mode ")
+    assert "+0 %" not in below.summary and "instability" in below.summary
+
+
+@pytest.mark.slow
 def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
     found = tolerances()
     worst = int(np.argmin(found.least))

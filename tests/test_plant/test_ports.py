@@ -115,6 +115,8 @@ def test_bad_directions_and_quantities():
         Poi("p", at=P, axes=("z", "z"))
     with pytest.raises(LabelError, match="combination of DOFs, so it has one axis"):
         Poi("p", at={"1:z": 0.5, "2:z": 0.5}, axes=("z", "rx"))
+    with pytest.raises(LabelError, match=r"'2:-x' has a direction with a sign.*at=\{'2:x': -1.0\}"):
+        Poi("p", at="2:-x")
 
 
 @pytest.mark.parametrize("kind", [Disturbance, Sensor])

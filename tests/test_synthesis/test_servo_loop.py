@@ -7,9 +7,12 @@ import pytest
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
 from flexplant.estimation import design_kalman, design_static
+from flexplant.labels import DofSet
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
-from flexplant.plant import Sensor, assemble_plant
+from flexplant.modes import solve_modes
+from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
+from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import design_servo, servo_bandwidth
 from flexplant.synthesis.laws.servo_design import servo_task
 from flexplant.testbeds import three_masses, wafer_stage
@@ -151,6 +154,33 @@ def test_the_largest_bandwidth_that_holds_6_dB():
     assert beyond.certificate["modulus margin"] < 0.5
     assert ["servo_bandwidth" in repr(one) for one in (servo, beyond)] == [False, True]
     assert servo_bandwidth(plant, observer=observer, peak=4.0) > reach
+
+
+def three_late_masses(chain):
+    """A plant with delay, with a chain of two more masses beside it that nothing touches."""
+    springs = [(0, 1, 4e6), (1, 2, 4e6), (3, 4, 3e4), (3, 3, 3e4)][: 4 if chain else 2]
+    n = 5 if chain else 3
+    K = np.zeros((n, n))
+    for i, j, k in springs:
+        row = np.eye(n)[i] - (i != j) * np.eye(n)[j]
+        K += k * np.outer(row, row)
+    dofs = DofSet(np.arange(1, n + 1), ["x"] * n, np.zeros((n, 3)))
+    model = FEModel(M=np.diag([4.0, 1, 1, 1, 1][:n]), K=K, dofs=dofs)
+    modes = solve_modes(model, count=n, damping=ModalDamping(0.01))
+    place = Ports(
+        w=[Disturbance("d", at="3:x", asd=1e-3)],
+        u=[Actuator("u", at="1:x")],
+        z=[Poi("p", at="3:x")],
+        y=[Sensor("y", at="1:x", asd=1e-12)],
+        references=[Reference("p")],
+    )
+    return assemble_plant(modes, place).discretized(1e3, delay=4.0)
+
+
+def test_modes_that_nothing_touches_do_not_choose_the_law():
+    alone, beside = (servo_bandwidth(three_late_masses(chain)) for chain in (False, True))
+    assert alone > 15.0  # 6.7 Hz without a wide lead
+    assert beside == pytest.approx(alone, rel=1e-6)
 
 
 def test_search_and_certificate_break_the_same_loop():

@@ -253,8 +253,17 @@ class ModeTolerances(Value):
 
     @property
     def least(self) -> FloatArray:
-        """Smallest change (m,) of each frequency at which the loop fails or reaches `margin`."""
-        return np.asarray(np.abs(np.hstack([self.within, self.stable])).min(axis=1))
+        """Smallest change (m,) of each frequency at which the loop fails or reaches `margin`.
+
+        If the loop does not have this margin without a change, only failure counts.
+        """
+        ends = [self.stable] if self._is_below else [self.within, self.stable]
+        return np.asarray(np.abs(np.hstack(ends)).min(axis=1))
+
+    @property
+    def _is_below(self) -> bool:
+        """Whether the loop is below `margin` without a change."""
+        return not np.any(self.within)
 
     @property
     def critical(self) -> tuple[int, ...]:
@@ -269,17 +278,18 @@ class ModeTolerances(Value):
         if not self.modes.size:
             return "no elastic mode"
         worst = int(np.argmin(self.least))
+        below = f"the modulus margin is below {self.margin:.3g}, " if self._is_below else ""
         if not np.isfinite(self.least[worst]):
             off = f"{100 * self.limit.min():.2g} %"
-            return f"stays stable if one modal frequency (not its shape) shifts by {off}"
+            return f"{below}stays stable if one modal frequency (not its shape) shifts by {off}"
         to = f"a modulus margin of {self.margin:.3g}"
         side = int(np.argmin(np.abs(self.within[worst])))
         change = self.within[worst, side]
-        if not np.isfinite(change):
+        if self._is_below or not np.isfinite(change):
             change = self.stable[worst, int(np.argmin(np.abs(self.stable[worst])))]
             to = "instability"
         return (
-            f"mode {self.modes[worst]} ({self.freq[worst]:.4g} Hz) shifted by "
+            f"{below}mode {self.modes[worst]} ({self.freq[worst]:.4g} Hz) shifted by "
             f"{100 * change:+.2g} % "
             f"leads to {to}"
             + ("" if self.known is None else f" (known to {100 * self.known[worst]:.2g} %)")

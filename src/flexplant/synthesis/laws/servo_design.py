@@ -76,12 +76,12 @@ def design_servo(
     used. The gain k makes the loop gain of the axis 1 at the bandwidth. A resonance next to the
     bandwidth can make this k unsuitable, so that |S| at u exceeds 6 dB. If so, k is computed from
     the response at s = sigma, where no mode resonates; this k is used only if it keeps 6 dB. If a
-    mode lies between one and four times the bandwidth, a wide lead is tried: each 4 in the law of a
-    mass becomes 16, or 64 if 16 does not keep 6 dB. A wide lead suppresses errors up to a higher
-    frequency. It suppresses them less at low frequencies, and passes more noise to the actuators. A
-    notch has the damping of its mode. Its frequency is that of the mode, or lower for a fast mode,
-    so that errors of the frequency are tolerated. `servo_bandwidth` gives the largest bandwidth
-    with a peak of 6 dB.
+    mode lies between one and four times the bandwidth, or if |S| still exceeds 6 dB, a wide lead is
+    tried: each 4 in the law of a mass becomes 16, or 64 if 16 does not keep 6 dB. A wide lead
+    suppresses errors up to a higher frequency. It suppresses them less at low frequencies, and
+    passes more noise to the actuators. A notch has the damping of its mode. Its frequency is that
+    of the mode, or lower for a fast mode, so that errors of the frequency are tolerated.
+    `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
 
     Parameters
     ----------
@@ -270,13 +270,13 @@ _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 #: raises |S| and lowers the frequency up to which |S| of the references is below 1 by at most this
 #: factor. Those above it are for axes on springs that would follow too little otherwise
 _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
+#: wide leads are tried where a mode lies above the bandwidth within this factor
+_NEAR = 4.0
 #: |S| that an axis is to have at this fraction of its bandwidth, as a mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
 #: a bandwidth is next to a resonance when a mode lies within this of it, and the gain of the axis
 #: differs by more than this from that on the real axis; in logarithms
 _RESONANT = 0.2
-#: wide leads are tried where a mode lies above the bandwidth within this factor
-_NEAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -341,13 +341,13 @@ class ServoTask:
         if self.phase_margins(plain).min() <= 0.0:
             return plain
         best = self._settling(self.notched(plain))
+        if all(axis.line != "mass" for axis in plain.axes):
+            return best
         modes, lowest = elastic(self.plant), float(plain.driven.freq.min())
         near = bool(np.any((modes > lowest) & (modes < _NEAR * lowest)))
-        if not near or all(axis.line != "mass" for axis in plain.axes):
-            return best
         for lead in LEADS[1:]:
             # the widest leads only where the others do not serve: they cost most noise
-            if lead != LEADS[1] and self._holds(best, TARGET):
+            if not (near and lead == LEADS[1]) and self._holds(best, TARGET):
                 break
             axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
             wide = self.notched(plain._replace(axes=tuple(axes)))

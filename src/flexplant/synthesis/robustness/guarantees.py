@@ -100,8 +100,8 @@ class RobustStability(Value):
         where = f", largest at {self.freq:.5g} Hz" if np.isfinite(self.freq) else ""
         lines = [f"<RobustStability: {verdict}, {bounds}{where}"]
         if self.lower:
-            shown = _largest_deltas(self.values)
-            lines.append(f"  unstable at {1 / self.lower:.4g} times the uncertainty: {shown}")
+            shown = f": {_largest_deltas(self.values)}" if self.values else ""
+            lines.append(f"  unstable at {1 / self.lower:.4g} times the uncertainty{shown}")
         shown = ", ".join(f"{k} {v:.4g}" for k, v in self.certificate.items())
         lines.append(f"  verified: {shown}")
         if self.left_out is not None:
