@@ -130,12 +130,13 @@ def smallest_norm(problem):
     own = loop_speed(base, problem)
     for speed in (own, 10.0 * own, 0.1 * own):
         parts = scaled(base, speed)
-        best = min([best, *(_least(parts, problem.nu, problem.ny, level) for level in LEVELS)])
+        for level in LEVELS:
+            best = min(best, _least(parts, problem.nu, problem.ny, level, best))
     return best
 
 
-def _least(parts, nu, ny, level):
-    """The least norm reached with what is added of one level."""
+def _least(parts, nu, ny, level, known):
+    """The least norm reached with what is added of one level, where it is below the known one."""
     changed, u, y = with_added(parts, nu, ny, level)
     plain, least = split(*parts, nu, ny), np.inf
 
@@ -149,14 +150,15 @@ def _least(parts, nu, ny, level):
         least = min(least, norm)
         return norm <= gamma * (1.0 + 1e-3)
 
-    high = np.inf
-    for gamma in np.geomspace(1e4, 1e-4, 33):
+    # a level that does not reach the least norm known reaches no smaller one
+    span, high = (known, 1e-2 * known, 9) if known < np.inf else (1e4, 1e-4, 33), np.inf
+    for gamma in np.geomspace(*span):
         if reached(gamma):
             high = gamma
-        elif high < np.inf:
+        elif min(high, known) < np.inf:
             break
     low = high / 10**0.25
-    for _ in range(9 if high < np.inf else 0):
+    for _ in range(10 if high < np.inf else 0):
         middle = np.sqrt(low * high)
         low, high = (low, middle) if reached(middle) else (middle, high)
     return least
