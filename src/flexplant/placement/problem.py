@@ -395,6 +395,7 @@ class Problem:
             return tuple(self.spanning(weights))
         draws = random or np.random.default_rng(0)
         nearest: tuple[int, ...] = ()
+        least = self.layouts.missing(self.spanning())  # no choice of this size misses fewer
         for draw in range(REFUSED):
             worth = draws.uniform(0.0, 1.0, self.total)
             worth[self.spanning(worth)] += 2.0
@@ -406,7 +407,7 @@ class Problem:
             missed = self.layouts.missing(found)
             if not nearest or missed < self.layouts.missing(nearest):
                 nearest = found
-            if not missed:
+            if missed <= least:
                 break
         return nearest
 
