@@ -181,11 +181,10 @@ def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
     assert not none.modes.size
 
 
-@pytest.mark.parametrize("slack", [1.005, 1.05])
 @pytest.mark.parametrize("kind", ["stable", "within"])
-def test_a_tolerance_just_inside_of_the_limit_is_found(kind, slack):
-    """A limit that is 0.5 % above a tolerance finds what a limit of 5 % found."""
-    every, one = tolerances(), loop()
+def test_a_tolerance_just_inside_of_the_limit_is_found(kind):
+    """A limit that is 0.5 % above a tolerance finds what wide limits found."""
+    every, one, slack = tolerances(), loop(), 1.005
     wanted = getattr(every, kind)
     where = np.argwhere(np.isfinite(wanted) & (slack * np.abs(wanted) < every.limit[:, None]))
     assert len(where) >= 5
@@ -351,7 +350,7 @@ def test_sensors_behind_filters_and_latencies(sensors):
             if np.isfinite(within) and within:
                 before, behind = (off(mode, part * within) for part in (0.98, 1.02))
                 assert not behind.is_stable or behind.modulus_margin < 0.35 < before.modulus_margin
-            for share in (0.3, 0.6, 0.95):  # and nothing happens before
+            for share in (0.5, 0.95):  # and nothing happens before
                 before = off(mode, sign * share * min(abs(within), found.limit[row]))
                 assert before.is_stable and before.modulus_margin > 0.35 * 0.98
 

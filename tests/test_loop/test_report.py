@@ -255,7 +255,7 @@ def body_with_modes(rng, axes):
 def test_stable_on_coarse_lines_is_stable_or_says_of_which_modes_it_is_not(axes, noise):
     """Of loops on lines that step over resonances: exact poles decide."""
     rng, seen = np.random.default_rng(axes), {}
-    for _ in range(40):
+    for _ in range(24):
         G, K, lines, widths = body_with_modes(rng, axes)
         frf = frequency_response(G, lines)
         error = rng.standard_normal((2, *frf.data.shape))
@@ -269,9 +269,9 @@ def test_stable_on_coarse_lines_is_stable_or_says_of_which_modes_it_is_not(axes,
             assert ("unless a mode between the lines near" in repr(report)) == (said == "if")
         assert truly or said != "unstable"
         seen[said] = seen.get(said, 0) + 1
-    assert seen["unstable"] > 6
-    assert seen["stable" if not noise else "if"] > 12
-    assert seen.get("open", 0) < 8
+    assert seen["unstable"] > 3
+    assert seen["stable" if not noise else "if"] > 7
+    assert seen.get("open", 0) < 5
 
 
 def test_what_cannot_be_judged_says_why():
@@ -390,7 +390,7 @@ def crossings_of_poles(G, K, factors):
 @pytest.mark.parametrize("kind", ["undamped", "light", "integrator", "lags"])
 def test_gain_margins_are_the_factors_at_which_poles_cross(kind, sampled):
     """PI controllers: also where an undamped pole takes the loop gain through infinity."""
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         w = 10 ** rng.uniform(0, 1)
         den = {
@@ -443,7 +443,7 @@ def test_the_modulus_margin_of_a_measured_loop_is_that_of_a_stable_one(zero):
     """Poles of the model say which; an Frf that begins at 0 Hz is read from its next line on."""
     lines = np.arange(0.05, 500.0, 0.05)
     seen = {"stable": 0, "unstable": 0, "open": 0}
-    for seed in range(0, 60, 2):
+    for seed in range(0, 60, 4):
         G, K, unstable = measured_machine(np.random.default_rng(seed + zero))
         freq, data = lines, frequency_response(G, lines).data
         if zero:
@@ -463,9 +463,9 @@ def test_the_modulus_margin_of_a_measured_loop_is_that_of_a_stable_one(zero):
         assert len(said) == (2 if unstable else 0)  # of the lines and of the model
         assert margin == (0.0 if unstable else pytest.approx(of_model, rel=0.1)), seed
         assert not unstable or f"{unstable} pole" in said[0]
-    assert seen["stable"] > 10
-    assert seen["unstable"] >= 3
-    assert seen["open"] <= 6
+    assert seen["stable"] > 5
+    assert seen["unstable"] >= 1
+    assert seen["open"] <= 3
 
 
 def test_a_loop_that_is_not_judged_has_no_margin_alone():

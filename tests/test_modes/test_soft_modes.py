@@ -156,7 +156,7 @@ def test_what_is_free_says_how_soft_a_suspension_would_look_free():
 @pytest.mark.long
 def test_a_soft_suspension_of_a_small_plate_is_found_down_to_a_hundredth_of_a_hertz():
     free = plate((20, 20), size=(0.6, 0.6), thickness=0.0272)
-    for hertz in (2.0, 0.25, 0.08, 0.01):
+    for hertz in (2.0, 0.1, 0.01):
         stiffness = (2 * np.pi * hertz) ** 2 * free.mass / 4
         modes = solve_modes(suspended(free, stiffness), count=6)
         error = modes.freq[:3] / (hertz * np.array([1, np.sqrt(3), np.sqrt(3)])) - 1

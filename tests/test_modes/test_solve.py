@@ -169,9 +169,10 @@ def test_a_lost_partner_is_found_again(monkeypatch):
     assert_modes_of(model, modes)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_count_that_does_not_agree_raises(monkeypatch):
     model = make_plate(elements=(24, 24))
+    monkeypatch.setattr(counted, "MOST_STEPS", 3)
     below = counted.modes_below
     monkeypatch.setattr(counted, "modes_below", lambda *args: below(*args) - 1)
     with pytest.raises(SolverError, match="count finds"):

@@ -224,7 +224,8 @@ WAYS = {
 @pytest.mark.parametrize(
     ("use", "way", "shape"),
     [
-        *((use, way, None) for use in USES for way in ("usual", "own")),
+        *((use, "usual", None) for use in USES),
+        *((use, "own", None) for use in ("place_actuators", "score_sensors", "pareto_curve")),
         *((use, "usual", low_pass_filter(60.0)) for use in ("place_both", "sensor_map")),
         ("sensor_map", "judged", None),
     ],

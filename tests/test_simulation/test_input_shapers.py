@@ -37,7 +37,7 @@ def test_what_is_left_is_what_an_oscillator_shows(kind, freq, damping):
     shaper = input_shaper(freq, damping=damping, kind=kind)
     shaped = shaper.shaped(MOVE)
     assert shaper.amplitudes.sum() == pytest.approx(1.0)
-    for other in (freq, 1.1 * freq, 0.8 * freq):
+    for other in (freq, 0.8 * freq):
         free = vibration(MOVE, other, damping)
         found = vibration(shaped, other, damping)
         left = shaper.residual(other, damping).item()

@@ -253,6 +253,6 @@ def test_refusals():
         servo_bandwidth(plant, peak=1.0)
     # the law is the cause: at a few hertz rate and delay take hardly any phase
     with pytest.raises(SolverError, match=r"no bandwidth from .*rate and delay take only") as none:
-        servo_bandwidth(plant, peak=1.02)
+        servo_bandwidth(three_masses(), peak=1.02)
     assert "aise the rate" not in str(none.value)
     assert isinstance(static.system, StateSpace)

@@ -243,9 +243,9 @@ def swinging(P):
     return np.abs(poles[poles.imag > 1.0]) / (2.0 * np.pi)
 
 
-def cable_carrier(seed):
+def cable_carrier():
     """A linear axis whose cable carrier, a chain of links, swings from 0.2 Hz on."""
-    rng = np.random.default_rng([4, seed])
+    rng = np.random.default_rng([4, 1])
 
     def drawn(size):
         return size * np.exp(rng.uniform(-0.2, 0.2))
@@ -273,10 +273,9 @@ def cable_carrier(seed):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 1])
-def test_slow_modes_that_limit_nothing_end_no_search(seed):
+def test_slow_modes_that_limit_nothing_end_no_search():
     """The stage follows as far as the servo does, not to 17 times the slowest mode."""
-    plant = cable_carrier(seed)
+    plant = cable_carrier()
     servo = fx.servo_bandwidth(plant, observer=fx.design_kalman(plant))
     found = judged(plant, fx.design_stage(plant, progress=False))
     assert found.serves(0.7 * servo)

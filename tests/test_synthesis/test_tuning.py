@@ -109,7 +109,7 @@ def test_noise_is_not_fitted(known):
 def test_a_mode_that_lines_do_not_resolve_stays_below():
     """A mode 0.16 Hz wide on lines of 1 Hz with 1 % noise: no law relies on its phase."""
     modes, rng = PLANTS["turned by half, below crossover"], np.random.default_rng(5)
-    freq = np.arange(2.0, 4990.0, 1.0) + 0.3
+    freq = np.arange(2.0, 2500.0, 1.0) + 0.3
     noise = 1 + 0.01 * rng.standard_normal((2, freq.size)).T @ [0.5**0.5, 0.5**0.5 * 1j]
     frf = Frf(freq, (response(freq, modes) * noise)[None, None])
     found = tune_loops(frf, rate=RATE, hold=False, notches=1)
@@ -178,7 +178,7 @@ def test_six_axes_hold_the_peak_together():
 
 def coupled(share):
     """Two masses, each an axis of its own, with one mode at 600 Hz that both move and see."""
-    freq = dense({600.0: 1.0})
+    freq = dense({600.0: 1.0}, 150)
     s, w = 2j * np.pi * freq, 2 * np.pi * 600.0
     late = np.exp(-1.5 * s / RATE) * np.sinc(freq / RATE)
     mode = np.array([[0.1, share], [share, 0.1]])[:, :, None] / (s**2 + 2e-3 * w * s + w**2)

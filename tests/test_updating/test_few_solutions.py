@@ -59,7 +59,7 @@ def test_data_that_do_not_fit_are_few_eigenvalue_problems(plate, solved, count, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(0, 12, 2))
 def test_the_answer_is_that_of_all_starts_searched_to_their_end(monkeypatch, seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(5, 10))
