@@ -274,6 +274,9 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
     dual = StateSpace(monitored.A.T, monitored.C[[row]].T, np.eye(n), none, monitored.dt)
     reach = responder(dual)
     factor = 2.0 * (monitored.dt or 1.0)
+    G = np.hstack([none[:, :0], *(one.G for one in noises)])
+    D = np.concatenate([none[:0, 0], *(one.D[row] for one in noises)])
+    owners = np.repeat(np.eye(len(noises)), [one.G.shape[1] for one in noises], axis=0)
 
     def found(freq: FloatArray) -> FloatArray:
         out = np.empty((len(noises), freq.size))
@@ -281,8 +284,8 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
             part = slice(start, start + PIECE)
             # transposed, not conjugated: C (z I - A)^-1 of the same z
             back = reach(freq[part])[:, 0].T
-            for i, one in enumerate(noises):
-                out[i, part] = np.sum(np.abs(back @ one.G + one.D[row]) ** 2, axis=1)
+            squares = (back.real @ G + D) ** 2 + (back.imag @ G) ** 2
+            out[:, part] = (squares @ owners).T
         return factor * out
 
     return found
