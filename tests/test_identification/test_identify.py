@@ -450,7 +450,7 @@ JOINT_SHAPES = """
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [5])
 def test_folded_modes_do_not_make_weak_modes_means_of_separate_fits(seed):
     """Weak modes were means over outputs that "disagree", with up to 2.4 Hz of deviation."""

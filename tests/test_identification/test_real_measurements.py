@@ -40,7 +40,7 @@ def vibration_toolbox(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("refine", [None, False])
+@pytest.mark.parametrize("refine", [pytest.param(None, marks=pytest.mark.long), False])
 def test_a_ruler_in_a_wide_band_is_answered_from_the_diagram(refine):
     """11 modes in 114 s, 1305 Hz not among them, when it was refined by default."""
     with warnings.catch_warnings():

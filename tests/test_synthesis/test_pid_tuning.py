@@ -20,6 +20,8 @@ PLANTS = {
     "unstable": ([1.0], [1.0, -1.0], None, 0.0),
     "resonant": ([1.0], [1.0, 2e-3 * 50.0, 2500.0], 500.0, 0.0),
 }
+#: plants of which thousands of laws are tried before one is stable with its margin
+SLOWEST = ("three tanks", "wrong way first")
 
 
 def loop_gain(name, found):
@@ -60,7 +62,10 @@ def loop_gain(name, found):
     return L, poles
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.long) if name in SLOWEST else name for name in PLANTS],
+)
 @pytest.mark.slow
 def test_ordinary_plants_are_served(name):
     (num, den, rate, late), margin = PLANTS[name], 0.5

@@ -206,10 +206,9 @@ def test_search_and_certificate_break_the_same_loop():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("asd", [1e-10, 1e-8])
-def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found(asd):
+def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found():
     """A slow Kalman estimate reads u more than y: broken where both read u no bandwidth held."""
-    plant = sampled(reduced(), ports(sensor_asd=asd))
+    plant = sampled(reduced(), ports(sensor_asd=1e-8))
     observer = design_kalman(plant)
     held = design_servo(plant, bandwidth=50.0, observer=observer).certificate["modulus margin"]
     assert held > 0.5

@@ -206,7 +206,7 @@ def test_a_pattern_keeps_its_zeros_and_an_earlier_design_is_a_start():
         design_structured(plant, FixedOrder(pattern=np.ones((1, 2))))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_laws_are_tuned_to_a_local_minimum():
     """PID with roll-off and notch, sampled and late: every draw nearby is worse."""
     plant = machine()

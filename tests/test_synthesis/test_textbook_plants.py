@@ -265,7 +265,7 @@ def test_robust_loop_shaping_in_any_unit_of_time(seed):
     assert ncf_margin(P, found) == pytest.approx(1.0 / found.gamma, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["one lag", "double integrator"])
 def test_a_structured_design_of_full_order(kind):
     """It begins at the controller of full order, and does not lose it."""
@@ -283,7 +283,7 @@ def channels_of_mu(p, d):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["two lags", "three lags", "double integrator", "Pade delay"])
+@pytest.mark.parametrize("kind", ["two lags", "double integrator", "Pade delay"])
 def test_robust_performance_of_what_is_typed_first(kind):
     """mu of these two blocks is the largest |S| + |KS|; the best D that is constant is no better.
 

@@ -185,7 +185,7 @@ def coupled(share):
     return Frf(freq, (np.eye(2)[:, :, None] / s**2 + mode) / MASS * late)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_ended_the_search_is_said():
     """Where no laws hold the peak together, the best come back with what stands in the way."""
     found = tune_loops(coupled(0.05), rate=RATE, hold=False, notches=0)

@@ -48,7 +48,9 @@ def parameters(plate, rom, count):
     return found[:count]
 
 
-@pytest.mark.parametrize(("count", "modes", "seed"), [(4, 14, 0), (4, 10, 1), (2, 8, 2)])
+@pytest.mark.parametrize(("count", "modes", "seed"), [
+    pytest.param(4, 14, 0, marks=pytest.mark.long), (4, 10, 1), (2, 8, 2)
+])  # fmt: skip
 def test_data_that_do_not_fit_are_few_eigenvalue_problems(plate, solved, count, modes, seed):
     """1534 and 1401 of the first two when every start was searched to its end."""
     rom = plate.reduced(0.01, True)
