@@ -54,7 +54,7 @@ def test_residual_terms_are_powers_and_held_integrators():
 
 def test_a_fraction_of_high_enough_order_finds_every_pole():
     H = modal_frf(FREQ, POLES, PHI, PHI[:2])
-    found = Moments(FREQ, H, np.ones((4, FREQ.size)), 16).solve(16, np.isfinite)
+    found = Moments(FREQ, H, np.ones((4, FREQ.size)), 16).solve([16], np.isfinite)[0]
     for k, p in enumerate(POLES):
         place = np.argmin(np.abs(found.poles - p))
         assert abs(found.poles[place] / p - 1) < 1e-5
@@ -72,12 +72,12 @@ def test_a_repeated_pole_of_a_fraction_has_two_participations(order):
     H = R[:, :, None] / (z - 0.98)
     double = np.log(0.98) / step + 2j * np.pi * FREQ.mean()
     moments = Moments(FREQ, H, np.ones((4, FREQ.size)), order)
-    found = moments.solve(order, lambda poles: np.abs(poles / double - 1) < 1e-6)
+    (found,) = moments.solve([order], lambda poles: np.abs(poles / double - 1) < 1e-6)
     assert found.poles.size == 2
     assert np.linalg.svd(found.participation, compute_uv=False)[-1] > 0.1
     left = found.shapes - R @ np.linalg.lstsq(R, found.shapes)[0]
     assert np.linalg.norm(left) < 1e-6
-    assert moments.solve(order, lambda poles: poles.imag < 0).poles.size == 0
+    assert moments.solve([order], lambda poles: poles.imag < 0)[0].poles.size == 0
 
 
 def test_an_frf_carries_its_doubt(tmp_path):

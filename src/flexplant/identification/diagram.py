@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -22,13 +22,11 @@ from ..arrays import (
     between,
     complex_array,
     real_array,
-    whole,
 )
-from ..errors import ModelError, SolverError, counted, short
-from ..modes.matching import assigned, in_span
+from ..errors import ModelError, SolverError, counted
+from ..modes.matching import assigned, in_span, mac_matrix
 from ..store import Value, checked
 from ..tolerances import NULL, SAME, TINY
-from ..words import several
 from .line_weights import PreparedLines
 
 #: flags of a pole; each includes the previous ones
@@ -270,16 +268,17 @@ def _continued_poles(
     coarse = tol_damping * spacing / f_old
     near = np.abs(f_new[:, None] / f_old - 1.0) <= np.maximum(tol_freq, coarse)
     damped = near & (np.abs(z_new[:, None] - z_old) <= np.maximum(tol_damping * z_old, coarse))
-    alike = np.zeros_like(near)
-    for i, pole in enumerate(new.poles):
+    apart = np.abs(new.poles[:, None] - old.poles)
+    wide = -3.0 * np.maximum(old.poles.real, new.poles.real[:, None])
+    group = near & (apart <= np.maximum(wide, 1e-4 * f_new[:, None]))
+    alike = group & (mac_matrix(new.shapes, old.shapes) >= tol_mac)
+    for i in np.flatnonzero(np.sum(group, axis=1) > 1):
         # shapes of (nearly) repeated poles are arbitrary within their span
-        reach = np.maximum(-3.0 * np.maximum(old.poles.real, pole.real), 1e-4 * abs(pole))
-        group = np.flatnonzero(near[i] & (np.abs(old.poles - pole) <= reach))
-        if group.size:
-            alike[i, group] = in_span(old.shapes[:, group], new.shapes[:, [i]]) >= tol_mac
+        span = old.shapes[:, group[i]]
+        alike[i, group[i]] = in_span(span, new.shapes[:, [i]]) >= tol_mac
     stable = damped & alike
     flag = np.max(near * 1 + damped * 1 + stable * 1, axis=1)
-    distance = np.abs(new.poles[:, None] - old.poles) / (f_old + TINY)
+    distance = apart / (f_old + TINY)
     cost = np.where(stable, distance, np.where(near, 10.0 + distance, 1e3))
     # a pole whose damping jumps continues a track, but is not stable
     return assigned(cost, most=100.0), flag
@@ -323,10 +322,8 @@ class Moments:
     ) -> None:
         self.centre = np.pi * (freq[0] + freq[-1])
         self.step = 2 * np.pi * ARC / (2 * np.pi * (freq[-1] - freq[0]))
-        z = np.exp(1j * (2 * np.pi * freq - self.centre) * self.step)
-        lags = np.arange(-order, order + 1)
-        powers = z[:, None] ** lags[None, :]
-        squares = weight**2
+        ahead, squares = self._powers(freq, order), weight**2
+        powers = np.hstack([ahead[:, :0:-1].conj(), ahead])
         self.n_out, self.n_in = data.shape[:2]
         R = squares @ powers
         S = np.einsum("of,oif,fk->oik", squares, -data, powers, optimize=True)
@@ -337,19 +334,28 @@ class Moments:
         self.big = T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
         # powers of z on most of the circle are well conditioned for all data. Lower orders are
         # leading blocks, also of the inverse of a triangle
-        triangles = np.linalg.cholesky(R[:, toeplitz])
-        self.inverse = np.array([la.solve_triangular(L, np.eye(n), lower=True) for L in triangles])
+        self.inverse = np.linalg.inv(np.linalg.cholesky(R[:, toeplitz]))
         coupled = S[:, :, toeplitz].transpose(0, 2, 3, 1).reshape(self.n_out, n, n * m)
         #: for each output L^{-1} S, which eliminates B
         self.taken = self.inverse @ coupled
 
-    def solve(self, order: int, wanted: Callable[[ComplexArray], BoolArray]) -> OrderPoles:
-        """Return the wanted poles of one order; shapes are computed for these only."""
-        A, B = self.fraction(order)
+    def _powers(self, freq: FloatArray, order: int) -> ComplexArray:
+        """Return the powers (n_freq, order + 1) of z at frequencies [Hz]."""
+        turn = (2 * np.pi * freq - self.centre) * self.step
+        return np.asarray(np.exp(1j * turn[:, None] * np.arange(order + 1)))
+
+    def solve(
+        self, orders: Sequence[int], wanted: Callable[[ComplexArray], BoolArray]
+    ) -> list[OrderPoles]:
+        """Return the wanted poles of rising orders; shapes are computed for these only."""
+        return [self._poles(A, wanted) for A in self._denominators(orders)]
+
+    def _poles(self, A: ComplexArray, wanted: Callable[[ComplexArray], BoolArray]) -> OrderPoles:
+        """Return the wanted poles of one order with the denominator A."""
         # in v = 1/z the polynomial is monic: its companion matrix needs no inverse
-        m = self.n_in
-        companion = np.eye(order * m, k=-m, dtype=np.complex128)
-        companion[:m] = -A[1:].transpose(1, 0, 2).reshape(m, order * m)
+        order, m = len(A) - 1, self.n_in
+        companion = np.eye(order * m, k=m, dtype=np.complex128)
+        companion[:, :m] = -A[1:].transpose(0, 2, 1).reshape(order * m, m)
         v = np.linalg.eigvals(companion)
         # poles at zero: the leading coefficient is singular except for rounding
         z = 1.0 / v[np.abs(v) > 1e-8]
@@ -357,37 +363,45 @@ class Moments:
         keep = wanted(poles)
         z, poles = z[keep], poles[keep]
         powers = z[:, None] ** np.arange(order + 1)
-        left, right = _pole_vectors(z, np.tensordot(powers, A, axes=1))
-        values = np.einsum("kom,km->ok", np.tensordot(powers, B, axes=(1, 1)), right)
+        left, right = _pole_vectors(z, (powers @ A.reshape(-1, m * m)).reshape(-1, m, m))
+        rows = (powers[:, :, None] * right[:, None, :]).reshape(z.size, m * (order + 1))
+        values = self._numerator(A).reshape(self.n_out, -1) @ rows.T
         size = np.linalg.norm(values, axis=0)
         seen = size > 0
         return OrderPoles(order, poles[seen], values[:, seen] / size[seen], left[seen].T)
 
     def response(self, order: int, freq: FloatArray) -> ComplexArray:
         """Return the response (n_out, n_in, n_freq) of the matrix fraction of one order."""
-        A, B = self.fraction(order)
-        z = np.exp(1j * (2 * np.pi * freq - self.centre) * self.step)
-        powers = z[None, :] ** np.arange(order + 1)[:, None]
-        below = np.einsum("rij,rf->fji", A, powers)
-        above = np.einsum("orj,rf->fjo", B, powers)
+        A = next(self._denominators([order]))
+        powers, m = self._powers(freq, order), self.n_in
+        below = (powers @ A.reshape(-1, m * m)).reshape(-1, m, m).swapaxes(1, 2)
+        numerator = self._numerator(A).transpose(1, 2, 0).reshape(order + 1, -1)
+        above = (powers @ numerator).reshape(-1, m, self.n_out)
         return np.asarray(np.linalg.solve(below, above).transpose(2, 1, 0))
 
-    def fraction(self, order: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return A (order + 1, n_in, n_in) with A_0 = I and B (n_out, order + 1, n_in)."""
+    def _denominators(self, orders: Sequence[int]) -> Iterator[ComplexArray]:
+        """Yield A (order + 1, n_in, n_in) with A_0 = I of rising orders."""
         # this constraint makes the mathematical poles unstable and keeps the physical ones stable,
-        # which makes the stabilisation diagram clear [Cauberghe2004]_
-        n, m = order + 1, self.n_in
-        taken = self.taken[:, :n, : n * m]
-        rows = taken.reshape(-1, n * m)
-        big = self.big[: n * m, : n * m] - rows.conj().T @ rows
-        free: Any = -_solve_hermitian(big[m:, m:], big[m:, :m])
-        A = np.concatenate([np.eye(m, dtype=np.complex128), free])
-        B = -self.inverse[:, :n, :n].conj().swapaxes(1, 2) @ (taken @ A)
-        return A.reshape(n, m, m), B
+        # which makes the stabilisation diagram clear [Cauberghe2004]_. Each order only adds rows
+        m, done, left = self.n_in, 0, self.big.copy()
+        for order in orders:
+            n = order + 1
+            rows = self.taken[:, done:n].reshape(-1, left.shape[0])
+            left -= rows.conj().T @ rows
+            done, free = n, _solve_hermitian(left[m : n * m, m : n * m], left[m : n * m, :m])
+            yield np.concatenate([np.eye(m), -free]).reshape(n, m, m)
+
+    def _numerator(self, A: ComplexArray) -> ComplexArray:
+        """Return B (n_out, order + 1, n_in) of the denominator A."""
+        n, m = A.shape[:2]
+        below = self.taken[:, :n, : n * m] @ A.reshape(n * m, m)
+        return np.asarray(-self.inverse[:, :n, :n].conj().swapaxes(1, 2) @ below)
 
 
 def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0."""
+    if matrices.shape[1] == 1:
+        return np.ones((z.size, 1), dtype=np.complex128), np.ones((z.size, 1), dtype=np.complex128)
     # null vectors of a pole that is repeated except for rounding are independent
     U, _, Vh = np.linalg.svd(matrices)
     alike = np.abs(z[:, None] - z) < SAME
@@ -459,20 +473,6 @@ def _resolved(freq: FloatArray) -> int:
     return min(freq.size, round(float(freq[-1] - freq[0]) / gap) + 1)
 
 
-def checked_orders(orders: Iterable[int]) -> list[int]:
-    """Return rising model orders."""
-    if not several(orders):
-        raise ModelError(
-            f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
-        )
-    listed = sorted({whole(n, "each of orders") for n in orders})
-    if len(listed) < 4:
-        raise ModelError(
-            f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
-        )
-    return listed
-
-
 #: number of lines of a part, and fraction of it that is used beyond each of its ends
 LINES, OVERLAP = 400, 0.25
 #: ratio of the frequencies at the ends of a part above which it is divided, and least number of
@@ -537,7 +537,7 @@ def diagram_of(
         own, freq = part.own, ready.freq[part.seen]
         moments = moments_in(ready, part)
         inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
-        results = [moments.solve(order, inside) for order in part.orders]
+        results = moments.solve(part.orders, inside)
         spacing = 2 * np.pi * float(np.median(np.diff(freq))) if part.mirrored else 0.0
         diagram = built_diagram(results, band, tolerances, first=first, spacing=spacing)
         first += len(diagram)

@@ -410,7 +410,7 @@ def _answered(
     fit, reported, rejected = gated(now.fit, count, alone=begin.alone, compare=compare)
     apart, uneven = None, 1.0
     if settled:
-        fit = refined(lines, fit.poles, fit.participation, steps=task.steps, fine=True)
+        fit = _settled(fit, task.steps, fine=True)
     if compare:
         excess, least = fit.cost - lines.freedom(fit.m), gain_due_of_own_poles(fit)
         if fit.misfit < NOISE:
@@ -487,6 +487,11 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
 
 
+def _settled(fit: PoleFit, steps: int, **how: bool) -> PoleFit:
+    """Return the refined fit, from a fit as it is."""
+    return refined(fit.lines, fit.poles, fit.participation, steps=steps, first=fit, **how)
+
+
 def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
 ) -> tuple[PoleFit, tuple[Rejected, ...]]:
@@ -504,33 +509,29 @@ def _first_fit(
     weaker = tuple(rejection(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
     if weaker:
         fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
-    fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
-    return fit, weaker
+    return _settled(fit, steps, strict=False), weaker
 
 
 def _likeliest_fit(task: Task, first: _Stage, alone: bool, bar: Progress) -> _Stage:
     """Return the maximum likelihood fit, with the poles and terms that the data support."""
     (ready, fit), free, steps = first, task.upper is None, task.steps
-    poles, part = fit.poles, fit.participation
     reducing = [(unwindowed, 1), (dropped, int(alone))]
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
         *((missed_poles, MOST), (merged, MOST), (more_terms, int(free))),
         *((split_proposals, MOST), (relocated, MOST), (merged, MOST), (missed_poles, MOST)),
     ]
-    for _ in range(1 if ready.known else 2):
-        lines = task.lines(ready)
-        start = supported(lines, poles, part) if alone else pivoted(lines, poles, part)
+    for again in range(1 if ready.known else 2):
+        start = pivoted(task.lines(ready), fit.poles, fit.participation) if again else fit
+        if alone:
+            start = supported(start.lines, start.poles, start.participation, start)
         # spurious poles may prevent convergence, which is therefore judged at the end
-        fit = refined(
-            lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
-        )
+        fit = _settled(start, steps, strict=not alone)
         fit = improved(fit, reducing, steps=steps)
         bar.advance()
         if alone:
             fit = improved(fit, growing, steps=steps, rough=True)
             bar.advance()
-        poles, part = fit.poles, fit.participation
         if not ready.known:
             share = 1.0 - fit.lines.freedom(fit.m) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)

@@ -16,7 +16,6 @@ from ..words import instance, several
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
-    checked_orders,
     diagram_of,
     moments_in,
     parts_of,
@@ -108,7 +107,7 @@ def stabilisation_diagram(
     top = between(
         max_zeta, "max_zeta", 0.0, 1.0, "With 1 or more nothing oscillates: pass for example 0.2."
     )
-    ready = prepared_lines(forward_in_time(frf, band), band)
+    ready = forward_in_time(frf, band)[1]
     listed = None if orders is None else checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, listed)
@@ -245,8 +244,8 @@ def identify_modes(
         runs = repetitions(runs)
     with one_thread():
         try:
-            runs = tuple(forward_in_time(run, band) for run in runs)
-            ready = prepared_lines(stacked_runs(runs) if len(runs) > 1 else runs[0], band)
+            runs, prepared = zip(*(forward_in_time(run, band) for run in runs), strict=True)
+            ready = prepared_lines(stacked_runs(runs), band) if len(runs) > 1 else prepared[0]
             rate = None if hold is None else positive(hold, "hold")
             high = float(ready.freq[-1])
             if rate is not None and high > rate / 2 * (1 + ROUNDING):
@@ -285,6 +284,20 @@ def identify_modes(
             raise of_segments(runs[0], error) from None
 
 
+def checked_orders(orders: Iterable[int]) -> list[int]:
+    """Return rising model orders."""
+    if not several(orders):
+        raise ModelError(
+            f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
+        )
+    listed = sorted({whole(n, "each of orders") for n in orders})
+    if len(listed) < 4:
+        raise ModelError(
+            f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
+        )
+    return listed
+
+
 def _checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     """Return {channel: DOF label}, checked."""
     if dofs is None:
@@ -314,7 +327,7 @@ def _checked_sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArra
     )
 
 
-def forward_in_time(frf: Frf, band: Any) -> Frf:
+def forward_in_time(frf: Frf, band: Any) -> tuple[Frf, PreparedLines]:
     r"""Return an FRF in the convention exp(i omega t), conjugated if it was in exp(-i omega t).
 
     The impulse response of a stable machine is zero before the force, that of the conjugate after
@@ -324,17 +337,18 @@ def forward_in_time(frf: Frf, band: Any) -> Frf:
     ready = prepared_lines(frf, band)
     rows = ready.data.reshape(-1, ready.freq.size)
     if not _earlier(ready.freq, rows):
-        return frf
+        return frf, ready
     mean = frf.correlation
     turned = frf.replace(data=frf.data.conj(), correlation=None if mean is None else np.conj(mean))
-    if _stable_misfit(prepared_lines(turned, band)) > BETTER * _stable_misfit(ready):
-        return frf
+    other = prepared_lines(turned, band)
+    if _stable_misfit(other) > BETTER * _stable_misfit(ready):
+        return frf, ready
     warn(
         "the FRF responds before its forces act: it uses the convention exp(-i omega t), which "
         "has the opposite sign of all imaginary parts. Its conjugate is used. Pass "
         "frf.replace(data=frf.data.conj())."
     )
-    return turned
+    return turned, other
 
 
 def _earlier(freq: FloatArray, data: ComplexArray) -> bool:
@@ -347,9 +361,11 @@ def _earlier(freq: FloatArray, data: ComplexArray) -> bool:
     rows = rows * step / np.where(size > 0, size, 1.0)
     # lines a step apart repeat the response after 1/step: half of that belongs to either side
     time = np.geomspace(LOBE / band, 0.5 / float(np.median(step)), TIMES)
-    turn = np.exp(2j * np.pi * np.outer(freq, time))
-    after, before = (np.sum(np.abs(rows @ one) ** 2, axis=0) @ time for one in (turn, turn.conj()))
-    return bool(before > after)
+    turn = 2 * np.pi * np.outer(freq, time)
+    parts = np.concatenate([rows.real, rows.imag])
+    even, odd = (np.split(parts @ one, 2) for one in (np.cos(turn), np.sin(turn)))
+    # a quarter of the difference of |even - i odd|^2 before and |even + i odd|^2 after
+    return bool(np.sum(even[0] * odd[1] - even[1] * odd[0], axis=0) @ time > 0)
 
 
 def _stable_misfit(ready: PreparedLines) -> float:
@@ -362,7 +378,7 @@ def _stable_misfit(ready: PreparedLines) -> float:
             inside = (poles.imag > 2 * np.pi * freq[0]) & (poles.imag < 2 * np.pi * freq[-1])
             return inside & (poles.real < 0) & (poles.real > -DAMPED * np.abs(poles))
 
-        poles = moments_in(ready, part).solve(part.orders[-1], stable).poles
+        poles = moments_in(ready, part).solve(part.orders[-1:], stable)[0].poles
         terms = [1 / (2j * np.pi * freq[:, None] - poles), (freq[:, None] / freq[-1]) ** POWERS]
         for weight, data in zip(ready.line_weight[:, seen], ready.data[:, :, seen], strict=True):
             columns = np.hstack(terms) * weight[:, None]

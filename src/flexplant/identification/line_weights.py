@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from ..arrays import BoolArray, ComplexArray, FloatArray, frequency_band
 from ..errors import ModelError
 from ..lti.frequency import Frf
-from ..tolerances import CHANCE
+from ..tolerances import CHANCE, RANK
 from ..words import instance
 from .frf_estimation import STRETCH
 
@@ -219,18 +219,23 @@ def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) 
     near = np.abs(np.arange(d.size) - middle) <= SPREAD
     aside, rows = d[~near], data.reshape(-1, d.size)
     smooth = d[:, None] ** np.arange(3)
+    # all rows share the columns of a, b, c and r; that of g, without its part in them, is their own
     known = np.column_stack([smooth[~near], 1.0 / aside])
-    fixed = np.broadcast_to(known, (len(rows), *known.shape))
-    X = np.concatenate([fixed, -(aside * rows[:, ~near])[:, :, None]], axis=2)
-    inverse = np.linalg.pinv(X)
-    c = (inverse @ rows[:, ~near, None])[..., 0]
-    free = X.shape[1] - X.shape[2]
-    left = rows[:, ~near] - (X @ c[..., None])[..., 0]
-    noise = np.linalg.norm(left, axis=1) / np.sqrt(free)
-    deviation = noise[:, None] * np.sqrt(np.sum(np.abs(inverse) ** 2, axis=2))
+    inverse = np.linalg.pinv(known)
+    past, y = np.eye(aside.size) - known @ inverse, rows[:, ~near]
+    x = -aside * y
+    own, due = x @ past, y @ past
+    power = np.sum(np.abs(own) ** 2, axis=1)
+    seen = power > RANK**2 * np.sum(np.abs(x) ** 2, axis=1)
+    power = np.where(seen, 1.0 / np.where(seen, power, 1.0), 0.0)[:, None]
+    g = power * np.sum(own.conj() * due, axis=1, keepdims=True)
+    c, taken = (y - g * x) @ inverse.T, x @ inverse.T
+    free = aside.size - known.shape[1] - 1
+    noise = np.linalg.norm(due - g * own, axis=1) / np.sqrt(free)
+    deviation = noise[:, None] * np.sqrt(np.sum(inverse**2, axis=1) + power * np.abs(taken) ** 2)
     # with `free` complex degrees of freedom |e|^2 exceeds x with probability (1 + x/free)^-free
     least = np.sqrt(free * np.expm1(-np.log(chance / len(rows)) / free))
-    off = np.abs(rows - c[:, :3] @ smooth.T / (1.0 + c[:, 4:] * d))
+    off = np.abs(rows - c[:, :3] @ smooth.T / (1.0 + g * d))
     height = least * np.hypot(noise, deviation[:, 0])
     skirt = np.abs(c[:, 3]) + 2.0 * deviation[:, 3]
     holds = off[:, middle] > np.maximum(height, skirt / (NARROW / 2))

@@ -244,10 +244,15 @@ def random_effects(
     return mean, np.sqrt(extra), factor / np.sqrt(total), weighted
 
 
-def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
-    """Remove, one by one, poles that noise may explain; SolverError when no pole remains."""
+def supported(
+    lines: Lines, poles: ComplexArray, part: ComplexArray, first: PoleFit | None = None
+) -> PoleFit:
+    """Remove, one by one, poles that noise may explain; SolverError when no pole remains.
+
+    `first` is the fit at these poles, if it exists already.
+    """
     least = gain_due_of_pole(lines)
-    fit = pivoted(lines, poles, part)
+    fit = pivoted(lines, poles, part) if first is None else first
     kept, now = list(range(poles.size)), fit.cost
     while len(kept) > 1:
         rises = fit.rises(kept)

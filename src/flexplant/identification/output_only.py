@@ -13,7 +13,8 @@ from ..errors import ModelError, SolverError
 from ..lti.sampling import LIGHT
 from ..modes.matching import NEAR, assigned, mac_matrix
 from ..parallel import Progress, expect, tick
-from .diagram import OrderPoles, built_diagram, checked_orders
+from .diagram import OrderPoles, built_diagram
+from .identify import checked_orders
 from .measured import MeasuredModes
 from .spectra import signals
 

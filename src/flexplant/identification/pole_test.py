@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
-from ..tolerances import CERTAIN, CHANCE, CLOSE, SAME
+from ..tolerances import CERTAIN, CHANCE, CLOSE, NULL, SAME
 from .model_error import (
     coherence,
     corroborated,
@@ -179,7 +179,8 @@ def unwindowed(fit: PoleFit) -> Proposals:
 def dropped(fit: PoleFit) -> Proposals:
     """Propose the poles that are modes and that noise alone does not explain."""
     light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
-    less = supported(fit.lines, fit.poles[light], fit.participation[:, light])
+    first = fit if light.size == fit.m else None
+    less = supported(fit.lines, fit.poles[light], fit.participation[:, light], first)
     if less.m < fit.m:
         yield [Trial(fit.lines, less.poles, less.participation, np.inf, -np.inf)]
 
@@ -191,19 +192,38 @@ def merged(fit: PoleFit) -> Proposals:
         yield [Trial(fit.lines, *fit.rest(pair[1]), np.inf, -np.inf)]
 
 
-def _refit_terms(fit: PoleFit, upper: int, chance: float) -> Trial:
-    """Return the fit with another number of residual terms of modes above the band."""
-    lines, count = fit.lines, upper - fit.lines.upper
-    other = replace(lines, upper=upper)
-    gain = fit.cost - PoleFit(other, fit.poles, fit.participation).cost
+def _refit_terms(fit: PoleFit, lines: Lines, fewest: PoleFit, chance: float) -> Trial:
+    """Return the fit of lines with another number of residual terms of modes above the band.
+
+    `fewest` is the fit at the same poles with no more of these terms than either.
+    """
+    count = lines.upper - fit.lines.upper
+    gain = fit.cost - fewest.cost + _gain_of_terms(fewest, lines)
     channels = lines.data.shape[0] * lines.data.shape[1]
     least = np.sign(count) * max(1.0, fit.misfit) * gain_due(lines, channels * abs(count), chance)
-    return Trial(other, fit.poles, fit.participation, gain, least)
+    return Trial(lines, fit.poles, fit.participation, gain, least)
+
+
+def _gain_of_terms(fit: PoleFit, more: Lines) -> float:
+    """Return the decrease of the cost by the further residual terms of other lines."""
+    # the terms S are orthogonal to the present ones; with the basis Q of the shapes and the error e
+    # it is `b^T (I - M^T M)^-1 b` with `M = Q^T S` and `b = S^T e`
+    gain, first = 0.0, fit.lines.lower + fit.lines.upper
+    for (Q, error), (smooth, _) in zip(fit.bases, more.smooth_bases, strict=True):
+        new, n_in = smooth[:, :, first:], len(smooth)
+        b = np.concatenate([S.T @ e for S, e in zip(new, error.reshape(n_in, -1), strict=True)])
+        parts = zip(Q.reshape(n_in, -1, Q.shape[1]), new, strict=True)
+        M = np.hstack([own.T @ S for own, S in parts])
+        free = np.eye(b.size) - M.T @ M
+        gain += float(b @ np.linalg.pinv(free, rcond=NULL, hermitian=True) @ b)
+    return gain
 
 
 def fewer_terms(fit: PoleFit) -> Proposals:
     """Propose the smallest number of residual terms that the data allow."""
-    trials = (_refit_terms(fit, upper, FEW) for upper in UPPER if upper < fit.lines.upper)
+    fewer = [fit.lines.with_upper(upper) for upper in UPPER if upper < fit.lines.upper]
+    fewest = PoleFit(fewer[0], fit.poles, fit.participation) if fewer else fit
+    trials = (_refit_terms(fit, lines, fewest, FEW) for lines in fewer)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
@@ -218,7 +238,9 @@ def more_terms(fit: PoleFit) -> Proposals:
     # bias
     lines = fit.lines
     afforded = afforded_terms(lines.freq.size, lines.lower)
-    trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded if upper > lines.upper)
+    most = lines.with_upper(max([lines.upper, *afforded]))
+    wider = (most.with_upper(upper) for upper in afforded if upper > lines.upper)
+    trials = (_refit_terms(fit, other, fit, CHANCE) for other in wider)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 

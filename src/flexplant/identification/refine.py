@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
 from ..parallel import so_far
 from ..tolerances import RANK, TINY
-from .terms import axis, pole_terms, residual_terms
+from .terms import FAR_APART, axis, orthonormal, pole_terms, qr, residual_terms, take_off
 
 #: largest entry of a participation vector relative to the one held at 1
 RUNAWAY = 5.0
@@ -25,6 +25,9 @@ FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
 TRIAL_STEPS, GAINS_AHEAD = 4, 20.0
 #: number of steps of a fit of one output, whose start poles are close
 OWN = 20
+#: least independent fraction of the square of a column for which products are accurate: 1e-10 with
+#: rounding, which a damping of 1e-8 hides
+OWN_SQUARE = 1e-6
 #: least damping ratio of a pole, and its largest distance from zero relative to the highest line:
 #: there the pole is a constant within 1 %, and with a hold its exponential does not overflow
 LEAST, FARTHEST = 1e-7, 100.0
@@ -94,7 +97,19 @@ class Lines:
         # the part of the residual terms is known
         some.__dict__["smooth_bases"] = [self.smooth_bases[o] for o in rows]
         some.__dict__["goals"] = [self.goals[o] for o in rows]
+        some.__dict__["twice"] = self.twice[rows]
         return some
+
+    def with_upper(self, upper: int) -> Lines:
+        """Return the lines with another number of residual terms of modes above the band."""
+        other, count = replace(self, upper=upper), self.lower + upper
+        other.__dict__["twice"] = self.twice
+        if upper <= self.upper:
+            # bases of fewer terms are the leading columns
+            other.__dict__["smooth_bases"] = [
+                (Q[:, :, :count], R[:, :count, :count]) for Q, R in self.smooth_bases
+            ]
+        return other
 
     def pole_terms(self, poles: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Return the terms (m, n_freq) of poles and their derivatives."""
@@ -114,12 +129,21 @@ class Lines:
         )
 
     @cached_property
+    def twice(self) -> FloatArray:
+        """The weights (n_out, n_in, 2 n_freq) of real and imaginary parts."""
+        return np.concatenate([self.weight, self.weight], axis=-1)
+
+    @cached_property
     def smooth_bases(self) -> list[tuple[FloatArray, FloatArray]]:
         """Per output Q (n_in, 2 n_freq, n_terms) and R of the weighted residual terms."""
-        found = []
-        for w in self.weight:
-            pairs = [_qr(_real_and_imag(self.smooth * row).T) for row in w]
-            found.append((np.array([Q for Q, _ in pairs]), np.array([R for _, R in pairs])))
+        # the terms are made orthonormal with mean weights first: with others little is left to do
+        mean = np.sqrt(np.mean(self.twice**2, axis=(0, 1)))
+        shared, R = qr((_real_and_imag(self.smooth) * mean).T)
+        terms, found = shared.T / mean, []
+        bases = np.empty((*self.twice.shape[:2], *terms.shape))
+        for weights, Q in zip(self.twice, bases, strict=True):
+            parts = [orthonormal(terms * w, own) for w, own in zip(weights, Q, strict=True)]
+            found.append((Q.swapaxes(1, 2), np.array([(own * size) @ R for own, _, size in parts])))
         return found
 
     @cached_property
@@ -127,7 +151,8 @@ class Lines:
         """Per output the weighted data (n_in 2 n_freq,) without the residual terms."""
         found = []
         for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
-            found.append(_off(Q, _real_and_imag(data * w)[:, None, :]).ravel())
+            goal = _real_and_imag(data * w)[:, None, :]
+            found.append(take_off(Q, goal).ravel())
         return found
 
 
@@ -160,7 +185,7 @@ def refined(
     participation, pivots = now.participation, now.pivots
     # nearly Gauss-Newton from the start, whose poles are good
     damping, idle = 1e-6, 0
-    power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
+    power = float(np.linalg.norm(lines.data * lines.weight)) ** 2
     enough = ROUGH if poles_only else FINE if fine else COARSE
     farthest = FARTHEST * 2 * np.pi * float(lines.freq[-1])
     for number in range(steps):
@@ -250,35 +275,40 @@ class PoleFit:
         self.plus, self.slope = lines.pole_terms(poles)
         self.minus, self.slope_minus = lines.pole_terms(poles.conj())
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
-        self.triangles: list[tuple[FloatArray, FloatArray]] = []
+        #: per output R and its inverse, of columns of length 1, and their lengths
+        self.triangles: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error
         self.bases: list[tuple[FloatArray, FloatArray]] = []
         #: fits of single outputs made so far, by position in `lines.parts`
         self.alone: dict[int, PoleFit] = {}
         self.cost = 0.0
         columns = self._stacked(self.plus, self.minus, participation)
-        for o, (right, stacked) in enumerate(zip(lines.goals, columns, strict=True)):
-            size = np.maximum(np.linalg.norm(stacked, axis=0), TINY)
-            Q, R = _orthonormal(stacked / size)
-            if np.min(np.abs(np.diag(R)), initial=1.0) < FAR_APART:
+        # one array for all outputs: memory that is new for each takes longer than its products
+        bases = np.empty((n_out, 2 * m, 2 * data[0].size))
+        for o, (right, stacked, rows) in enumerate(zip(lines.goals, columns, bases, strict=True)):
+            R, inverse, size = orthonormal(stacked.reshape(rows.shape), rows)
+            if np.min(np.abs(R.diagonal()), initial=1.0) < FAR_APART:
                 # the difference of two poles that nearly coincide holds their rounding, enlarged
-                rows = Q.T.reshape(2 * m, data.shape[1], -1).swapaxes(0, 1)
-                Q = _off(lines.smooth_bases[o][0], rows).swapaxes(0, 1).reshape(Q.shape[::-1]).T
-            x = la.lstsq(R, Q.T @ right, cond=RANK)[0] / size
+                take_off(lines.smooth_bases[o][0], rows.reshape(stacked.shape).swapaxes(0, 1))
+            due = rows @ right
+            x = inverse @ due / size
             self.shapes[o] = x[:m] + 1j * x[m:]
-            self.triangles.append((R, size))
-            error = right - Q @ (Q.T @ right)
+            self.triangles.append((R, inverse, size))
+            error = right - due @ rows
             self.cost += float(error @ error)
-            self.bases.append((Q, error))
+            self.bases.append((rows.T, error))
 
     def _stacked(
         self, plus: ComplexArray, minus: ComplexArray, participation: ComplexArray
     ) -> Iterator[FloatArray]:
-        """Yield per output the columns (n_in 2 n_freq, 2 m) of shapes, free of residual terms."""
-        both = np.array([_turned(_halves(plus, minus), own) for own in participation])
-        for (Q, _), w in zip(self.lines.smooth_bases, self.lines.weight, strict=True):
-            columns = _off(Q, both * _twice(w)[:, None, :])
-            yield columns.swapaxes(0, 1).reshape(2 * len(plus), w.shape[0] * columns.shape[2]).T
+        """Yield per output the rows (2 m, n_in, 2 n_freq) of shapes, free of residual terms."""
+        halves = _halves(plus, minus)
+        both = np.array([_turned(halves, own) for own in participation]).swapaxes(0, 1)
+        rows = np.empty(both.shape)
+        for (Q, _), w in zip(self.lines.smooth_bases, self.lines.twice, strict=True):
+            np.multiply(both, w, out=rows)
+            take_off(Q, rows.swapaxes(0, 1))
+            yield rows
 
     @property
     def misfit(self) -> float:
@@ -294,9 +324,12 @@ class PoleFit:
         # with the least-squares coefficients x and the inverse V of the normal matrix, leaving out
         # the two of a pole costs `x^T V^-1 x` of their entries
         both, total = np.array([*kept, *(k + self.m for k in kept)]), np.zeros(len(kept))
-        for right, (Q, _), (R, _) in zip(self.lines.goals, self.bases, self.triangles, strict=True):
-            half = la.pinv(la.qr(R[:, both], mode="economic")[1], rtol=0.0)
-            x = half @ (half.T @ (R[:, both].T @ (Q.T @ right)))
+        parts = zip(self.lines.goals, self.bases, self.triangles, strict=True)
+        for right, (Q, _), (R, half, _) in parts:
+            x = half @ (Q.T @ right)
+            if len(kept) < self.m:
+                half = np.asarray(la.pinv(la.qr(R[:, both], mode="economic")[1], rtol=0.0))
+                x = half @ (half.T @ (R[:, both].T @ (Q.T @ right)))
             rows = half.reshape(2, len(kept), -1).transpose(1, 0, 2)
             own = np.linalg.pinv(rows @ rows.transpose(0, 2, 1), rcond=0.0, hermitian=True)
             pairs = x.reshape(2, -1)
@@ -313,10 +346,11 @@ class PoleFit:
         plus, minus = (lines.pole_terms(some)[0] for some in (poles, poles.conj()))
         cost, columns = self.cost, self._stacked(plus, minus, participation)
         gone = [] if instead is None else [instead, instead + self.m]
-        for right, A, (Q, error), (R, _) in zip(
+        for right, rows, (Q, error), (R, _, _) in zip(
             lines.goals, columns, self.bases, self.triangles, strict=True
         ):
-            lines.work.add(A.size * 4 * self.m)
+            lines.work.add(rows.size * 4 * self.m)
+            A = rows.reshape(len(rows), -1).T
             A = A / np.maximum(np.linalg.norm(A, axis=0), TINY)
             known = Q.T @ A
             turned = la.qr(np.delete(R, gone, axis=1))[0] if gone else np.eye(2 * self.m)
@@ -364,27 +398,25 @@ class PoleFit:
         part.cost = sum(float(error @ error) for _, error in part.bases)
         return part
 
-    @cached_property
-    def modal(self) -> ComplexArray:
-        """The responses (n_out, n_in, n_freq) of the modes alone."""
-        residues = self.shapes[:, None, :] * self.participation
-        return np.asarray(residues @ self.plus + residues.conj() @ self.minus)
-
-    @cached_property
+    @property
     def terms(self) -> FloatArray:
         """The coefficients (n_out, n_in, n_terms) of the residual terms."""
-        left = _real_and_imag((self.lines.data - self.modal) * self.lines.weight)
+        residues = self.shapes[:, None, :] * self.participation
+        modal = residues @ self.plus + residues.conj() @ self.minus
+        left = _real_and_imag((self.lines.data - modal) * self.lines.weight)
         return np.array(
             [
-                [la.lstsq(R, Q.T @ row)[0] for Q, R, row in zip(Qs, Rs, rows, strict=True)]
+                [np.linalg.lstsq(R, Q.T @ row)[0] for Q, R, row in zip(Qs, Rs, rows, strict=True)]
                 for (Qs, Rs), rows in zip(self.lines.smooth_bases, left, strict=True)
             ]
         )
 
     @cached_property
     def model(self) -> ComplexArray:
-        """The fitted responses."""
-        return np.asarray(self.modal + self.terms @ self.lines.smooth)
+        """The fitted responses (n_out, n_in, n_freq)."""
+        error = np.array([own for _, own in self.bases]).reshape(self.lines.twice.shape)
+        real, imag = np.split(error, 2, axis=-1)
+        return np.asarray(self.lines.data - (real + 1j * imag) / self.lines.weight)
 
     @cached_property
     def _rows(self) -> FloatArray:
@@ -395,14 +427,14 @@ class PoleFit:
             return of_poles
         return np.concatenate([of_poles, _halves(self.plus, self.minus)])
 
-    def _combined(self, rows: FloatArray, o: int, i: int) -> FloatArray:
-        """Return the derivatives of an output by an input from `_rows`, or from products of it."""
-        # with Re and Im of the poles, then with those of the participation of the row's own input
-        m, shape = self.m, self.shapes[o]
-        parts = [_turned(rows[: 2 * m], shape * self.participation[i])]
-        if len(rows) > 2 * m:
-            parts.append(_turned(rows[2 * m :], shape))
-        return np.concatenate(parts)
+    def _combined(self, rows: FloatArray, shapes: ComplexArray) -> FloatArray:
+        """Return derivatives (..., n_in, 4 m, n) from `_rows`, or from products of it."""
+        # by Re and Im of the poles, then by those of the participation of the row's own input
+        m = self.m
+        parts = [_turned(rows[..., : 2 * m, :], shapes * self.participation)]
+        if rows.shape[-2] > 2 * m:
+            parts.append(_turned(rows[..., 2 * m :, :], shapes))
+        return np.concatenate(parts, axis=-2)
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
@@ -423,12 +455,10 @@ class PoleFit:
         """Return J (n_in 2 n_freq, n_parameters) of an output."""
         # `J = D - Q Q^T D` with the derivatives D of the rows of each input and the basis Q of the
         # shapes
-        n_in = self.participation.shape[0]
-        Q = self.bases[o][0]
+        n_in, Q = self.participation.shape[0], self.bases[o][0]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
-        weights = _twice(self.lines.weight[o])
-        rows = [self._combined(self._rows * w, o, i) for i, w in enumerate(weights)]
-        moving = _off(self.lines.smooth_bases[o][0], np.array(rows))
+        moving = self._combined(self._rows * self.lines.twice[o][:, None, :], self.shapes[o])
+        take_off(self.lines.smooth_bases[o][0], moving)
         for own, D, (mine, at) in zip(J, moving, self._places, strict=True):
             own[:, at] = D[mine].T
         J = J.reshape(Q.shape[0], -1)
@@ -440,41 +470,46 @@ class PoleFit:
         return N, g
 
     @cached_property
-    def _equations(self) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+    def _equations(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """J^T J and J^T e, and per output the projection Q^T D on the shapes."""
         # `J^T J = D^T D - (Q^T D)^T Q^T D` and `J^T e = D^T e`, summed over the inputs, whose rows
         # depend only on their participation; products of the common rows are combined. Q is the
         # basis of the residual terms and of the shapes, which are orthogonal to them, as e is. J
         # itself is formed where the difference would lose more digits than the least damping of a
         # step allows
-        n_in = self.participation.shape[0]
-        count = 2 * self.participation.size
-        self.lines.work.add(self.lines.data.size * count**2)
-        N, g, taken = np.zeros((count, count)), np.zeros(count), []
+        n_in, lines, m = self.participation.shape[0], self.lines, self.m
+        count, (n_out, size) = 2 * self.participation.size, (len(self.bases), len(self._rows))
+        lines.work.add(lines.data.size * count**2)
+        rows, terms = np.empty(self._rows.shape), lines.lower + lines.upper
+        squares = np.empty((n_out, n_in, size, size))
+        right = np.empty((n_out, n_in, size, terms + 2 * m + 1))
         for o, (Q, error) in enumerate(self.bases):
-            whole, common = np.zeros_like(N), np.zeros((2 * self.m, count))
-            errors = error.reshape(n_in, -1)
-            bases = Q.reshape(*errors.shape, 2 * self.m)
-            left, smooth = np.zeros_like(N), self.lines.smooth_bases[o][0]
-            weights = _twice(self.lines.weight[o])
-            parts = zip(weights, smooth, bases, errors, self._places, strict=True)
-            for i, (w, terms, basis, e, (mine, at)) in enumerate(parts):
-                rows = self._rows * w
-                half = self._combined(rows @ rows.T, o, i)
-                square = self._combined(half.T, o, i)[np.ix_(mine, mine)]
-                right = rows @ np.concatenate([terms, basis, e[:, None]], axis=1)
-                own = self._combined(right, o, i)[mine]
-                off = own[:, : terms.shape[1]]
-                whole[np.ix_(at, at)] += square
-                left[np.ix_(at, at)] += square - off @ off.T
-                g[at] += own[:, -1]
-                common[:, at] += own[:, terms.shape[1] : -1].T
-            left -= common.T @ common
-            if np.any(np.diag(left) < OWN_SQUARE * np.diag(whole)):
-                J = self._jacobian(o)
-                left = J.T @ J
-            N += left
-            taken.append(common)
+            columns = Q.reshape(n_in, -1, 2 * m), error.reshape(n_in, -1, 1)
+            parts = zip(lines.twice[o], lines.smooth_bases[o][0], *columns, strict=True)
+            for i, (w, *others) in enumerate(parts):
+                np.multiply(self._rows, w, out=rows)
+                np.matmul(rows, rows.T, out=squares[o, i])
+                np.concatenate([rows @ one for one in others], axis=1, out=right[o, i])
+        shapes = self.shapes[:, None, :]
+        half = self._combined(squares, shapes).swapaxes(2, 3)
+        whole, own = self._combined(half, shapes), self._combined(right, shapes)
+        off = own[..., :terms]
+        free = whole - off @ off.swapaxes(2, 3)
+        length, left = np.zeros((2, n_out, count))
+        taken, N, g = np.zeros((n_out, 2 * m, count)), np.zeros((count, count)), np.zeros(count)
+        for i, (mine, at) in enumerate(self._places):
+            length[:, at] += whole[:, i, mine, mine]
+            left[:, at] += free[:, i, mine, mine]
+            taken[:, :, at] += own[:, i, mine, terms:-1].swapaxes(1, 2)
+            g[at] += np.sum(own[:, i, mine, -1], axis=0)
+        close = np.any(left - np.sum(taken**2, axis=1) < OWN_SQUARE * length, axis=1)
+        for i, (mine, at) in enumerate(self._places):
+            N[at[:, None], at] += np.sum(free[~close, i], axis=0)[mine[:, None], mine]
+        flat = taken[~close].reshape(-1, count)
+        N -= flat.T @ flat
+        for o in np.flatnonzero(close):
+            J = self._jacobian(int(o))
+            N += J.T @ J
         return N, g, taken
 
     def jacobians(self) -> Iterator[ComplexArray]:
@@ -484,18 +519,20 @@ class PoleFit:
             split = self._jacobian(o).reshape(n_in, 2, n_freq, -1)
             yield split[:, 0] + 1j * split[:, 1]
 
-    def maps(self) -> list[tuple[FloatArray, ComplexArray]]:
-        """Return per output the derivatives of its shapes."""
-        # d[Re psi; Im psi] / d(poles, participation) and, these held, its rows by the weighted data
-        # (n_in, n_freq, 2 m)
-        n_in, n_freq = self.lines.data.shape[1:]
+    def maps(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Return per output the derivatives of its shapes, and their map from the bases."""
+        # d[Re psi; Im psi] / d(poles, participation) and, these held, by `Q^T` times the data
         found = []
-        for o, ((Q, _), common) in enumerate(zip(self.bases, self._equations[2], strict=True)):
-            R, size = self.triangles[o]
-            inverse = la.pinv(R, rtol=RANK) / size[:, None]
-            rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
-            found.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
+        for (_, inverse, size), common in zip(self.triangles, self._equations[2], strict=True):
+            own = inverse / size[:, None]
+            found.append((-own @ common, own))
         return found
+
+    def shape_rows(self, o: int, own: FloatArray) -> ComplexArray:
+        """Return the derivatives (n_in, n_freq, 2 m) of an output's shapes by its weighted data."""
+        n_in, n_freq = self.lines.data.shape[1:]
+        rows = (self.bases[o][0] @ own.T).reshape(n_in, 2, n_freq, 2 * self.m)
+        return np.asarray(rows[:, 0] + 1j * rows[:, 1])
 
 
 def free_inputs(pivots: Any, n_in: int) -> IntArray:
@@ -515,16 +552,14 @@ def _apply_step(
 
 
 def _damped_step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:
-    return np.asarray(la.solve(N + damping * np.eye(g.size), g, assume_a="pos"))
+    step, info = la.lapack.dposv(N + damping * np.eye(g.size), g)[1:]
+    if info:
+        raise la.LinAlgError("the equations of a step are not positive.")
+    return np.asarray(step)
 
 
 def _real_and_imag(values: Any) -> FloatArray:
     return np.concatenate([values.real, values.imag], axis=-1)
-
-
-def _twice(weight: FloatArray) -> FloatArray:
-    """Return the weights of real and imaginary parts."""
-    return np.concatenate([weight, weight], axis=-1)
 
 
 def _halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
@@ -533,44 +568,8 @@ def _halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
 
 
 def _turned(rows: FloatArray, residues: ComplexArray) -> FloatArray:
-    """Return the rows (2 m, n) of `_halves` for residues (m,), and for j times these."""
-    first, second = np.split(rows, 2)
-    real, imag = residues.real[:, None], residues.imag[:, None]
-    return np.concatenate([real * first + imag * second, real * second - imag * first])
-
-
-def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    if not matrix.shape[1]:
-        return np.zeros((matrix.shape[0], 0)), np.zeros((0, 0))
-    Q, R = la.qr(matrix, mode="economic")
-    return np.asarray(Q), np.asarray(R)
-
-
-#: least independent fraction of a column for which products are accurate, and for which one pass is
-#: exact to 1e-14; the same of its square, 1e-10 with rounding, which a damping of 1e-8 hides
-OWN_PART, FAR_APART, OWN_SQUARE = 1e-4, 0.1, 1e-6
-
-
-def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q and R of columns of unit length in column-major memory."""
-    # by the triangle of their products, twice where columns are close: many times faster than
-    # `_qr`, and equally accurate where no column is nearly a combination of the others
-    rows, whole = columns.T, np.eye(columns.shape[1])
-    for _ in range(2):
-        try:
-            triangle = la.cholesky(rows @ rows.T, lower=True)
-        except la.LinAlgError:
-            return _qr(columns)
-        own = np.min(np.diag(triangle), initial=1.0)
-        if own < OWN_PART:
-            return _qr(columns)
-        rows = la.inv(triangle) @ rows
-        whole = whole @ triangle
-        if own > FAR_APART:
-            break
-    return rows.T, whole.T
-
-
-def _off(Q: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return rows (n_in, count, N) without their projection on Q (n_in, N, n_terms)."""
-    return np.asarray(rows - (rows @ Q) @ np.swapaxes(Q, -1, -2))
+    """Return the rows (..., 2 m, n) of `_halves` for residues (..., m), and for j times these."""
+    m = residues.shape[-1]
+    first, second = rows[..., :m, :], rows[..., m:, :]
+    real, imag = residues.real[..., None], residues.imag[..., None]
+    return np.concatenate([real * first + imag * second, real * second - imag * first], axis=-2)

@@ -94,14 +94,15 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
     # participation of repeated poles is only known up to a rotation and gets no variance
     inverse = scaled_inverse(N)
     slopes = np.array([slope for slope, _ in maps]).reshape(n_out, 2, m, -1)
-    direct = [own for _, own in maps]
     common = inverse
     mixed: FloatArray = np.zeros((n_out, len(inverse), 2 * m))
     held = np.zeros((n_out, n_out, m, 2, 2))
     if ready.independent:
-        for a, own in enumerate(direct):
-            held[a, a] = _of_modes(own, own)
+        for a, (_, turn) in enumerate(maps):
+            pairs = turn.reshape(2, m, -1)
+            held[a, a] = np.einsum("akq,bkq->kab", pairs, pairs)
     else:
+        direct = [fit.shape_rows(a, turn) for a, (_, turn) in enumerate(maps)]
         J, common = list(fit.jacobians()), np.zeros_like(inverse)
         for b, (own, slope) in enumerate(zip(direct, J, strict=True)):
             others, total = ready.spread(own), np.zeros_like(slope)

@@ -1,12 +1,14 @@
-"""Poles and residual terms at the lines of a measurement, with hold and window."""
+"""Poles and residual terms at the lines of a measurement, with hold and window; their bases."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray
+from ..tolerances import RANK, TINY
 
 #: |(s - lambda) T| below which the integral for a windowed pole is a sum over Gauss points, because
 #: the closed form loses digits there; and number of points, which is exact to rounding
@@ -72,7 +74,8 @@ def pole_terms(
         \quad b = 1 - a.
     """
     gap = s[None, :] - poles[:, None]
-    value, slope = 1.0 / gap, 1.0 / gap**2
+    value = 1.0 / gap
+    slope = value**2
     if hold is not None:
         T = 1.0 / hold
         turn = np.exp(poles * T)[:, None]
@@ -120,3 +123,51 @@ def residual_terms(
 def axis(freq: FloatArray) -> ComplexArray:
     """Return s = 2 pi i f."""
     return np.asarray(2j * np.pi * freq)
+
+
+def qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q and R of a matrix, also of one without columns."""
+    if not matrix.shape[1]:
+        return np.zeros((matrix.shape[0], 0)), np.zeros((0, 0))
+    Q, R = la.qr(matrix, mode="economic")
+    return np.asarray(Q), np.asarray(R)
+
+
+#: least independent fraction of a column for which products are accurate, and for which one pass is
+#: exact to 1e-14
+OWN_PART, FAR_APART = 1e-4, 0.1
+
+
+def orthonormal(rows: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return R of columns, given as rows, its inverse and their lengths; `basis` becomes Q^T."""
+    # by the triangle of their products, twice where columns are close: many times faster than `qr`,
+    # and equally accurate where no column is nearly a combination of the others
+    products = rows @ rows.T
+    size = np.maximum(np.sqrt(products.diagonal()), TINY)
+    now, scale, products = rows, size, products / size / size[:, None]
+    whole = inverse = np.eye(len(rows))
+    for _ in range(2):
+        try:
+            triangle = np.linalg.cholesky(products)
+        except la.LinAlgError:
+            break
+        own = np.min(triangle.diagonal(), initial=1.0)
+        if own < OWN_PART:
+            break
+        back = np.linalg.inv(triangle)
+        whole, inverse = whole @ triangle, back @ inverse
+        if own > FAR_APART:
+            np.matmul(back / scale, now, out=basis)
+            return whole.T, inverse.T, size
+        now, scale = (back / scale) @ now, np.ones(len(rows))
+        products = now @ now.T
+    Q, R = qr((rows / size[:, None]).T)
+    basis[:] = Q.T
+    return R, np.asarray(la.pinv(R, rtol=RANK), dtype=np.float64), size
+
+
+def take_off(Q: FloatArray, rows: FloatArray) -> FloatArray:
+    """Take the projection on Q (n_in, N, n_terms) from rows (n_in, count, N), and return them."""
+    for own, basis in zip(rows, Q, strict=True):
+        own -= (own @ basis) @ basis.T
+    return rows
