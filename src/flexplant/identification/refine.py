@@ -507,8 +507,8 @@ class PoleFit:
             N[at[:, None], at] += np.sum(free[~close, i], axis=0)[mine[:, None], mine]
         flat = taken[~close].reshape(-1, count)
         N -= flat.T @ flat
-        for o in np.flatnonzero(close):
-            J = self._jacobian(int(o))
+        for o in np.flatnonzero(close).tolist():
+            J = self._jacobian(o)
             N += J.T @ J
         return N, g, taken
 
