@@ -247,7 +247,7 @@ def dense_solver(g: Subsystem) -> tuple[Solver, int, int]:
         alike.setdefault(g.A[np.ix_(own, own)].tobytes(), []).append(own)
     solvers: list[tuple[_Gains, _Channels]] = []
     sizes = max(MODAL_CHUNK, 64 * len(g.A)), PARTS
-    known: dict[tuple[bytes, ...], tuple[_Channels, list[_Poles]]] = {}
+    known: dict[tuple[bytes, ...], tuple[_Channels, list[_Residues]]] = {}
     for parts in alike.values():
         seen = [np.flatnonzero(g.C[:, own].any(axis=1)) for own in parts]
         fed = [np.flatnonzero(g.B[own].any(axis=0)) for own in parts]
@@ -295,14 +295,14 @@ def _separate_states(A: FloatArray) -> list[IntArray]:
     return parts
 
 
-class _Poles(NamedTuple):
+class _Residues(NamedTuple):
     """Poles (n,), one of each pair, and residues (channels, n), those of several parts in turn."""
 
     poles: ComplexArray
     residues: ComplexArray
 
 
-def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Poles | None:
+def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Residues | None:
     """Return poles and residues; a pole off the real axis stands for its conjugate too."""
     poles, left, right = diagonal_form(A, np.hstack(Bs), np.vstack(Cs))
     if left is None or right is None:
@@ -316,10 +316,10 @@ def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Pol
         (left[i : i + p, None] * right[:, j : j + m].T).reshape(p * m, poles.size)
         for i, j, (p, m) in zip(rows, columns, sizes, strict=False)
     ]
-    return _Poles(poles, np.concatenate(residues))
+    return _Residues(poles, np.concatenate(residues))
 
 
-def _pole_gains(every: list[_Poles], channels: _Channels) -> _Gains:
+def _pole_gains(every: list[_Residues], channels: _Channels) -> _Gains:
     """Real residues times functions of s, of all poles with the same channels."""
     poles = np.concatenate([one.poles for one in every])
     residues = np.hstack([one.residues for one in every])
