@@ -6,6 +6,7 @@ such systems.
 
 - `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
 - `frequency_response`: the `Frf` of a system, or of a structure between its ports.
+- `merged_frf`: one `Frf` of several measurements, with other sensors or forces in each.
 - `discretized`: exact sampling of a plant with a hold and a delay. `tustin` and `matched` sample
   controllers.
 - `Delayed`: a system with a delay or a derivative in continuous time, exact on the frequency axis.
@@ -89,6 +90,7 @@ from .interconnection import parallel as parallel
 from .interconnection import series as series
 from .lyapunov import controllability_gramian as controllability_gramian
 from .lyapunov import observability_gramian as observability_gramian
+from .merged_responses import merged_frf as merged_frf
 from .minimal_realisations import minimal as minimal
 from .modal import ModalForm as ModalForm
 from .modal import StableSplit as StableSplit
