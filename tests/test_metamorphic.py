@@ -197,9 +197,12 @@ def norms_as_told_first(sampled):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sampled", [False, True])
-def test_norms_of_the_best_controllers(tell, sampled):
-    found = [norms_as_told_first(sampled), best_norms(tell(truss(7, held=True)), sampled)]
+@pytest.mark.parametrize(
+    ("name", "sampled"), [(name, bool(i % 2)) for i, name in enumerate(OTHERWISE)]
+)
+def test_norms_of_the_best_controllers(name, sampled):
+    told = OTHERWISE[name](truss(7, held=True))
+    found = [norms_as_told_first(sampled), best_norms(told, sampled)]
     np.testing.assert_allclose(found[1][0], found[0][0], rtol=1e-6)
     np.testing.assert_allclose(found[1][1], found[0][1], rtol=2e-3)
     np.testing.assert_allclose(found[1][2], found[0][2], rtol=1e-6)

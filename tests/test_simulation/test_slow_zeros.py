@@ -99,8 +99,7 @@ def test_a_loop_has_the_filters_too():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("part", [0.3, 3.0])
+@pytest.mark.parametrize(("seed", "part"), [(0, 0.3), (1, 3.0), (2, 0.3), (3, 3.0)])
 def test_filters_leave_less_on_machines_that_differ(seed, part):
     """The bandwidth is below or above the zero; the machine's isolators are not the model's."""
     plant, (_, M, k, _) = on_a_frame(seed, rate=2e3)

@@ -30,7 +30,7 @@ def test_scattered_poles_converge_with_every_gauss_newton(plate):
     rom, target = plate.reduced(0.01, True), oracle.truth(0.01)
     parameters = [AddedMass(plate.z8), AddedDamping(plate.z8)]
     rng = np.random.default_rng(0)
-    for _ in range(12):
+    for _ in range(6):
         noise = 1e-6 * np.abs(target) * (rng.normal(size=2) + 1j * rng.normal(size=2))
         data = [Eigenvalues(MeasuredModes(target + noise, modes=[6, 7]))]
         paper = update(rom, parameters, data)
