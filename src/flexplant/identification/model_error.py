@@ -51,7 +51,8 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEGLIGIBLE * (fit.cost - free)
     limit, alone = min(least, free + noise, fit.cost / NOISE), 0.0
     for place in range(parts):
-        alone += fit.own_of(place).cost
+        own = fit.own_below(place, limit - alone)
+        alone += np.inf if own is None else own.cost
         if alone >= limit:
             return False
     return True

@@ -21,7 +21,7 @@ from .model_error import (
     supported,
     twin_poles,
 )
-from .refine import Lines, PoleFit, refined
+from .refine import Lines, PoleFit, pivoted, refined
 
 #: probability that noise is taken for outputs that disagree; real differences are far larger
 ALARM = 1e-9
@@ -53,6 +53,8 @@ class Trial(NamedTuple):
     participation: ComplexArray
     gain: float
     least: float
+    #: the fit before refinement, if it exists already
+    first: PoleFit | None = None
 
 
 #: rivals of each place of a possible change, the best ones first
@@ -91,7 +93,7 @@ def _accepted(fit: PoleFit, trial: Trial, steps: int) -> PoleFit | None:
     below = fit.cost - trial.least
     more = None
     with attempted(f"a fit with {trial.poles.size} poles", SolverError):
-        more = refined(*trial[:3], steps=steps, strict=more_poles, below=below)
+        more = refined(*trial[:3], steps=steps, strict=more_poles, below=below, first=trial.first)
     if more is None:
         return None
     zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
@@ -141,15 +143,10 @@ def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
     gain = 0.0
     for place in np.argsort(np.subtract(after, before), kind="stable").tolist():
         own = more.own_of(place)
-        if place not in fit.alone:
-            least_of_it = own.cost + least - gain
-            alone = None
-            with attempted(f"a fit of {fit.lines.side} {place + 1} alone", SolverError):
-                alone = fit.of_rows(fit.lines.parts[place], below=least_of_it)
-            if alone is None:
-                return True
-            fit.alone[place] = alone
-        gain += fit.alone[place].cost - own.cost
+        alone = fit.own_below(place, own.cost + least - gain)
+        if alone is None:
+            return True
+        gain += alone.cost - own.cost
         if gain > least:
             return True
     return False
@@ -201,7 +198,8 @@ def _refit_terms(fit: PoleFit, lines: Lines, fewest: PoleFit, chance: float) -> 
     gain = fit.cost - fewest.cost + _gain_of_terms(fewest, lines)
     channels = lines.data.shape[0] * lines.data.shape[1]
     least = np.sign(count) * max(1.0, fit.misfit) * gain_due(lines, channels * abs(count), chance)
-    return Trial(lines, fit.poles, fit.participation, gain, least)
+    first = fewest if lines is fewest.lines else None
+    return Trial(lines, fit.poles, fit.participation, gain, least, first)
 
 
 def _gain_of_terms(fit: PoleFit, more: Lines) -> float:
@@ -222,7 +220,7 @@ def _gain_of_terms(fit: PoleFit, more: Lines) -> float:
 def fewer_terms(fit: PoleFit) -> Proposals:
     """Propose the smallest number of residual terms that the data allow."""
     fewer = [fit.lines.with_upper(upper) for upper in UPPER if upper < fit.lines.upper]
-    fewest = PoleFit(fewer[0], fit.poles, fit.participation) if fewer else fit
+    fewest = pivoted(fewer[0], fit.poles, fit.participation) if fewer else fit
     trials = (_refit_terms(fit, lines, fewest, FEW) for lines in fewer)
     yield [trial for trial in trials if trial.gain > trial.least]
 

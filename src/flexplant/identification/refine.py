@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
-from ..errors import SolverError, counted
+from ..errors import SolverError, attempted, counted
 from ..parallel import so_far
 from ..tolerances import RANK, TINY
 from .terms import FAR_APART, axis, orthonormal, pole_terms, qr, residual_terms, take_off
@@ -200,6 +200,9 @@ def refined(
         scaled[held, held] = 1.0
         # the gain of a full step: a damped step is short and does not show convergence
         predicted = float(slope @ _damped_step(scaled, slope, 1e-8))
+        if predicted <= FINE * enough * now.cost / (2 * lines.data.size):
+            # rounding would decide whether so small a step lowers the cost
+            break
         better, gained = None, 0.0
         for _ in range(12):
             step = _damped_step(scaled, slope, damping) / size
@@ -365,6 +368,13 @@ class PoleFit:
     def own(self) -> list[PoleFit]:
         """The fits of each output, or set-up, alone."""
         return [self.own_of(place) for place in range(len(self.lines.parts))]
+
+    def own_below(self, place: int, below: float) -> PoleFit | None:
+        """Return the fit of one output, or set-up, alone; None where it stays above a cost."""
+        if place not in self.alone:
+            with attempted(f"a fit of {self.lines.side} {place + 1} alone", SolverError):
+                self.alone[place] = self.of_rows(self.lines.parts[place], below)
+        return self.alone.get(place)
 
     def own_of(self, place: int) -> PoleFit:
         """Return the fit of one output, or set-up, alone, which is made once."""
