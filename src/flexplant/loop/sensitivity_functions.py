@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -209,7 +209,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     controller = controller.select(driven)
     plant = plant.select(controller.inputs, driven)
     # the peaks of S lie at the poles of the closed loop, not at those of its parts
-    return _modelled(plant, controller, lambda: loop_poles(plant, controller))
+    return _modelled(plant, controller, cache(lambda: loop_poles(plant, controller)))
 
 
 def _fed_back(gain: Any) -> tuple[Any, StateSpace]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -215,6 +215,7 @@ class Evaluator:
         laws = design.laws
         law = laws[name]
 
+        @cache  # the grid, the count and the bandwidth need them
         def poles() -> ComplexArray:
             if machine.is_measured:
                 return law.system.poles()
