@@ -110,7 +110,7 @@ class AxisLaw:
         if axis.resolved:
             loop = self.response(numbers, self.s) * axis.points[1]
             return bool(_turns_stably(loop, axis.integrators))
-        return are_stable([self.law(numbers)], axis.freq, axis.G[None, None], rigid=int(axis.free))
+        return are_stable([self.law(numbers)], axis.lines, rigid=int(axis.free))
 
     def _scale(self, numbers: FloatArray) -> FloatArray:
         """Return the gains (..., 1) with which the loop of the rigid body crosses 1 at w_b."""
@@ -335,6 +335,11 @@ class MeasuredAxis:
     #: whether the lines resolve all resonances, as those of a model do
     resolved: bool = False
 
+    @cached_property
+    def lines(self) -> MeasuredPlant:
+        """The plant for which laws are judged on its lines."""
+        return MeasuredPlant(self.freq, self.G[None, None])
+
     @property
     def ceiling(self) -> float:
         """The highest corner [Hz] that a law may have: 0.45 of the rate, or the last line."""
@@ -421,19 +426,18 @@ class MeasuredAxis:
         return 2 * self.free + (self.power != 1)
 
 
-def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid: int) -> bool:
+def are_stable(laws: Sequence[Law], plant: MeasuredPlant, *, rigid: int) -> bool:
     """Return whether laws stabilise axes (k, k, n_freq) on lines, by the Nyquist count."""
 
     def respond(freq: FloatArray) -> ComplexArray:
         each = np.array([-law.response(freq) for law in laws])
         return np.asarray(np.eye(len(laws))[:, :, None] * each)
 
-    if freq.size < FEWEST:
+    if plant.freq.size < FEWEST:
         return False
     integrators = sum(any(isinstance(f, Pid) and f.i for f in law.factors) for law in laws)
-    plant = MeasuredPlant(freq, P)
     count = nyquist_count(
-        plant, respond, plant.hidden(respond(freq)),
+        plant, respond, plant.hidden(respond(plant.freq)),
         rigid=rigid, at_zero=2 * rigid + integrators, unstable=0, poles=np.zeros(0, dtype=complex),
     )  # fmt: skip
     return count.unstable == 0

@@ -14,6 +14,7 @@ from ...loop.broken import inverted
 from ...lti.frequency import Frf
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles
+from ...lti.measured_lines import MeasuredPlant
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...tolerances import NEGLIGIBLE
@@ -103,8 +104,12 @@ class JointPlant:
             poles = self._poles(laws)
             edge = np.abs(poles) - 1.0 if self.plant.dt else poles.real
             return bool(edge.max(initial=-1.0) < 0.0)
-        P = np.moveaxis(self.coupling(self.grid).inner, 0, -1)
-        return are_stable(laws, self.grid, P, rigid=self.rigid)
+        return are_stable(laws, self.lines, rigid=self.rigid)
+
+    @cached_property
+    def lines(self) -> MeasuredPlant:
+        """The axes of an Frf for which laws are judged on its lines."""
+        return MeasuredPlant(self.grid, np.moveaxis(self.coupling(self.grid).inner, 0, -1))
 
     def worst(self, laws: Sequence[Law]) -> Worst:
         """Return the largest |S| of a stable loop, the grid refined at its peaks."""
