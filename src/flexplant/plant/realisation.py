@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, positive
+from ..arrays import ComplexArray, FloatArray, IntArray, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..lti.blocks_of_states import block_diagonal
@@ -107,8 +107,19 @@ class ModalRealisation(Value):
         return [2] * first + [2 * (last - first + 1)] + [2] * (b - 1 - last)
 
     def row(self, at: Place, direction: str) -> FloatArray:
-        """Return the row over the model's DOFs for a place."""
-        return self.model.row(at, direction)
+        """Return the row over the model's DOFs for a place; what it weights is found once."""
+        if not isinstance(at, str | tuple):
+            return self.model.row(at, direction)
+
+        def found() -> tuple[IntArray, FloatArray, int]:
+            row = self.model.row(at, direction)
+            used = np.flatnonzero(row)
+            return used, row[used], row.size
+
+        used, weights, size = self.once(("row", at, direction), found)
+        row = np.zeros(size)
+        row[used] = weights
+        return row
 
     def load(self, forces: FloatArray) -> FloatArray:
         """Return forces on the model's DOFs in the coordinates of `row`."""
