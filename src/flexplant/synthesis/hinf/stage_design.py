@@ -205,6 +205,7 @@ class _StageTask(Design):
                 self.holds(self.wanted / _CROSSES)
             else:
                 self._kept(self.wanted / _CROSSES, self._moved, self.wanted)
+        vars(self).pop("machines", None)  # no check needs them again: each takes 3 MB
         if self.best is None:
             off, causes = 100.0 * max(self.ranges.values()), dict.fromkeys(self.causes)
             raise InfeasibleError(
