@@ -25,7 +25,7 @@ OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 SIZE, ELEMENTS = (0.4, 0.3, 0.05), (8, 6, 2)  # m
 LX, LY, LZ = SIZE
 RATE, DELAY = 10e3, 1  # Hz, samples
-BANDWIDTH = 70.0  # Hz
+BANDWIDTH = 100.0  # Hz
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 CORNERS = [(x, y) for x in (0.0, LX) for y in (0.0, LY)]
 

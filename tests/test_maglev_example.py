@@ -12,7 +12,9 @@ from flexplant.documentation import keep
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 #: [m] rms in closed loop in the middle and at the corner
-PINS = {"x": (2.23853e-9, 2.35997e-9), "z": (2.39947e-9, 4.06848e-9)}
+PINS = {"x": (1.74965e-9, 1.85336e-9), "z": (1.87667e-9, 3.11504e-9)}
+#: modulus margins in the middle, between and at the corner
+MARGINS = 0.622, 0.561, 0.557
 
 pytestmark = pytest.mark.long
 
@@ -59,7 +61,10 @@ def test_the_machine_keeps_what_the_loop_promises(maglev, found, text):
     assert kept.modulus_margin == pytest.approx(promised.modulus_margin, rel=0.05)
     for axis in maglev.AXES:
         assert kept.rms(f"die:{axis}") == pytest.approx(promised.rms(f"die:{axis}"), rel=0.03)
-        assert kept.rms(f"die:{axis}") != pytest.approx(promised.rms(f"die:{axis}"), rel=1e-4)
+        # rz differs least: by 2.5e-5
+        assert kept.rms(f"die:{axis}") != pytest.approx(
+            promised.rms(f"die:{axis}"), rel=1e-5, abs=0
+        )
     assert f"{kept.modulus_margin:.3f}" in text
 
 
@@ -86,10 +91,10 @@ def test_the_path_of_the_poi(found):
         assert rms[0] == pytest.approx(middle, rel=2e-3, abs=0)
         assert rms[-1] == pytest.approx(corner, rel=2e-3, abs=0)
         assert np.all(np.diff(rms) > 0)
-    for case in found["path"]:
+    for case, margin in zip(found["path"], MARGINS, strict=True):
         assert case["loop"].is_stable
         assert case["loop"].left_out.is_stable
-        assert case["loop"].modulus_margin == pytest.approx(0.467, abs=0.003)
+        assert case["loop"].modulus_margin == pytest.approx(margin, abs=0.003)
         # what is not seen of the motion is far below what is not suppressed of it
         assert case["observer"].rms("die:z") < 0.2 * case["loop"].rms("die:z")
     # the fourth sensor along z tells how the stage twists: worth 23 % at the corner

@@ -49,10 +49,10 @@ def test_margins_of_an_integrator_with_a_second_of_delay(k):
     ],
 )
 def test_norms_are_those_with_pades_delay(num, den, law, delay):
-    """The norms of S and T of an ordinary system with a delay of order 12."""
+    """The norms of S and T of an ordinary system with a delay of order 8."""
     plant, K = Delayed(tf(num, den), delay), -Delayed.tf(*law)
     loop = DelayedLoop(plant, K)
-    L = fx.lti.minimal(loop.gain.pade(12))
+    L = fx.lti.minimal(loop.gain.pade(8))
     S = fx.lti.feedback(fx.StateSpace([], [], [], [[1.0]]), L)
     T = fx.lti.feedback(L, fx.StateSpace([], [], [], [[1.0]]))
     assert loop.is_stable and S.is_stable

@@ -1,5 +1,6 @@
 """Designs on truncated plants, checked with the truncated modes: oracle by dense matrices."""
 
+import re
 import warnings
 from functools import cache
 
@@ -99,7 +100,8 @@ def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     # oracle: stability() is the radius' logarithm or the like: only its sign counts
     loop = dense(whole, errors, found.system)
     assert np.abs(np.linalg.eigvals(loop[0])).max() == pytest.approx(radius, abs=1e-9)
-    assert len(messages) == 1 and f"mode {found.left_out.modes[0]} (" in messages[0]
+    # one mode of a repeated pair or both, as the eigenvalue solver turns them
+    assert len(messages) == 1 and re.search(rf"modes? {found.left_out.modes[0]}\b", messages[0])
     assert "unstable" in repr(found) and "truncated modes" in repr(found)
 
 
@@ -192,7 +194,7 @@ def test_where_none_are_known_the_answer_says_so():
 def test_a_closed_loop_carries_the_check(tmp_path):
     errors, _, found, _ = design()
     plant = sampled(small())
-    with pytest.warns(FlexplantWarning, match=r"stable on its plant, .* unstable .*mode \d+ \("):
+    with pytest.warns(FlexplantWarning, match=r"stable on its plant, .* unstable .*modes? \d+"):
         loop = close_loop(plant.replace(evaluation=many()), errors, found)
     assert loop.is_stable and not loop.left_out.is_stable
     assert loop.left_out.modes == found.left_out.modes

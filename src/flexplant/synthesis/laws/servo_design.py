@@ -351,7 +351,8 @@ class ServoTask:
                 break
             axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
             wide = self.notched(plain._replace(axes=tuple(axes)))
-            if self._best([best, wide]) is wide:
+            loop = self.closed(wide)
+            if self._best([best, wide]) is wide and (loop.completed or loop).is_stable:
                 wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
         return best
