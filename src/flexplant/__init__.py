@@ -113,7 +113,7 @@ slower.
 | H-infinity, 61 states of a stage: norm 0.901 | 0.59 s | slycot: no answer in 10 s | - | - |
 | mu of 12 complex scalars, both bounds | 21 ms | slycot ab13md, the upper one | 15 ms | 0.69 |
 | the upper bound alone | 13 ms | slycot ab13md, the upper one | 15 ms | 1.1 |
-| poles of a close pair in noise: error 5e-07 | 0.45 s | scikit-rf: 7e-07 | 0.26 s | 0.58 |
+| poles of a close pair in noise: error 5e-07 | 0.15 s | scikit-rf: 7e-07 | 0.14 s | 0.94 |
 | a sparse OUTPUT4 file of Nastran | 13 ms | pyYeti | 36 ms | 2.7 |
 
 Peers are faster for some tasks because flexplant also checks its results. For all modes of the

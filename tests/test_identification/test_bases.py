@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from flexplant.identification.refine import Lines, PoleFit
+from flexplant.identification.pole_test import fewer_terms, more_terms
+from flexplant.identification.refine import Lines, PoleFit, refined
 from oracles_identification import modal_frf, noisy, pole
 
 FREQ = np.arange(8.0, 100.0, 0.25)
@@ -60,3 +61,34 @@ def test_costs_with_other_poles_are_those_of_whole_fits(seed):
     exchanged = np.append(rest[0], two[0]), np.hstack([rest[1], two[1]])
     expected = least_squares_cost(H, *exchanged)
     assert fit.cost_with(*two, instead=2) == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_other_numbers_of_residual_terms_gain_what_whole_fits_gain(seed):
+    """Fewer terms suffice for modes of the band; a mode just above it requires more."""
+    rng = np.random.default_rng(seed)
+    n_in, true = 1 + seed % 3, pole([20.0, 33.0, 50.0, 77.0, 104.0], [0.01] * 5)
+    phi = 30.0 * rng.normal(size=(4, 5))
+    for propose, upper, count in ((fewer_terms, 9, 4), (more_terms, 3, 5)):
+        H = modal_frf(FREQ, true[:count], phi[:, :count], phi[:n_in, :count])
+        H = noisy(H, DEVIATION, rng)
+        weight = np.sqrt(2.0) / (DEVIATION * rng.uniform(1.0, 2.0, H.shape))
+        poles, part = true[:4], phi[:n_in, :4].astype(complex)
+        fit = PoleFit(Lines(FREQ, H, weight, LOWER, upper, None), poles, part)
+        trials = next(iter(propose(fit)))
+        assert trials
+        for trial in trials:
+            other = Lines(FREQ, H, weight, LOWER, trial.lines.upper, None)
+            gain = fit.cost - PoleFit(other, poles, part).cost
+            assert trial.gain == pytest.approx(gain, rel=1e-6)
+
+
+def test_a_fit_at_its_minimum_is_returned_as_it_is():
+    rng = np.random.default_rng(0)
+    true, phi = pole([20.0, 33.0, 50.0], [0.01] * 3), rng.normal(size=(4, 3))
+    H = noisy(modal_frf(FREQ, true, phi, phi[:2]), DEVIATION, rng)
+    lines = Lines(FREQ, H, np.full(H.shape, np.sqrt(2.0) / DEVIATION), LOWER, UPPER, None)
+    fit = refined(lines, true, phi[:2] + 0j, steps=20, fine=True)
+    for _ in range(9):
+        again, fit = fit, refined(lines, fit.poles, fit.participation, steps=20, first=fit)
+    assert fit is again

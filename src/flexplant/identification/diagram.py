@@ -326,15 +326,17 @@ class Moments:
         powers = np.hstack([ahead[:, :0:-1].conj(), ahead])
         self.n_out, self.n_in = data.shape[:2]
         R = squares @ powers
-        S = np.einsum("of,oif,fk->oik", squares, -data, powers, optimize=True)
-        T = np.einsum("of,oif,ojf,fk->ijk", squares, data.conj(), data, powers, optimize=True)
+        weighted = squares[:, None, :] * data
+        S = -weighted @ powers
+        T = np.einsum("oif,ojf->ijf", data.conj(), weighted) @ powers
         n, m = order + 1, self.n_in
         toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + order
         #: moments of A; column: coefficient r of A, channel i
         self.big = T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
         # powers of z on most of the circle are well conditioned for all data. Lower orders are
         # leading blocks, also of the inverse of a triangle
-        self.inverse = np.linalg.inv(np.linalg.cholesky(R[:, toeplitz]))
+        triangles = np.linalg.cholesky(R[:, toeplitz])
+        self.inverse = np.array([la.lapack.ztrtri(L, lower=1)[0] for L in triangles])
         coupled = S[:, :, toeplitz].transpose(0, 2, 3, 1).reshape(self.n_out, n, n * m)
         #: for each output L^{-1} S, which eliminates B
         self.taken = self.inverse @ coupled

@@ -210,9 +210,9 @@ UNASKED = 5e7
 BUDGET = 5e10
 #: operations of a whole fit and of a first result relative to those of a step, on average
 _REFINED, _FIRST = 6e3, 200.0
-#: operations of a whole fit and of a first result, relative to those of a step: 300 to 800, and 50
-#: to 80, on records of ten to thirty modes
-_WHOLE, _START = 500.0, 60.0
+#: operations of a whole fit and of a first result, relative to those of a step: 260 to 530, and 8
+#: to 31, on records of 10 to 14 modes
+_WHOLE, _START = 400.0, 20.0
 #: misfit of a first result above which a warning is given: deviations are enlarged by its square
 #: root
 LARGE = 4.0

@@ -88,7 +88,7 @@ class PreparedLines:
     @property
     def line_weight(self) -> FloatArray:
         """Weights (n_out, n_freq) of whole rows, as a matrix fraction needs them."""
-        mean = 1.0 / np.sqrt(np.mean(self.weight**-2.0, axis=1))
+        mean = 1.0 / np.sqrt(np.mean(1.0 / self.weight**2, axis=1))
         return np.asarray(mean / mean.max())
 
     def over_runs(self, count: int) -> PreparedLines:
