@@ -220,7 +220,7 @@ def claims(cases: dict[float, dict[str, Any]]) -> dict[str, bool]:
 # %% The run, and its tables
 def main() -> dict[str, Any]:
     """Return all that the tables and the picture show; two processes share the work."""
-    print("Two processes work for about a minute; bars show where they are.", flush=True)
+    print("Two processes work for about half a minute; bars show where they are.", flush=True)
     with ProcessPoolExecutor(2) as both:
         cases = dict(zip(DAMPINGS, both.map(study, DAMPINGS), strict=True))
     found = claims(cases)
