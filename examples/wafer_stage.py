@@ -68,7 +68,7 @@ def reduced(damping: float, *, compliance: bool = True) -> fx.ReducedModel:
 # %% The update: measured poles give mass at z8 and stiffness, then replace those of the model
 def identified(machine: Any) -> fx.MeasuredModes:
     """Return the machine's poles and shapes at the corners from noisy frequency responses."""
-    frf = machine.measure_frf(ports(), period=1.0, periods=3, discard=1, rng=4)
+    frf = machine.measure_frf(ports(), period=1.0, periods=3, discard=1, rng=7)
     return fx.identify_modes(frf, band=BAND, hold=RATE)
 
 

@@ -127,7 +127,7 @@ def test_gains_are_learnt_on_a_machine_that_the_model_does_not_describe(model):
     assert found.errors[1] < 0.35 * found.errors[0]
     assert np.ptp(found.errors[1:]) < 0.2 * found.errors[1]
     added = found.feedforward.gains[0, 0, 2] - start.gains[0, 0, 2]
-    assert added == pytest.approx(0.5, abs=0.05)
+    assert added == pytest.approx(0.5, abs=0.1)  # three deviations of forty seeds
     assert found.feedforward.gains[0] in found.gains and "3 moves" in repr(found)
     # as least squares of what no basis function reaches: a further move cannot do better
     assert found.errors.argmin() >= 1

@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from flexplant.loop import ClosedLoop, close_loop
 from flexplant.lti import StateSpace
 from flexplant.lti.discretisation import Recursion
 from flexplant.plant import StandardPlant
 from flexplant.plant.building import white_noise
-from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
+from flexplant.simulation.runs import Drawn, InBlocks, SampleBySample, make_runner
 from machines import observer, servo, stage
+from stages import sampled, some_modes
 
 
 def shown(runner, loop, given, start=None, seed=3):
@@ -99,3 +101,30 @@ def test_thousands_of_modes_go_mode_by_mode():
     expected = (decay**steps)[:, None] * np.cos(np.outer(steps, angle))
     z = shown(runner, loop, given, start)[0]
     np.testing.assert_allclose(z, expected.sum(axis=1), rtol=0, atol=1e-10 * modes)
+
+
+def test_few_columns_are_drawn_of_many_modes():
+    """To 1e-8 of the variance of each state; rounding of the factor chooses no other columns."""
+    plant = sampled(some_modes(count=60))
+    noise = white_noise(plant)
+    factor, few = noise.factor, Drawn(noise, plant).factor
+    assert few.shape[1] < 0.6 * factor.shape[1]
+    size = np.linalg.norm(factor, axis=1)
+    assert np.all(np.abs(few @ few.T - factor @ factor.T) <= 1e-8 * np.outer(size, size))
+    change = 1e-13 * np.random.default_rng(0).standard_normal(factor.shape)
+    other = Drawn(noise._replace(factor=factor * (1.0 + change)), plant).factor
+    np.testing.assert_allclose(other, few, rtol=1e-12, atol=0)
+
+
+def test_the_rms_of_a_loop_is_that_of_all_columns():
+    """Of each channel, by SciPy."""
+    loop = close_loop(stage(), observer(), servo())
+    g, noise = loop.monitored, white_noise(loop.plant)
+    few = Drawn(noise, loop.plant).factor
+    squares = []
+    for one in (noise.factor, few):
+        enter = np.zeros((g.n_states, one.shape[1]))
+        enter[: len(one)] = one
+        states = scipy.linalg.solve_discrete_lyapunov(g.A, enter @ enter.T)
+        squares.append(np.sum(g.C @ states * g.C, axis=1))
+    np.testing.assert_allclose(squares[1], squares[0], rtol=1e-7, atol=1e-12 * squares[0].min())

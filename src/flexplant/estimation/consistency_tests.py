@@ -240,7 +240,7 @@ def consistency(
     >>> plant = fx.testbeds.three_masses()
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=1)
+    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=2)
     >>> fx.estimation.consistency(observer, run).text
     'the innovations are white and of the predicted size.'
     """

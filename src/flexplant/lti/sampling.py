@@ -524,11 +524,13 @@ def accumulated_noise(
         count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    parts = [
-        np.sqrt(0.5 * piece * weight) * on(force, 0.5 * piece * (node + 1.0))
-        for node, weight in zip(nodes, weights, strict=True)
-    ]
-    G = compressed(np.hstack(parts))
+    # the moments in Legendre polynomials have the same sum of squares (an orthogonal combination of
+    # the nodes), and fall fast with their degree
+    degrees = np.arange(count)
+    moments = np.polynomial.legendre.legvander(nodes, count - 1) * weights[:, None]
+    moments *= np.sqrt(0.5 * piece * (degrees + 0.5))
+    parts = np.stack([on(force, 0.5 * piece * (node + 1.0)) for node in nodes], axis=2)
+    G = compressed((parts @ moments).reshape(n, -1))
     for k in range(doublings):
         G = compressed(np.hstack([G, on(G, piece * 2**k)]))
     return G

@@ -21,7 +21,7 @@
 >>> run = fx.simulate(loop, reference=move, duration=0.5, rng=1)
 >>> ma, msd = run.exposure("die:error", window=5e-3, start=0.4)
 >>> f"{1e9 * ma:.0f} nm, {1e9 * msd:.1f} nm"
-'1160 nm, 147.5 nm'
+'664 nm, 93.4 nm'
 
 Names elsewhere: ``lsim`` (MATLAB), ``forced_response`` (python-control) and runs of a Simulink
 model correspond to `simulate`.

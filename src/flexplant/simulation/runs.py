@@ -202,57 +202,31 @@ def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, Floa
     return diagonal, coupling, partner, rest
 
 
-#: number of states above which this is not searched, since it would take longer than a run
-_MANY = 256
-#: number of samples drawn and mixed together, which fit the cache
-_CHUNK = 256
-
-
 class Drawn:
     """The white noises of a plant, drawn for a stretch of samples at a time.
 
-    Few forces through many modes make a factor whose singular values fall fast: r columns of white
-    samples are mixed into the few that are not rounding, ``L V'`` the factor. They are drawn as r
-    columns, whose number and order do not depend on rounding, and always for a whole stretch, so
-    that a longer run begins with the shorter one bit by bit.
+    Columns of the factor are left out that add less than 1e-8 to the variance of every state: most
+    moments of forces over a sample. No basis is computed, so that rounding decides nothing. Numbers
+    are always drawn for a whole stretch: a longer run begins with the shorter one bit by bit.
     """
 
     def __init__(self, noise: WhiteNoise, plant: StandardPlant) -> None:
         names = [plant.w[i].removesuffix(":noise") for i in noise.columns]
         self.read = np.array([name in plant.y for name in names], dtype=bool)
         self.columns, self.deviation = noise.columns, noise.deviation
-        self.factor, self.mix = noise.factor, np.eye(noise.factor.shape[1])
-        self.thin = noise.factor.shape[0] <= _MANY
-        if self.thin:
-            size = np.linalg.norm(noise.factor, axis=1)
-            unit = noise.factor / divisor(size)[:, None]
-            U, s, V = np.linalg.svd(unit, full_matrices=False)
-            kept = int(np.count_nonzero(s > ROOT * s.max(initial=0.0)))
-            self.factor = size[:, None] * U[:, :kept] * s[:kept]
-            self.mix = np.ascontiguousarray(V[:kept].T)
-        self.buffer = np.empty((_CHUNK, self.mix.shape[0] + self.columns.size))
-
-    @property
-    def cost(self) -> int:
-        """Operations for a sample: products of matrices."""
-        return 2 * (self.factor.size + (self.mix.size if self.thin else 0))
+        square = noise.factor**2
+        part = square / divisor(square.sum(axis=1, keepdims=True))
+        kept = part.max(axis=0, initial=0.0) * len(part.T) > ROOT
+        self.factor = np.ascontiguousarray(noise.factor[:, kept])
 
     def draw(
         self, generator: np.random.Generator, samples: int, hold: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Return white samples (samples, few) for the factor, and noises of the columns of w."""
         # sensors are read in the first of every `hold` samples, with the noise of that rate
-        rank, few = self.mix.shape
-        white, single = np.empty((samples, few)), np.empty((samples, self.columns.size))
-        for start in range(0, samples, _CHUNK):
-            part = slice(start, min(start + _CHUNK, samples))
-            drawn = self.buffer[: part.stop - start]
-            generator.standard_normal(out=drawn)
-            if self.thin:
-                np.matmul(drawn[:, :rank], self.mix, out=white[part])
-            else:
-                white[part] = drawn[:, :rank]
-            np.multiply(drawn[:, rank:], self.deviation, out=single[part])
+        few = self.factor.shape[1]
+        drawn = generator.standard_normal((samples, few + self.columns.size))
+        white, single = drawn[:, :few], drawn[:, few:] * self.deviation
         if hold > 1:
             single[:, self.read] /= np.sqrt(hold)
             single[np.ix_(np.arange(samples) % hold > 0, self.read)] = 0.0
@@ -346,7 +320,7 @@ class SampleBySample:
         """Operations for a sample: about twelve calls, and products with single vectors."""
         m = self.parts
         products = 2 * ONE_VECTOR * (m.sense.size + m.law.size + m.inflow.size)
-        return 12 * CALL + products + self.noise.cost
+        return 12 * CALL + products + 2 * self.noise.factor.size
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put all runs at a state of plant and controller; each draws from its generator."""
