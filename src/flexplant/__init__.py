@@ -90,37 +90,34 @@ functions in other tools.
 package (peer), each row in one run of
 ``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio above 1 means that flexplant
 is faster. Before the times are taken, the results are compared. Times vary by about 20 % from run
-to run. Meanwhile other work used both cores (load 8 to 13), which makes quick calls up to 50 %
-slower.
+to run. The rows of 30 603 DOFs are from a run in which other work used both cores.
 
 | task | flexplant | peer | its time | ratio |
 |---|---|---|---|---|
-| 24 modes of a solid, 27 783 DOFs | 2.9 s | scipy eigsh | 23 s | 7.8 |
+| 24 modes of a solid, 27 783 DOFs | 2.7 s | scipy eigsh | 21 s | 7.8 |
 | 24 modes of a plate, 30 603 DOFs | 0.95 s | scipy eigsh on CHOLMOD | 0.98 s | 1 |
 | 24 modes of a plate, 30 603 DOFs | 1 s | scipy eigsh on PARDISO | 0.76 s | 0.76 |
-| all 243 modes of a plate, dense | 15 ms | scipy eigh | 5.5 ms | 0.37 |
-| 200 lines of a plate's responses, 30 000 DOFs | 2.2 s | scipy splu (4 of them) | 560 s | 250 |
-| 8 x 8 frequency responses, 10 000 lines | 9.1 ms | python-control, slycot | 0.21 s | 23 |
-| H-infinity norm, 48 states, 0.1 % damping | 3.2 ms | slycot ab13dd | 2.4 ms | 0.73 |
-| the same, A dense | 3.3 ms | slycot ab13dd | 2.4 ms | 0.73 |
-| H2 norm, 200 states | 3.9 ms | python-control, slycot | 8.4 ms | 2.2 |
-| zero-order hold, 48 states | 0.15 ms | scipy cont2discrete | 0.17 ms | 1.1 |
-| a discrete Riccati equation, 48 states | 4.8 ms | scipy solve_discrete_are | 8.2 ms | 1.7 |
-| 100 000 samples through a Kalman filter | 50 ms | filterpy (5000 of them) | 7.7 s | 150 |
-| 100 000 samples of a loop, 212 states | 94 ms | python-control | 1.7 s | 17 |
-| the same, commands saturated | 2.4 s | python-control (2000 of them) | 4.8 s | 2 |
-| H-infinity, 3 states: norm 0.137 | 22 ms | python-control, slycot: 0.137 | 21 ms | 0.95 |
-| H-infinity, 61 states of a stage: norm 0.901 | 0.59 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 21 ms | slycot ab13md, the upper one | 15 ms | 0.69 |
-| the upper bound alone | 13 ms | slycot ab13md, the upper one | 15 ms | 1.1 |
-| poles of a close pair in noise: error 5e-07 | 0.15 s | scikit-rf: 7e-07 | 0.14 s | 0.94 |
-| a sparse OUTPUT4 file of Nastran | 13 ms | pyYeti | 36 ms | 2.7 |
+| all 243 modes of a plate, dense | 8.1 ms | scipy eigh | 4.6 ms | 0.57 |
+| 200 lines of a plate's responses, 30 000 DOFs | 1.2 s | scipy splu (4 of them) | 350 s | 310 |
+| 8 x 8 frequency responses, 10 000 lines | 3.5 ms | python-control, slycot | 0.1 s | 29 |
+| H-infinity norm, 48 states, 0.1 % damping | 1.6 ms | slycot ab13dd | 1.8 ms | 1.1 |
+| the same, A dense | 1.8 ms | slycot ab13dd | 1.9 ms | 1.1 |
+| H2 norm, 200 states | 1.7 ms | python-control, slycot | 3.2 ms | 1.9 |
+| zero-order hold, 48 states | 0.094 ms | scipy cont2discrete | 0.12 ms | 1.3 |
+| a discrete Riccati equation, 48 states | 2.5 ms | scipy solve_discrete_are | 6.1 ms | 2.5 |
+| 100 000 samples through a Kalman filter | 27 ms | filterpy (5000 of them) | 4.5 s | 160 |
+| 100 000 samples of a loop, 212 states | 54 ms | python-control | 1.3 s | 23 |
+| the same, commands saturated | 1.4 s | python-control (2000 of them) | 2.6 s | 1.9 |
+| H-infinity, 3 states: norm 0.137 | 9.5 ms | python-control, slycot: 0.137 | 14 ms | 1.5 |
+| H-infinity, 61 states of a stage: norm 0.901 | 0.32 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 10 ms | slycot ab13md, the upper one | 10 ms | 1 |
+| the upper bound alone | 5.7 ms | slycot ab13md, the upper one | 10 ms | 1.8 |
+| poles of a close pair in noise: error 5e-07 | 0.11 s | scikit-rf: 7e-07 | 90 ms | 0.82 |
+| a sparse OUTPUT4 file of Nastran | 7.3 ms | pyYeti | 24 ms | 3.2 |
 
 Peers are faster for some tasks because flexplant also checks its results. For all modes of the
-plate, a third of the time goes into residuals. Another third goes into the separation of rigid-body
-motions and the full accuracy of soft modes. The zero-order hold returns a checked system with
-names. For H-infinity of 3 states, the smallest possible norm is bounded to 1 %, and the norm of
-the loop is computed twice. For mu there is also a lower bound, from a perturbation that reaches it.
+plate, a quarter of the time goes into residuals. Another quarter goes into the separation of
+rigid-body motions and the full accuracy of soft modes.
 With a factor of CHOLMOD or of MKL PARDISO, eigsh is twice as fast as `solve_modes` on a plate of
 10 000 DOFs. With PARDISO it is 1.3 times faster on a plate of 30 000 DOFs, 1.2 times on one of 99
 000, and as fast on a solid of 28 000. With CHOLMOD it is as fast on the first, and 1.2 and 2.3
