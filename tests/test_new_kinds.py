@@ -150,6 +150,7 @@ class SlowestPole(fx.synthesis.MeasuredObjective):
         return 1.0 / -float(rate.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, 1e3])
 @pytest.mark.parametrize("rate", [0.0, 50.0])
 def test_an_objective_counts_in_seconds_at_any_speed(speed, rate):

@@ -40,6 +40,7 @@ def identified(frf):
     return found, [str(one.message) for one in caught]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("noise", [1e-6, 1e-2])
 def test_both_conventions_give_the_same_modes(seed, noise):

@@ -75,6 +75,7 @@ def random_geometry(rng):
     return systems, nodes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("double", [False, True])
 def test_places_and_local_directions_by_another_program(tmp_path, order, double):

@@ -31,6 +31,7 @@ def random_law(rng, dt):
     return (la.expm(A * dt) if dt else A), C, recovery
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_slow_poles_move_to_the_recovery_time_and_others_stay(sampled):
     for seed in range(200):

@@ -181,6 +181,7 @@ def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
     assert not none.modes.size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stable", "within"])
 def test_a_tolerance_just_inside_of_the_limit_is_found(kind):
     """A limit that is 0.5 % above a tolerance finds what wide limits found."""

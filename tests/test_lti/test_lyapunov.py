@@ -93,6 +93,7 @@ def test_scalar_values():
     assert not solve_stein(0.5 * np.eye(2), np.zeros((2, 2))).any()
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(-30, 30), min_size=6, max_size=6))
 def test_units_do_not_matter(powers):
     d = 2.0 ** np.array(powers)

@@ -74,6 +74,7 @@ def test_sampled_systems_are_run_sample_by_sample(seed):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "poles", [(-1.0, -3.0), (-0.1 + 2j, -0.1 - 2j), (-1.0, -1e-3), (-0.7 + 0.7j, -0.7 - 0.7j)]
 )

@@ -68,6 +68,7 @@ def test_it_is_said_in_one_line():
     assert repr(modes(8, 6).mesh_error(modes(16, 6))).startswith("<MeshError: 3 modes, ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_frequencies_of_two_meshes_point_to_the_converged_plate(seed):
     """Less than half of the error of the finer mesh is left, of repeated modes too."""

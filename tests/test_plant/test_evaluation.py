@@ -164,6 +164,7 @@ def test_a_system_made_elsewhere_has_a_plant_as_its_evaluation_model():
         _ = plant.replace(evaluation=MODES).evaluation_plant
 
 
+@pytest.mark.slow
 def test_it_is_solved_and_assembled_once(monkeypatch):
     """Its modes are solved once, and its plant is assembled once, whoever asks for it."""
     calls = Counter()
@@ -199,6 +200,7 @@ def test_machines_drawn_from_a_plant_have_no_evaluation_model():
     assert drawn.system.n_states == known.evaluation_plant.system.n_states
 
 
+@pytest.mark.slow
 def test_results_say_where_they_are_not_judged():
     """Once in each printed result; nothing of it where there is an evaluation model."""
     alone = plant_of(MODES.select(range(9)))

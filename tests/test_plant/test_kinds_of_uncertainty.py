@@ -188,6 +188,7 @@ def test_a_kind_is_the_plant_with_the_changed_property(name, seed):
         assert np.any(np.abs(wanted - nominal) > 1e-3 * np.abs(nominal)) == bool(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_machines_that_are_drawn_have_the_property_at_some_value(name):
     """One number explains all responses of each machine, and its deviation is a half."""
@@ -207,6 +208,7 @@ def test_machines_that_are_drawn_have_the_property_at_some_value(name):
     assert abs(np.mean(found)) < 0.15
 
 
+@pytest.mark.slow
 def test_a_delay_is_the_plant_that_was_sampled_with_it():
     own = Chain(0)
     uncertain = own.plant(2e3).uncertain(Delay(0.3))
@@ -265,6 +267,7 @@ def whole():
     return fx.solve_modes(model, count=6, damping=fx.ModalDamping(0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 2e3])
 def test_neglected_modes_are_bounded_and_drawn(rate):
     """Machines have the modes that the plant lacks; what these do lies below the weights."""
@@ -364,6 +367,7 @@ def steps(plant):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "order",
     [

@@ -246,6 +246,7 @@ def test_dampings_scatter_as_the_measured_ones(case):
     assert scipy.stats.kstest(ratio, scipy.stats.t(m - 1).cdf).pvalue > 0.01
 
 
+@pytest.mark.slow
 def test_a_plant_of_a_calibrated_model_has_machines_without_asking(case, plant):
     assert len(plant.machines.plants) == 40
     assert plant.machines.plants is plant.machines.plants
@@ -291,6 +292,7 @@ def test_intervals_are_predictive_of_a_log_normal_figure():
         interval_of(np.array([1.0, 0.0, np.inf]), 0.9)
 
 
+@pytest.mark.slow
 def test_an_observer_says_where_its_error_lies(plant):
     observer = fx.design_kalman(plant)
     low, high, sentence = observer.interval("die:z", 0.95)
@@ -304,6 +306,7 @@ def test_an_observer_says_where_its_error_lies(plant):
     assert "on 95 % of such machines" in repr(observer)
 
 
+@pytest.mark.slow
 def test_densities_scatter_as_stated_or_are_said_to_be_as_given(case, plant):
     """Without scatter of the structure the error is that of the densities alone: log-normal."""
     observer = fx.design_kalman(plant)
@@ -331,6 +334,7 @@ def test_densities_scatter_as_stated_or_are_said_to_be_as_given(case, plant):
     assert low < np.median(each) < high
 
 
+@pytest.mark.slow
 def test_a_loop_says_where_its_figures_lie(plant):
     observer = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
@@ -371,6 +375,7 @@ def test_what_machines_do_beyond_a_model_is_the_covariance_of_the_difference(pla
     assert np.abs((found - wanted) / size).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_filter_that_weighs_modes_by_their_uncertainty_has_lower_upper_ends(plant):
     plain = fx.design_kalman(plant)
     weighed = fx.design_kalman(plant, machines=plant.machines)
@@ -379,6 +384,7 @@ def test_a_filter_that_weighs_modes_by_their_uncertainty_has_lower_upper_ends(pl
     assert weighed.rms("die") >= 0.99 * plain.rms("die")  # the model alone is known best by plain
 
 
+@pytest.mark.slow
 def test_places_are_compared_machine_by_machine(plant):
     """Is a place of a sensor better? The ratio of errors varies less than the errors do."""
     own = plant.assembled.ports
@@ -395,6 +401,7 @@ def test_places_are_compared_machine_by_machine(plant):
     assert "evaluation=" in alone.compared(close, "die").sentence
 
 
+@pytest.mark.slow
 def test_budgets_and_comparisons_have_intervals(plant):
     observer = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
@@ -404,6 +411,7 @@ def test_budgets_and_comparisons_have_intervals(plant):
     assert "servo on 95 % of such machines:" in text and "modulus margin" in text
 
 
+@pytest.mark.slow
 def test_placements_compare_places_machine_by_machine(plant):
     """The sentence of scores and of a placement is that of two filters on the same machines."""
     near = plant.assembled.ports.y[1].replace(name="near", at=(0.2, 0.0, 0.0))
@@ -423,6 +431,7 @@ def test_placements_compare_places_machine_by_machine(plant):
     assert not alone.interval
 
 
+@pytest.mark.slow
 def test_any_figure_of_a_loop_has_an_interval(plant):
     """The MA of the error after a move, against runs on the machines one by one."""
     observer = fx.design_static(plant)
@@ -495,6 +504,7 @@ def test_a_stage_is_judged_on_the_machines_of_its_fit(plant):
     assert found.certificate[promised + "drawn"] != pytest.approx(min(each))
 
 
+@pytest.mark.slow
 def test_the_response_of_the_fit_judges_loops(case):
     """A plant of a model that was fitted to a response says the same as plant.measured(frf)."""
     system = case.plant().continuous.Gyu.select(["y1", "y2"], ["u1", "u2"])
@@ -516,6 +526,7 @@ def test_the_response_of_the_fit_judges_loops(case):
     assert fx.close_loop(held, observer, servo).on_measurement is None
 
 
+@pytest.mark.slow
 def test_the_report_says_where_figures_lie(plant, tmp_path):
     observer = fx.design_static(plant)
     loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=20.0, observer=observer))

@@ -121,6 +121,7 @@ def test_a_model_that_is_updated_after_it_was_calibrated_is_not_calibrated():
         plant.uncertain(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::flexplant.errors.FlexplantWarning")
 @pytest.mark.parametrize(("seed", "damped", "open_modes"), [(12, True, (5,)), (2, False, (4, 5))])
 def test_what_was_measured_determines_shares_or_says_that_it_does_not(seed, damped, open_modes):

@@ -411,6 +411,7 @@ def test_a_weighted_plant_shows_its_machine(tmp_path):
     assert "Standard assumptions" in page and "u actuator" in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hexapod", "maglev_block"])
 def test_a_driven_machine_is_drawn(kind, tmp_path):
     """Its axes; and its devices from above, unless all masses are at one point."""

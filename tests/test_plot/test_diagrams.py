@@ -129,6 +129,7 @@ def test_systems_may_stand_in_a_list():
             draw([])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 1e4])
 def test_poles_by_frequency_and_damping(rate):
     g = machine(n_rigid=1, n_elastic=4, m=1, p=1)

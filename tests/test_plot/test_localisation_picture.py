@@ -54,6 +54,7 @@ def test_what_does_not_go_together_is_refused(case):
         plot.localisation(found, candidates=candidates[:2], dofs=dofs)
 
 
+@pytest.mark.slow
 def test_what_was_chosen_is_shown_though_a_dozen_explain_more_alone(case):
     """Two masses together: the second explains little by itself."""
     names = tuple(f"m{i}" for i in range(20))

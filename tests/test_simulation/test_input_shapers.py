@@ -69,6 +69,7 @@ def test_a_stated_change_of_the_frequency_is_borne(change, damping):
     assert input_shaper(25.0, damping=damping).residual(band, damping).max() > 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("freq", [40.0, [40.0, 55.0]])
 def test_ramps_of_whole_periods_leave_the_modes_at_rest(freq):
     move = quiet_setpoint(0.1, velocity=0.5, acceleration=10.0, freq=freq)

@@ -120,6 +120,7 @@ def large(spring, n=800):
     return K, dofs, slide
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("digits", [7, 10, 12])
 def test_a_slide_of_few_digits_in_a_large_model(digits):
     """By inverse iteration, where K is too large for its null vectors."""

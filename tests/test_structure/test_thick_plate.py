@@ -31,6 +31,7 @@ def random_plate(seed):
     return tuple(size), float(size.min() * 10 ** rng.uniform(-2.5, -0.8)), rng
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_thick_and_thin_plates_converge_to_mindlin_s_theory(seed):
     """From a 300th to a sixth of the side; nothing locks and nothing is left at the limit."""
@@ -44,6 +45,7 @@ def test_thick_and_thin_plates_converge_to_mindlin_s_theory(seed):
     assert np.abs(errors[1]).max() < 0.75 * np.abs(errors[0]).max()
 
 
+@pytest.mark.slow
 def test_errors_fall_with_the_square_of_the_element():
     """Where elements resolve the thickness, along which a free edge twists."""
     exact = mindlin_frequencies((0.4, 0.3), 0.08, 2700.0, 70e9, 0.33, order=16, count=6)
@@ -54,6 +56,7 @@ def test_errors_fall_with_the_square_of_the_element():
     np.testing.assert_allclose(coarse / fine, 4.0, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_a_thin_plate_is_kirchhoff_s():
     size = (0.6, 0.45)
     thin = frequencies(made(size, 6e-4, (20, 15)))[:10]
@@ -63,6 +66,7 @@ def test_a_thin_plate_is_kirchhoff_s():
     np.testing.assert_allclose(thin, classic, rtol=8e-3)
 
 
+@pytest.mark.slow
 def test_a_plate_that_does_not_shear_has_only_rotary_inertia():
     size, h = (0.6, 0.45), 0.0272
     stiff = frequencies(made(size, h, (28, 21), shear_factor=None))[:10]
@@ -72,6 +76,7 @@ def test_a_plate_that_does_not_shear_has_only_rotary_inertia():
     assert np.abs(stiff / shears - 1.0).max() > 0.02
 
 
+@pytest.mark.slow
 def test_a_solid_has_the_frequencies_of_the_thick_plate():
     size, h = (0.3, 0.24), 0.04
     solid = ritz_block(size=(*size, h), orders=(7, 7, 3), **ALUMINIUM)
@@ -158,6 +163,7 @@ def test_fields_are_the_sum_of_their_elements():
         )
 
 
+@pytest.mark.slow
 def test_fields_are_those_of_the_polynomials():
     def h(x, y):
         return 0.03 * (1.0 + 0.3 * x / 0.5 + 0.2 * y / 0.4)
@@ -192,6 +198,7 @@ def test_many_rows_are_those_one_by_one():
             np.testing.assert_allclose(row, model.dofs.interpolation.row(point, direction))
 
 
+@pytest.mark.slow
 def test_the_paper_s_plate_is_lower_than_its_thin_drawing():
     thin = np.sqrt(np.abs(la.eigvalsh(*plate_matrices(8, 8)[::-1])))[3:15]
     thick = 2 * np.pi * frequencies(fx.plate(**PLATE))[:12]

@@ -50,6 +50,7 @@ def test_one_loop_has_the_margins_of_python_control(seed):
     assert loop.delay_margin == pytest.approx(min(delays, default=np.inf))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", ["S-T", "S", "T"])
 def test_loops_that_change_at_once_stay_stable_within_the_disk(seed, kind):

@@ -74,6 +74,7 @@ def test_real_deltas_of_both_signs():
         assert found.lower == pytest.approx(np.abs(entries).max(), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "count"), [(2, 20), (4, 20), (7, 8), (11, 2)])
 def test_real_deltas_of_random_matrices_against_all_corners(n, count):
     """The determinant is linear in each Delta, so that the smallest one lies at a corner."""
@@ -87,6 +88,7 @@ def test_real_deltas_of_random_matrices_against_all_corners(n, count):
         assert np.abs(la.eigvals(M @ found.perturbation) - 1).min() < 1e-8
 
 
+@pytest.mark.slow
 def test_real_and_complex_deltas_of_both_signs():
     """The perturbation makes the loop singular; real ones of other signs do it no sooner."""
     near = []
@@ -146,6 +148,7 @@ def one_power_iteration(M, sizes, rng):
     ))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_starts_together_are_power_iterations_one_by_one():
     """The first half, whose real Deltas begin positive, among others: the same perturbations."""
     make = {"real": RepeatedScalar, "complex": lambda n: RepeatedScalar(n, real=False)}

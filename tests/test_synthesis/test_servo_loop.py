@@ -177,6 +177,7 @@ def three_late_masses(chain):
     return assemble_plant(modes, place).discretized(1e3, delay=4.0)
 
 
+@pytest.mark.slow
 def test_modes_that_nothing_touches_do_not_choose_the_law():
     alone, beside = (servo_bandwidth(three_late_masses(chain)) for chain in (False, True))
     assert alone > 15.0  # 6.7 Hz without a wide lead

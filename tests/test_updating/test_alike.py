@@ -41,6 +41,7 @@ def damped(model, K, M):
     return fx.FEModel(M, K, D, dofs=model.dofs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("seed", range(6))
 def test_all_images_of_the_true_places_are_alike(seed, count):

@@ -48,6 +48,7 @@ def parameters(plate, rom, count):
     return found[:count]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "modes", "seed", "most"), [
     pytest.param(4, 14, 0, 1200, marks=pytest.mark.long), (4, 10, 1, 600), (2, 8, 2, 600)
 ])  # fmt: skip

@@ -62,6 +62,7 @@ def residuals(kind, measured, shapes, std):
 KINDS = ["poles judged", "weighted poles judged", "shapes judged", "poles beside a MAC"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(4))
 def test_a_wrong_parameter_warns(kind, seed):
@@ -77,6 +78,7 @@ def test_a_wrong_parameter_warns(kind, seed):
     assert fit.p_value < 1e-4 and fit.chi2 > 3 * fit.dof
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_alone_warns_of_nothing(kind):
     """Chi-square has the mean and the spread that its degrees of freedom say."""

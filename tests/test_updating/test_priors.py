@@ -86,6 +86,7 @@ def test_a_printed_deviation_is_at_most_that_of_the_prior(wrong):
     assert np.all(half >= fit.std * (1 - 1e-3)) and np.all(half <= 0.3 * (1 + 1e-3))
 
 
+@pytest.mark.slow
 def test_a_prior_that_takes_no_part_is_named(wrong):
     model, fitted, poles, _ = wrong
     bare = fx.MeasuredModes(poles, modes=range(1, 5))

@@ -125,6 +125,7 @@ SIZE, THICKNESS = (0.5, 0.42), 0.02
 MATERIAL = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "lacks"), [(fx.kirchhoff_plate, True), (fx.plate, False)])
 def test_plates_are_told_to_lack_shear(make, lacks):
     """A thick plate in polynomials, measured, and a thin and a thick drawing of it."""

@@ -196,6 +196,7 @@ def test_the_phase_is_drawn_where_it_is_above_the_noise(level):
     np.testing.assert_allclose(np.exp(1j * np.radians(phase[there])), (L / size)[there], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gains_say_what_0_db_is():
     """N/m of a translation, N m/rad of a rotation, SI where units are not known."""
     pairs = ("N", "m"), ("m", "N"), ("N m", "rad"), ("rad", "N m"), ("m/s^2", "m")
