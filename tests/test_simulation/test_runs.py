@@ -7,6 +7,7 @@ import scipy.linalg
 from flexplant.loop import ClosedLoop, close_loop
 from flexplant.lti import StateSpace
 from flexplant.lti.discretisation import Recursion
+from flexplant.lti.sampling import sample_and_hold
 from flexplant.plant import StandardPlant
 from flexplant.plant.building import white_noise
 from flexplant.simulation.runs import Drawn, InBlocks, SampleBySample, make_runner
@@ -114,6 +115,23 @@ def test_few_columns_are_drawn_of_many_modes():
     change = 1e-13 * np.random.default_rng(0).standard_normal(factor.shape)
     other = Drawn(noise._replace(factor=factor * (1.0 + change)), plant).factor
     np.testing.assert_allclose(other, few, rtol=1e-12, atol=0)
+
+
+def test_a_quiet_force_that_only_the_output_shows_is_drawn():
+    """The floor moves two equal masses alike, and the sensor measures their difference."""
+    A = scipy.linalg.block_diag(*[[[0.0, 1.0], [-4e3, -5.0]]] * 2)
+    B = np.array([[0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]).T
+    C = [[-1.0, 0.0, 1.0, 0.0]] * 2
+    g = StateSpace(A, B, C, np.zeros((2, 3)), inputs=["floor", "fan", "u"], outputs=["z", "y"])
+    asd = {"floor": 1e-2, "fan": 1e-7}
+    held, factor = sample_and_hold(g, 2e3, {}, asd=np.array([*asd.values(), 0.0]))
+    plant = StandardPlant.from_statespace(held, u=["u"], y=["y"], asd=asd, noise_factor=factor)
+    few = Drawn(white_noise(plant), plant).factor
+    moved, expected = (
+        held.C @ scipy.linalg.solve_discrete_lyapunov(held.A, one @ one.T) @ held.C.T
+        for one in (few, factor)
+    )
+    np.testing.assert_allclose(moved, expected, rtol=1e-6)
 
 
 def test_the_rms_of_a_loop_is_that_of_all_columns():

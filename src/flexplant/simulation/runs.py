@@ -15,7 +15,7 @@ from ..lti.discretisation import CALL, ONE_VECTOR, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import StandardPlant
-from ..plant.building import WhiteNoise
+from ..plant.building import WhiteNoise, white_names
 from ..tolerances import RESIDUAL, ROOT
 from .nonlinear_elements import Acting, Answering
 
@@ -205,16 +205,19 @@ def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, Floa
 class Drawn:
     """The white noises of a plant, drawn for a stretch of samples at a time.
 
-    Columns of the factor are left out that add less than 1e-8 to the variance of every state: most
-    moments of forces over a sample. No basis is computed, so that rounding decides nothing. Numbers
-    are always drawn for a whole stretch: a longer run begins with the shorter one bit by bit.
+    Columns of the factor are left out that add less than a fraction of 1e-8 to the variance of
+    every state: most moments of forces over a sample. With several forces a column may be a quiet
+    force that only an output shows, where the loud ones cancel: it must also be this small in every
+    output of this sample and the next. No basis is computed, so that rounding decides nothing.
+    Numbers are always drawn for a whole stretch: a longer run begins with the shorter one bit by
+    bit.
     """
 
     def __init__(self, noise: WhiteNoise, plant: StandardPlant) -> None:
         names = [plant.w[i].removesuffix(":noise") for i in noise.columns]
         self.read = np.array([name in plant.y for name in names], dtype=bool)
         self.columns, self.deviation = noise.columns, noise.deviation
-        square = noise.factor**2
+        square = np.vstack([noise.factor, _shown(noise.factor, plant)]) ** 2
         part = square / divisor(square.sum(axis=1, keepdims=True))
         kept = part.max(axis=0, initial=0.0) * len(part.T) > ROOT
         self.factor = np.ascontiguousarray(noise.factor[:, kept])
@@ -231,6 +234,16 @@ class Drawn:
             single[:, self.read] /= np.sqrt(hold)
             single[np.ix_(np.arange(samples) % hold > 0, self.read)] = 0.0
         return white, single
+
+
+def _shown(factor: FloatArray, plant: StandardPlant) -> FloatArray:
+    """Return what a factor of several forces adds to outputs now and a sample later."""
+    g, forces = plant.system, white_names(plant)[0]
+    rows = np.vstack([g.C, g.C @ g.A])[: None if len(forces) > 1 else 0]
+    found = rows @ factor
+    # smaller ones may be rounding of states that cancel
+    least = ROOT * np.abs(rows) @ np.linalg.norm(factor, axis=1)
+    return np.where(np.abs(found) > least[:, None], found, 0.0)
 
 
 #: number of samples per stretch, a power of two that every size of a block divides, and number of
