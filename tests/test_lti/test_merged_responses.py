@@ -65,3 +65,5 @@ def test_refusals():
         merged_frf([part([0], [0]), part([1], [0], quantity="velocity")])
     with pytest.raises(ModelError, match="at least one Frf"):
         merged_frf([])
+    with pytest.raises(ModelError, match="measurement 2 has 'hammer' in V, another one in N"):
+        merged_frf([part([0], [0], units={"hammer": "N"}), part([1], [0], units={"hammer": "V"})])

@@ -36,15 +36,16 @@ def merged_frf(frfs: Sequence[Frf]) -> Frf:
     -------
     Frf
         It has a coherence or a variance if all measurements have one. Errors of different
-        measurements are independent. The correlation of the errors of outputs is kept if all
-        measurements have one, and the same inputs. `freedom` is the smallest of them.
+        measurements are assumed independent. The correlation of the errors of outputs is kept if
+        all measurements have one, and the same inputs. `freedom` is the smallest that is known.
 
     Raises
     ------
     LabelError
         When a pair of an output and an input was measured twice, or not at all.
     ModelError
-        When the measurements have different frequencies, quantities or windows.
+        When the measurements have different frequencies, quantities or windows, or a channel has
+        different units in them.
 
     Examples
     --------
@@ -96,6 +97,13 @@ def _check_alike(parts: Sequence[Frf]) -> None:
                 raise ModelError(
                     f"measurement {number} has the {name} {getattr(part, name)!r}, the first "
                     f"{getattr(first, name)!r}: estimate all in the same way."
+                )
+        for name, unit in part.units.items():
+            known = next((one.units[name] for one in parts if name in one.units), unit)
+            if unit != known:
+                raise ModelError(
+                    f"measurement {number} has {name!r} in {unit}, another one in {known}: convert "
+                    "one of them."
                 )
 
 
