@@ -488,7 +488,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 
 
 def _settled(fit: PoleFit, steps: int, **how: bool) -> PoleFit:
-    """Return the refined fit, from a fit as it is."""
+    """Return the refinement of a fit, which is not computed again at the start."""
     return refined(fit.lines, fit.poles, fit.participation, steps=steps, first=fit, **how)
 
 

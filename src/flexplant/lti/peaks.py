@@ -294,12 +294,12 @@ class Residues(NamedTuple):
 def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``."""
     # block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
-    # are ill-conditioned or too many, or a pole lies at z = -1. Also returns the eigenvalues of A,
-    # that of a block of one state twice, where they were computed
+    # are ill-conditioned or too many, or a pole lies at z = -1. Also returns the eigenvalues of A
+    # if they were computed; a block of one state gives its eigenvalue twice
     if g.n_states * g.D.size > LARGEST:
         return None, None
-    poles, left, right = block_form(g) or diagonal_form(g.A, g.B, g.C)
-    known = poles
+    known, left, right = block_form(g) or diagonal_form(g.A, g.B, g.C)
+    poles = known
     if left is None or right is None or (g.dt and np.any(poles == -1.0)):
         return None, known
     found, through = left.T[:, :, None] * right[:, None, :], g.D

@@ -238,9 +238,9 @@ class Subsystem(NamedTuple):
 def dense_solver(g: Subsystem) -> tuple[Solver, int, int]:
     """Return what solves for any A, how many frequencies at a time, times states, and least parts.
 
-    Parts that share no state, such as the axes of a servo, each with its own channels; those of one
-    A, as axes of one law have, together, and so are those of the same channels where poles give
-    their gains: a mode channel of a weighted plant is a state of its own.
+    The states are divided into parts that do not act on each other, such as the axes of a servo.
+    Parts with the same A are solved together, as those of axes with the same law. Parts with the
+    same channels are solved together if their gains are computed from poles.
     """
     alike: dict[bytes, list[IntArray]] = {}
     for own in _separate_states(g.A):

@@ -99,6 +99,6 @@ class EvaluationModel(Value):
 
 def is_channelled(given: object) -> bool:
     """Return whether it is a plant or a system with labels, not a structure."""
-    if isinstance(given, FEModel | Modes | ReducedModel):  # asked at once: a value searches names
-        return False
+    if isinstance(given, FEModel | Modes | ReducedModel):
+        return False  # `hasattr` is slow here: it makes the message with similar names
     return hasattr(given, "Gyu") or isinstance(given, StateSpace) or hasattr(given, "input_labels")

@@ -189,7 +189,7 @@ def _directions_of(at: Place) -> tuple[str, ...]:
     """Return the directions of a place that has labels, translations first; z for points."""
     labels = [at] if isinstance(at, str) else [*at] if isinstance(at, Mapping) else []
     named = [label.rpartition(":")[2] for label in labels if isinstance(label, str)]
-    if isinstance(at, str) and named[0][:1] in {"-", "+"}:
+    if isinstance(at, str) and ":" in at and named[0][:1] in {"-", "+"}:
         plain = f"{at.rpartition(':')[0]}:{named[0][1:]}"
         raise LabelError(
             f"a POI at {at!r} has a direction with a sign. Give {plain!r}, or for the opposite "

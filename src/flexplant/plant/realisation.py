@@ -107,7 +107,7 @@ class ModalRealisation(Value):
         return [2] * first + [2 * (last - first + 1)] + [2] * (b - 1 - last)
 
     def row(self, at: Place, direction: str) -> FloatArray:
-        """Return the row over the model's DOFs for a place; what it weights is found once."""
+        """Return the row over the model's DOFs for a place; its nonzero entries are kept."""
         if not isinstance(at, str | tuple):
             return self.model.row(at, direction)
 
