@@ -119,11 +119,12 @@ Peers are faster for some tasks because flexplant also checks its results. For a
 plate, a quarter of the time goes into residuals. Another quarter goes into the separation of
 rigid-body motions and the full accuracy of soft modes.
 With a factor of CHOLMOD or of MKL PARDISO, eigsh is twice as fast as `solve_modes` on a plate of
-10 000 DOFs. With PARDISO it is 1.3 times faster on a plate of 30 000 DOFs, 1.2 times on one of 99
-000, and as fast on a solid of 28 000. With CHOLMOD it is as fast on the first, and 1.2 and 2.3
-times slower on the others (``tests/benchmarks/modes_peers.py``, whose peers are the wheels
-`sksparse-minimal` and `pypardiso`). `solve_modes` on a factor of PARDISO was at most 1.2 times
-faster than on its own, because count, orthogonalisation and checks are the larger part.
+10 000 DOFs. With PARDISO it is 1.3 times faster on a plate of 30 000 DOFs, 1.2 times faster on a
+plate of 99 000 DOFs, and as fast on a solid of 28 000 DOFs. With CHOLMOD it is as fast on the plate
+of 30 000 DOFs, 1.2 times slower on that of 99 000, and 2.3 times slower on the solid
+(``tests/benchmarks/modes_peers.py``, whose peers are the wheels `sksparse-minimal` and
+`pypardiso`). With a factor of PARDISO, `solve_modes` was at most 1.2 times faster than with its
+own, because the count, the orthogonalisation and the checks take most of the time.
 ``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` measures many more times.
 
 **Limits**
