@@ -230,7 +230,7 @@ def only_one(kind: str, names: Iterable[str], given: Any, how: str) -> str:
     if given is not None:
         require_known(kind, [given], known)
     elif not known:
-        raise LabelError(f"there is no {kind}. Add one to the plant's ports, or say {how}.")
+        raise LabelError(f"the plant has no {kind}. Add one to its ports, or say {how}.")
     elif len(known) != 1:
         named = repr(known[0]) if how.endswith("=") else ""
         listed = f"{counted(len(known), kind)} ({some_names(known)})"

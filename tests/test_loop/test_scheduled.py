@@ -115,7 +115,7 @@ def test_refusals(plant):
         schedule_loops(plant, design, position="w", places=PLACES)
     with pytest.raises(ModelError, match="outside its range"):
         schedule_loops(plant, design, places=[0.0, 0.3])
-    with pytest.raises(LabelError, match="there is no position"):
+    with pytest.raises(LabelError, match="the plant has no position"):
         schedule_loops(fx.testbeds.three_masses(), design, places=PLACES)
 
     def growing(there):

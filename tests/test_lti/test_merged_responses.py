@@ -54,6 +54,13 @@ def test_errors_of_different_measurements_are_independent():
     assert merged_frf([part([0], [0, 1], variance=None), part([1], [0, 1])]).variance is None
 
 
+def test_lengths_of_segments_that_differ_by_rounding_are_equal():
+    found = merged_frf([part([0], [0], resolution=1.0), part([1], [0], resolution=1.0 + 1e-15)])
+    assert found.resolution == 1.0
+    with pytest.raises(ModelError, match=r"the resolution 2\.0, the first 1\.0"):
+        merged_frf([part([0], [0], resolution=1.0), part([1], [0], resolution=2.0)])
+
+
 def test_refusals():
     with pytest.raises(LabelError, match="hammer -> 1:z was measured more than once"):
         merged_frf([part([0], [0]), part([0, 1], [0])])

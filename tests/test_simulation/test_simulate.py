@@ -348,5 +348,5 @@ def test_what_cannot_be_simulated(loop):
     with pytest.raises(ModelError, match="close_loop"):
         simulate(loop.plant, duration=1.0)
     gain = StateSpace([], [], [], [[-0.1]], inputs=["y"], outputs=["u"])
-    with pytest.raises(LabelError, match="there is no reference"):
+    with pytest.raises(LabelError, match="the plant has no reference"):
         simulate(close_loop(direct_plant(D=np.zeros((2, 2))), gain), reference=1.0, duration=1.0)

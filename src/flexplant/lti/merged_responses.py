@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -93,10 +94,12 @@ def _check_alike(parts: Sequence[Frf]) -> None:
                 "the same rate and the same length of segments or periods."
             )
         for name in _COMMON:
-            if getattr(part, name) != getattr(first, name):
+            own, wanted = getattr(part, name), getattr(first, name)
+            numbers = isinstance(own, float) and isinstance(wanted, float)
+            if own != wanted and not (numbers and math.isclose(own, wanted, rel_tol=SAME)):
                 raise ModelError(
-                    f"measurement {number} has the {name} {getattr(part, name)!r}, the first "
-                    f"{getattr(first, name)!r}: estimate all in the same way."
+                    f"measurement {number} has the {name} {own!r}, the first {wanted!r}: "
+                    "estimate all in the same way."
                 )
         for name, unit in part.units.items():
             known = next((one.units[name] for one in parts if name in one.units), unit)
