@@ -225,7 +225,7 @@ def test_repr_is_short(loop):
         (list, ModelError, "at least one block"),
         (lambda: [np.eye(2)], ModelError, "named channels"),
         (lambda: [stage()], ModelError, "block 1 is a StandardPlant"),
-        (lambda: [servo()], LabelError, r"no signal 'die:hat'.*Close matches: 'die:ref'"),
+        (lambda: [servo()], LabelError, r"no signal 'die:hat'.*'die:ref'.*the observer too"),
         (
             lambda: [servo().renamed(inputs={"die:hat": "die:z"})],
             LabelError,

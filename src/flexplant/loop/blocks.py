@@ -175,11 +175,11 @@ def check_inputs(plant: AnyPlant, systems: Sequence[StateSpace]) -> None:
             owner = f"what can drive block {place}: plant.y, plant.u and outputs of blocks"
             error = unknown_label("signal", name, known, owner)
             hidden = next((side for side in "zw" if name in getattr(plant, side)), None)
-            why = (
-                f" It is in the plant's {hidden}, which is not measured: estimate it."
-                if hidden
-                else ""
-            )
+            why = ""
+            if hidden:
+                why = f" It is in the plant's {hidden}, which is not measured: estimate it."
+            elif name.endswith(":hat"):
+                why = " It is an estimate: give the observer too, close_loop(plant, observer, ...)."
             raise LabelError(f"{error}{why}")
 
 
