@@ -19,9 +19,8 @@ from ..seeds import REFUSED
 from ..sparse.symmetric import dense
 from ..structure.rigid import rigid_motions
 from ..tolerances import SAME, TINY, TYPED
-from ..updating.machines import Draw, Machines
+from ..updating.machines import MIXED, Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
-from ..updating.trend import MIXED
 from .measured_shapes import MeasuredShapes
 from .realisation import MODAL, ModalRealisation, modes_as_states, natural
 from .uncertainty.delta import Delta

@@ -44,6 +44,7 @@ from .judgement.validation import mac as mac
 from .judgement.validation import split as split
 from .judgement.validation import validate as validate
 from .machines import Machines as Machines
+from .machines import Trend as Trend
 from .matrix_parameters import MatrixParameter as MatrixParameter
 from .matrix_parameters import ModeDamping as ModeDamping
 from .matrix_parameters import PolynomialParameter as PolynomialParameter
@@ -64,7 +65,6 @@ from .search import TrustRegion as TrustRegion
 from .search import UpdateMethod as UpdateMethod
 from .sensitivities import Sensitivities as Sensitivities
 from .sensitivities import eigenvalue_sensitivities as eigenvalue_sensitivities
-from .trend import Trend as Trend
 from .update_result import History as History
 from .update_result import Starts as Starts
 from .update_result import UpdateResult as UpdateResult

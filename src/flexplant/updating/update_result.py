@@ -23,11 +23,10 @@ from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .family import CLUSTER
 from .judgement.goodness import chance, is_bad
-from .machines import COUNT, Machines
+from .machines import COUNT, Machines, Trend, trend_of
 from .parameters import AddedMass, Parameter
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
-from .trend import Trend, trend_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
