@@ -8,7 +8,8 @@ from scipy import stats
 from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.structure import PointMass, kirchhoff_plate
-from flexplant.updating import AddedMass, Eigenvalues, MatrixParameter, changed_models, update
+from flexplant.updating import AddedMass, Eigenvalues, MatrixParameter, family, update
+from flexplant.updating.full_basis import FullBasis
 from other_plate import TRUTH, OtherPlate
 
 
@@ -69,7 +70,7 @@ def test_the_covariance_is_that_of_the_errors(machine, kind):
 def test_damping_of_the_reduced_model_is_that_of_the_full_one(machine):
     """D of the full model is not known: its first modes are damped as the reduced model's are."""
     full = machine.full.replace(D=None)
-    basis = changed_models.FullBasis(full, machine.unknowns[:2], [], machine.rom)
+    basis = FullBasis(full, machine.unknowns[:2], [], machine.rom)
     wide = basis.at(np.zeros(2))
     modes = wide.modes()
     known = machine.rom.modes()
@@ -118,7 +119,7 @@ def test_what_does_not_go_together_is_refused(machine, monkeypatch):
     own = [MatrixParameter("E", dK=machine.rom.K)]
     with pytest.raises(ShapeError, match="full model needs the matrices of all"):
         update(machine.rom, own, data, full=machine.full)
-    monkeypatch.setattr(changed_models, "LARGE", 100)
-    monkeypatch.setattr(changed_models, "TOO_LARGE", 120)
+    monkeypatch.setattr(family, "LARGE", 100)
+    monkeypatch.setattr(family, "TOO_LARGE", 120)
     with pytest.raises(ModelError, match=r"126 DOFs \(limit 120\).*full=model"):
         update(machine.full, machine.unknowns, data)

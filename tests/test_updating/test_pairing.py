@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexplant.updating.family import pair
+from flexplant.modes.matching import pair
 
 
 def turned(degrees):

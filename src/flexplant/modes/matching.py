@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
+from scipy.sparse.csgraph import connected_components
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
-from ..tolerances import NEGLIGIBLE, ROUNDING, SAME, TINY
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROUNDING, SAME, TINY
 
 #: shapes below this, relative to the largest one of their span, are rounding and count as zero
 _NONE = SAME
@@ -22,6 +23,8 @@ NEAR = 0.15
 ALIKE = 0.9
 #: weight of a frequency ratio of e relative to the MAC; frequency decides where shapes are alike
 _FREQUENCY = 0.1
+#: relative distance below which modes form a cluster: their shapes mix at the smallest change
+CLUSTER = 0.02
 
 
 def mac_matrix(X: Any, Y: Any) -> FloatArray:
@@ -57,6 +60,42 @@ def assigned(cost: FloatArray, most: float = np.inf) -> IntArray:
     rows, columns = linear_sum_assignment(cost)
     found = np.full(len(cost), -1, dtype=np.int64)
     found[rows] = np.where(cost[rows, columns] <= most, columns, -1)
+    return found
+
+
+def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
+    """Return for each old mode the column of the new mode that continues it, -1 for none."""
+    # a one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
+    # together, by the projection of each new shape on their subspace. Inside it, independent shapes
+    # may cross, and all others keep their order of frequency, since two coupled modes veer instead
+    # of crossing
+    shapes = mac_matrix(old_X, X)
+    score, close = shapes.copy(), clusters(old_poles, CLUSTER)
+    for cluster in close:
+        score[cluster] = in_span(old_X[:, cluster], X)
+    found = assigned(-score)
+    for cluster in close:
+        members = cluster[found[cluster] >= 0]
+        found[members] = _match_cluster(shapes, members, found[members])
+    return found
+
+
+def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
+    """Return the new modes of a cluster in the order of its old ones."""
+    s, new = old.size, np.sort(new)
+    near = shapes[np.ix_(old, new)] > FOUR_DIGITS
+    if near.all() or np.array_equal(near, np.eye(s)):
+        return new  # the usual case at every point of a search; a graph costs ten times as much
+    linked = np.zeros((2 * s, 2 * s), dtype=bool)
+    linked[:s, s:] = near
+    # groups of modes that are connected by common shapes
+    count, side = connected_components(linked, directed=False)
+    found = new.copy()
+    for k in range(count):
+        a, b = np.flatnonzero(side[:s] == k), np.flatnonzero(side[s:] == k)
+        if a.size != b.size:
+            return new
+        found[a] = new[b]
     return found
 
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, divisor
 from ..errors import ModelError
-from ..tolerances import NEGLIGIBLE, PRECISION, SAME, SPLIT
+from ..tolerances import NEGLIGIBLE, NULL, PRECISION, RANK, SAME, SPLIT
 
 #: fraction of non-zero entries below which stored zeros are removed before products
 _FULL = 0.8
@@ -98,6 +98,48 @@ def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
         weight = sp.diags_array(scale)
         return sp.csc_array(weight @ matrix @ weight), scale
     return scale[:, None] * np.asarray(matrix) * scale, scale
+
+
+#: largest rank that is searched
+FEW = 4
+
+
+def factors(
+    matrix: FloatArray, *, most: int = FEW, rounding: float = NULL
+) -> list[tuple[float, FloatArray]] | None:
+    """Return s_i = +-1 and b_i of ``A = sum_i s_i b_i b_i^T``, by pivots; None when there are more.
+
+    Also None without a non-zero diagonal entry, as for [[0, 1], [1, 0]].
+    """
+    size = float(np.abs(matrix).max(initial=0.0))
+    found: list[tuple[float, FloatArray]] = []
+    left = matrix
+    for _ in range(most):
+        i = int(np.argmax(np.abs(np.diag(left))))
+        pivot = float(left[i, i])
+        if abs(pivot) <= rounding * size:
+            return None
+        b, sign = left[:, i] / np.sqrt(abs(pivot)), float(np.sign(pivot))
+        left = left - sign * np.outer(b, b)
+        found.append((sign, b))
+        if np.abs(left).max() <= rounding * size:
+            return found
+    return None
+
+
+def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
+    """Return ``V^T A V`` for all A (q, k, k), as ``s (V^T b)(V^T b)^T`` for a single factor."""
+    found = np.zeros((stack.shape[0], V.shape[1], V.shape[1]))
+    for A, own in zip(stack, found, strict=True):
+        if not A.any():
+            continue
+        one = factors(A, most=1, rounding=RANK)
+        if one is None:
+            own[:] = V.T @ A @ V
+        else:
+            c = one[0][1] @ V
+            own[:] = one[0][0] * np.outer(c, c)
+    return found
 
 
 def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:

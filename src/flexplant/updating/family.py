@@ -1,4 +1,4 @@
-"""The pencils ``lambda^2 M + lambda D + K`` over parameters, and the modes at one set of them."""
+"""The model over its parameters: pencils ``lambda^2 M + lambda D + K`` and the modes at a point."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
-from ..arrays import CACHED, ComplexArray, FloatArray, IntArray
-from ..errors import ModelError
-from ..modes.matching import assigned, clusters, in_span, mac_matrix
-from ..sparse.symmetric import dense, orthonormalised
-from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import FOUR_DIGITS, NULL, RANK, ROOT, SAME, TINY
+from ..arrays import CACHED, ComplexArray, FloatArray, IntArray, Matrix
+from ..errors import ModelError, attempted
+from ..modes import solve_modes
+from ..modes.matching import pair
+from ..sparse.symmetric import congruence, dense, matrix_sum, orthonormalised
+from ..structure.definite import elastic_modes, refuse_unstable, why_indefinite
+from ..structure.model import FEModel
+from ..tolerances import FOUR_DIGITS, RANK, ROOT, SAME, TINY
 from .parameters import Parameter
 
 
@@ -77,21 +78,20 @@ class Family:
         terms = [(b, part) for b, one in enumerate(self.parameters) for part in one.terms(model)]
         #: the parameter of each term: M(p) = M + sum_j g_j(p) M_j, one term where it is affine
         self.owner = [b for b, _ in terms]
-        self.physical = [np.zeros((len(terms), k, k)) for _ in range(3)]
+        self.terms = [np.zeros((len(terms), k, k)) for _ in range(3)]
         for j, (_, parts) in enumerate(terms):
-            for stack, part in zip(self.physical, parts, strict=True):
+            for stack, part in zip(self.terms, parts, strict=True):
                 if part is not None:
                     stack[j] = dense(part)
         self.massive = np.flatnonzero(np.any(M != 0, axis=0))
         if self.massive.size < k:
             self.V, self.rigid = np.eye(k), rigid
             self.M, self.D, self.K = M, D, K
-            self.terms = self.physical
         else:
             self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
-            self.terms = [congruence(stack, self.V) for stack in self.physical]
+            self.terms = [congruence(stack, self.V) for stack in self.terms]
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
@@ -105,7 +105,6 @@ class Family:
         part.parameters = tuple(self.parameters[b] for b in chosen)
         terms = [j for b in chosen for j, owner in enumerate(self.owner) if owner == b]
         part.owner = [chosen.index(self.owner[j]) for j in terms]
-        part.physical = [stack[terms] for stack in self.physical]
         part.terms = [stack[terms] for stack in self.terms]
         part.__dict__.pop("_holds", None)
         part._derive(np.zeros(len(chosen)))
@@ -152,10 +151,6 @@ class Family:
     def text(self, p: FloatArray) -> str:
         """Return the parameters with values and units."""
         return ", ".join(q.text(v) for q, v in zip(self.parameters, p.tolist(), strict=True))
-
-    def changes(self, p: FloatArray) -> list[FloatArray]:
-        """Return the terms that the parameters add to M, D and K of the model."""
-        return [np.tensordot(self._curves(p)[0], stack, axes=1) for stack in self.physical]
 
     def rigid_left(self, p: FloatArray) -> FloatArray:
         """Return the rigid-body modes (r, r') that no spring to the ground holds at `p`."""
@@ -364,46 +359,112 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     return np.asarray(poles[keep], dtype=np.complex128), np.asarray(vectors, dtype=np.complex128)
 
 
-#: largest rank that is searched
-FEW = 4
+#: number of DOFs above which an FEModel is updated in such a basis, and above which it is too large
+LARGE, TOO_LARGE = 300, 20_000
 
 
-def factors(
-    matrix: FloatArray, *, most: int = FEW, rounding: float = NULL
-) -> list[tuple[float, FloatArray]] | None:
-    """Return s_i = +-1 and b_i of ``A = sum_i s_i b_i b_i^T``, by pivots; None when there are more.
+def is_large(model: Any) -> bool:
+    """Return whether a model is an FEModel that is updated in a basis."""
+    if not isinstance(model, FEModel) or model.n_dof <= LARGE:
+        return False
+    if model.n_dof > TOO_LARGE:
+        raise ModelError(
+            f"updating an FEModel of {model.n_dof} DOFs (limit {TOO_LARGE}) solves it again for "
+            "each estimate. Reduce it, rom = reduce(...), and pass update(rom, ..., "
+            "full=model), which needs a few solutions."
+        )
+    return True
 
-    Also None without a non-zero diagonal entry, as for [[0, 1], [1, 0]].
-    """
-    size = float(np.abs(matrix).max(initial=0.0))
-    found: list[tuple[float, FloatArray]] = []
-    left = matrix
-    for _ in range(most):
-        i = int(np.argmax(np.abs(np.diag(left))))
-        pivot = float(left[i, i])
-        if abs(pivot) <= rounding * size:
-            return None
-        b, sign = left[:, i] / np.sqrt(abs(pivot)), float(np.sign(pivot))
-        left = left - sign * np.outer(b, b)
-        found.append((sign, b))
-        if np.abs(left).max() <= rounding * size:
+
+def changed_model(
+    model: Any,
+    parameters: Sequence[Parameter],
+    p: FloatArray,
+    family: Family | None = None,
+    std: FloatArray | None = None,
+) -> Any:
+    """Return the model with the parameters at `p` and its remaining rigid-body motions."""
+    # `family` has the same parameters; `std` are their standard deviations, for an error message
+    changes: dict[str, Any] = changed_matrices(model, parameters, p)
+    if hasattr(model, "T"):
+        # Gram-Schmidt keeps translations first and moves the rotations to the new centre
+        family = Family(model, parameters) if family is None else family
+        left = model.rigid_body @ family.rigid_left(p)
+        changes["rigid_body"] = orthonormalised(changes["M"], left)
+    # the joints of a machine were checked with the previous matrices
+    gone = {"joining": None} if getattr(model, "joining", None) is not None else {}
+    try:
+        return model.replace(**changes, **gone)
+    except ModelError as error:
+        found = _with_drag(model, changes) if isinstance(model, FEModel) else None
+        if found is not None:
             return found
-    return None
+        deviations = [None] * p.size if std is None else std.tolist()
+        every = zip(parameters, p.tolist(), deviations, strict=True)
+        text = ", ".join(q.text(v, deviation) for q, v, deviation in every)
+        why = _impossible(model, changes, parameters, p) or error
+        raise ModelError(
+            f"the update ended at {text}, which the {type(model).__name__} refuses: {why}"
+        ) from None
 
 
-def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
-    """Return ``V^T A V`` for all A (q, k, k), as ``s (V^T b)(V^T b)^T`` for a single factor."""
-    found = np.zeros((stack.shape[0], V.shape[1], V.shape[1]))
-    for A, own in zip(stack, found, strict=True):
-        if not A.any():
+def changed_matrices(
+    model: Any, parameters: Sequence[Parameter], p: FloatArray
+) -> dict[str, Matrix | None]:
+    """Return M, D and K with the parameters at `p`."""
+    # add the small changes first, since the matrices of the model are large
+    total: dict[str, Matrix | None] = dict.fromkeys("MDK")
+    for parameter, value in zip(parameters, p.tolist(), strict=True):
+        for name, part in zip("MDK", parameter.change(model, value), strict=True):
+            total[name] = matrix_sum(total[name], part)
+    return {name: matrix_sum(getattr(model, name), part) for name, part in total.items()}
+
+
+def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
+    """Return the model if its D fails only by a slight negative damping of rigid motion."""
+    # its sign does not matter below 1e-4 of the first elastic frequency (`normal_form`)
+    D = changes["D"]
+    if D is None or not model.rigid_body.shape[1]:
+        return None
+    held = None
+    with attempted("the updated model without its damping", ModelError):
+        held = model.replace(M=changes["M"], K=changes["K"], D=None)
+    if held is None:
+        return None
+    rigid = held.rigid_body
+    drag = float(np.abs(np.linalg.eigvalsh(rigid.T @ np.asarray(D @ rigid))).max())
+    first = solve_modes(held, count=rigid.shape[1] + 1).omega[-1]
+    if drag > FOUR_DIGITS * float(first):
+        return None
+    # the rigid-body part of D + d M is 0 in theory, so that twice d is above rounding
+    shifted = matrix_sum(D, 2.0 * drag * held.M)
+    try:
+        model.replace(D=shifted)
+    except ModelError:
+        return None
+    return held.with_unchecked_damping(D)
+
+
+def _impossible(
+    model: Any, changes: dict[str, Any], parameters: Sequence[Parameter], p: FloatArray
+) -> str:
+    """Return a text on an indefinite D or K and the parameters that cause it, else empty."""
+    for name in "DK":
+        said = "" if changes[name] is None else why_indefinite(changes[name], name)
+        if not said:
             continue
-        one = factors(A, most=1, rounding=RANK)
-        if one is None:
-            own[:] = V.T @ A @ V
-        else:
-            c = one[0][1] @ V
-            own[:] = one[0][0] * np.outer(c, c)
-    return found
+        at = "MDK".index(name)
+        negative = [
+            q.name
+            for q, v in zip(parameters, p.tolist(), strict=True)
+            if v < 0 and q.change(model, v)[at] is not None
+        ]
+        keep = ", ".join(negative) or "the parameters"
+        return (
+            f"{said} The measurement alone does not keep {keep} physical: give bounds=, (0.0, "
+            "None) for quantities that can only be added, or measure more."
+        )
+    return ""
 
 
 class Point:
@@ -474,10 +535,13 @@ class Point:
         """Return the model at other parameters, its modes paired by shape with those here."""
         eigen = self.family.at(p)
         old, new = self.family.weighted(self.eigen.X), self.family.weighted(eigen.X)
-        found = pair(self.eigen.poles, old, new)
+        return self.followed(pair(self.eigen.poles, old, new), self.family, p, eigen)
+
+    def followed(self, found: IntArray, family: Family, p: FloatArray, eigen: Eigen) -> Point:
+        """Return a point whose modes, in the columns `found`, have the numbers of those here."""
         labels = np.zeros(eigen.poles.size, dtype=np.int64)
         labels[found[found >= 0]] = self.labels[found >= 0]
-        return Point(self.family, p, eigen, labels)
+        return Point(family, p, eigen, labels)
 
 
 def first_point(family: Family, p: FloatArray) -> Point:
@@ -517,43 +581,3 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
         solved = np.linalg.solve(system, right)
         dX[own // s, own % s], dL[own // s, own % s] = solved[:, :k], solved[:, k:] * size * turn
     return list(zip(dX.transpose(0, 3, 2, 1), dL.transpose(0, 3, 2, 1), strict=True))
-
-
-#: relative distance below which modes form a cluster: their shapes mix at the smallest change
-CLUSTER = 0.02
-
-
-def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
-    """Return for each old mode the column of the new mode that continues it, -1 for none."""
-    # a one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
-    # together, by the projection of each new shape on their subspace. Inside it, independent shapes
-    # may cross, and all others keep their order of frequency, since two coupled modes veer instead
-    # of crossing
-    shapes = mac_matrix(old_X, X)
-    score, close = shapes.copy(), clusters(old_poles, CLUSTER)
-    for cluster in close:
-        score[cluster] = in_span(old_X[:, cluster], X)
-    found = assigned(-score)
-    for cluster in close:
-        members = cluster[found[cluster] >= 0]
-        found[members] = _match_cluster(shapes, members, found[members])
-    return found
-
-
-def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
-    """Return the new modes of a cluster in the order of its old ones."""
-    s, new = old.size, np.sort(new)
-    near = shapes[np.ix_(old, new)] > FOUR_DIGITS
-    if near.all() or np.array_equal(near, np.eye(s)):
-        return new  # the usual case at every point of a search; a graph costs ten times as much
-    linked = np.zeros((2 * s, 2 * s), dtype=bool)
-    linked[:s, s:] = near
-    # groups of modes that are connected by common shapes
-    count, side = connected_components(linked, directed=False)
-    found = new.copy()
-    for k in range(count):
-        a, b = np.flatnonzero(side[:s] == k), np.flatnonzero(side[s:] == k)
-        if a.size != b.size:
-            return new
-        found[a] = new[b]
-    return found

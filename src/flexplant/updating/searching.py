@@ -20,8 +20,7 @@ from ..errors import (
 )
 from ..seeds import Rng, generator
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, ROUNDING, TINY, TYPED
-from .changed_models import changed_model
-from .family import Point
+from .family import Point, changed_model
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
 from .parameters import PointParameter, checked_values
 from .residuals.frf_residual import FrfResidual

@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, between, positive, whole
-from ..errors import ModelError, attempted, counted, require_known, short
+from ..errors import ModelError, attempted, counted, require_known, short, warn
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
-from ..modes.matching import ALIKE, in_span
+from ..modes.matching import ALIKE, CLUSTER, in_span
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
 from ..tolerances import INTERVAL
 from ..words import with_deviation
-from .changed_models import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
-from .family import CLUSTER
+from .family import changed_model
 from .judgement.goodness import chance, is_bad
 from .machines import COUNT, Machines, Trend, trend_of
 from .parameters import AddedMass, Parameter
@@ -455,7 +454,16 @@ class UpdateResult(Value):
             )
         if not self.unknowns:
             raise ModelError("this result does not hold its parameters: run update() once more.")
-        return applied(model, self.unknowns, self.values)
+        changed = zip(self.unknowns, self.values, strict=True)
+        if getattr(model, "D", None) is None and any(
+            q.matrices(model)[1] is not None and value for q, value in changed
+        ):
+            warn(
+                "the model has no D: the D of the updated model would contain only the parameters "
+                "of the update, and solve_modes(..., damping=) would replace it. Apply the update "
+                "to a model with damping, for example model.with_damping(ModalDamping(0.01))."
+            )
+        return changed_model(model, self.unknowns, self.values)
 
     def calibrated(self, measured: Any) -> Any:
         """Return the updated reduced model with the measured poles of some modes.

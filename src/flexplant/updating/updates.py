@@ -15,8 +15,9 @@ from ..seeds import Rng, generator
 from ..structure.model import FEModel
 from ..tolerances import CLOSE, MOST_STEPS, TINY, TYPED
 from ..words import flag, instance
-from .changed_models import FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
+from .family import changed_model, is_large
+from .full_basis import FullBasis
 from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import Eigenvalues

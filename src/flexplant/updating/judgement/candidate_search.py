@@ -13,9 +13,9 @@ from ...arrays import whole as counted
 from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
 from ...store import Value
-from ...structure.model import FEModel
 from ...tolerances import CLOSE
-from ..changed_models import LARGE, FullBasis
+from ..family import is_large
+from ..full_basis import FullBasis
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
 from .goodness import chance, is_bad
@@ -122,7 +122,7 @@ def localise(
         )
     given = checked_residuals(residuals)
     most, screen = counted(most, "most"), counted(screen, "screen")
-    if isinstance(model, FEModel) and model.n_dof > LARGE:
+    if is_large(model):
         model = FullBasis(model, [*listed, *extra], given).at(np.zeros(len(listed) + len(extra)))
     whole = Objective(model, [*listed, *extra], given, prior=False)
     fits = Subsets(whole, given, len(listed))

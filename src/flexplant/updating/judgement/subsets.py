@@ -12,8 +12,9 @@ import scipy.linalg as la
 from ...arrays import FloatArray, divisor
 from ...errors import ModelError, SolverError
 from ...modes.matching import ALIKE, mac_matrix
+from ...sparse.symmetric import factors
 from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, NULL, SETTLED, TINY, TYPED
-from ..family import Eigen, Family, Point, factors
+from ..family import Eigen, Family, Point
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
 from .goodness import chance, is_bad, noise_misfit, worst

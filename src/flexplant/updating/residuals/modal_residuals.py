@@ -22,10 +22,10 @@ from ...arrays import (
 from ...errors import LabelError, ModelError, ShapeError, counted, require_known, short
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
-from ...modes.matching import assigned, clusters, mac_matrix
+from ...modes.matching import CLUSTER, assigned, clusters, mac_matrix
 from ...tolerances import SAME, TYPED
 from ...words import flag, instance
-from ..family import CLUSTER, Family, Point
+from ..family import Family, Point
 from ..parameters import named_place
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 
