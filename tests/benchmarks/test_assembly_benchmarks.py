@@ -14,7 +14,8 @@ import scipy.sparse.linalg as spla
 
 from flexplant import DofSet
 from flexplant.structure import FEModel, Spring, kirchhoff_plate, solid_block
-from flexplant.structure.element_matrices import Grid, plate_mass, plate_stiffness
+from flexplant.structure.element_matrices import plate_mass, plate_stiffness
+from flexplant.structure.grids import Grid
 from plates import PLATE, make_plate
 
 pytestmark = pytest.mark.benchmark
@@ -47,7 +48,7 @@ def test_a_million_dofs_by_part():
     n = 577
     whole, plate = cpu(lambda: make_plate(elements=(n, n)))
     line(f"kirchhoff_plate, {plate.n_dof} DOFs, {plate.K.nnz} entries each", whole)
-    grid = Grid((n, n), 3, np.ones((n, n), dtype=bool))
+    grid = Grid((1.0, 1.0), (n, n), 3, np.ones((n, n), dtype=bool))
     a = 0.6 / n
     line("  neighbours and pattern, for M and K", cpu(lambda: (grid._there, grid._pattern))[0])
     line("  entries of M", cpu(lambda: grid.matrix([(plate_mass(a, a), 1.0)]))[0])

@@ -46,16 +46,16 @@ from .interpolation import ScatteredShape as ScatteredShape
 from .interpolation import interpolated as interpolated
 from .matrices import FEMatrices as FEMatrices
 from .model import FEModel as FEModel
-from .shapes import BeamShape as BeamShape
-from .shapes import BlockShape as BlockShape
-from .shapes import PlateShape as PlateShape
+from .plates import PlateShape as PlateShape
+from .plates import ThickPlateShape as ThickPlateShape
+from .plates import kirchhoff_plate as kirchhoff_plate
+from .plates import plate as plate
+from .simple_models import BeamShape as BeamShape
+from .simple_models import BlockShape as BlockShape
 from .simple_models import beam as beam
 from .simple_models import chain as chain
-from .simple_models import kirchhoff_plate as kirchhoff_plate
 from .simple_models import solid_block as solid_block
 from .sliding_motions import slides as slides
 from .sliding_motions import sliding as sliding
-from .thick_plate import ThickPlateShape as ThickPlateShape
-from .thick_plate import plate as plate
 
 __dir__ = _public_names(__name__)

@@ -1,33 +1,34 @@
-"""Machines of simple form: chains, straight beams, rectangular plates, blocks of bricks."""
+"""Machines of simple form: chains, straight beams, blocks of bricks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, positive, positive_array, real_array
-from ..errors import ModelError, ShapeError, short
-from ..labels import DofSet
+from ..arrays import FloatArray, IntArray, positive, positive_array, real_array
+from ..errors import LabelError, ModelError, ShapeError, short
+from ..labels import DIRECTIONS, DofSet
 from ..store import frozen
 from ..words import one_of, several
 from .element_matrices import (
-    Grid,
     beam_mass,
+    beam_parts,
     beam_stiffness,
     beam_terms,
+    brick_bending,
     brick_mass,
+    brick_shape,
+    brick_slopes,
     brick_stiffness,
-    edge_share,
-    plate_mass,
-    plate_stiffness,
 )
-from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
+from .grids import Field, Grid, GridShape, grid_of
 from .model import FEModel
-from .shapes import BeamShape, BlockShape
-from .shapes import PlateShape as PlateShape
+from .plates import edge_share
 
 
 def chain(
@@ -115,6 +116,57 @@ def _laplacian(between: FloatArray, ground: FloatArray) -> sp.csc_array:
     return sp.csc_array(sp.diags_array([-between, main, -between], offsets=[-1, 0, 1]))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class BeamShape(GridShape):
+    """The shape functions of a beam along x, which are cubic between its nodes.
+
+    Parameters
+    ----------
+    length : float [m]
+        Length of the beam.
+    elements : int
+        Number of elements.
+    softness : float or (elements,) array, optional [m^2]
+        Ratio of bending stiffness to shear stiffness. None: the beam has no shear deformation.
+
+    Examples
+    --------
+    A beam of 2 m with four elements:
+
+    >>> import flexplant as fx
+    >>> fx.structure.BeamShape(2.0, 4)
+    BeamShape(length=2, elements=4)
+    """
+
+    length: float
+    elements: int
+    softness: float | FloatArray | None = None
+
+    motions = ("z", "ry")
+    body = "a beam in bending"
+
+    @cached_property
+    def _grid(self) -> Grid:
+        return Grid((self.length,), (self.elements,), 2, np.ones(self.elements, dtype=bool))
+
+    def _beside(self, points: FloatArray, element: IntArray) -> FloatArray:
+        return np.asarray(np.abs(points[:, 1:]).max(axis=1))
+
+    def _weights(self, direction: str, element: IntArray, place: FloatArray) -> FloatArray:
+        (h,) = self._grid.steps
+        given = 0.0 if self.softness is None else self.softness
+        f = edge_share(np.broadcast_to(given, (self.elements,))[element], h)
+        z, slope = (one[0] + f * one[1] for one in beam_parts(place[:, 0], h))
+        return np.asarray((z if direction == "z" else -slope) * [1, -1, 1, -1])
+
+    def _off(self, point: FloatArray, element: IntArray, outside: bool) -> LabelError:
+        return LabelError(
+            f"the point {tuple(point.tolist())} is off the beam, whose axis reaches from "
+            f"(0, 0, 0) to ({self.length:g}, 0, 0) m: its motion is not known. Coordinates are in "
+            "metres."
+        )
+
+
 #: motions that an end holds
 _ENDS = {"free": (), "pinned": ("z",), "clamped": ("z", "ry"), "guided": ("ry",)}
 
@@ -184,24 +236,17 @@ def beam(
     >>> beam(length=1.0, elements=10, area=1e-4, inertia=8.3e-10, **steel, ends=("clamped", "free"))
     <FEModel 'beam': 20 DOFs, sparse, no rigid-body motions, D not given>
     """
-    lengths, counts = (positive(length, "length"),), counts_of(elements, 1)
+    grid = grid_of((positive(length, "length"),), elements, 1, 2)
     held = _end_supports(ends)
-    rho, E, A, inertia_of = (
-        field_of(value, text, lengths, counts)
-        for value, text in (
-            (density, "density"),
-            (youngs_modulus, "youngs_modulus"),
-            (area, "area"),
-            (inertia, "inertia"),
-        )
-    )
-    grid, h = Grid(counts, 2, np.ones(counts, dtype=bool)), lengths[0] / counts[0]
+    rho, E = grid.field(density, "density"), grid.field(youngs_modulus, "youngs_modulus")
+    A, inertia_of = grid.field(area, "area"), grid.field(inertia, "inertia")
+    (h,) = grid.steps
     turns = E * inertia_of  # bending stiffness
     softness: Any = None
     if poisson_ratio is None:
         M, K = [(beam_mass(h), rho * A)], [(beam_stiffness(h), turns)]
     else:
-        nu = poisson_of(poisson_ratio, lengths, counts)
+        nu = grid.poisson(poisson_ratio)
         sheared = positive(shear_factor, "shear_factor") * A
         softness = 2.0 * (1.0 + nu) * inertia_of / sheared
         f = edge_share(softness, h)
@@ -210,17 +255,16 @@ def beam(
         M += [(one, rho * inertia_of * f**k) for k, one in enumerate(rotary)]
         K = [(beam_stiffness(h), turns * f), (sections, turns * (1.0 - f))]
     sign = np.outer([1, -1, 1, -1], [1, -1, 1, -1])  # ry = -dz/dx
-    shape = BeamShape(lengths[0], counts[0], softness)
+    shape = BeamShape(grid.lengths[0], grid.counts[0], softness)
     free = FEModel._proven(
         M=grid.matrix([(sign * matrix, weight) for matrix, weight in M]),
         K=grid.matrix([(sign * matrix, weight) for matrix, weight in K]),
         D=None,
-        dofs=dofs_of(grid, lengths, ("z", "ry"), shape),
+        dofs=grid.dofs(("z", "ry"), shape),
         name="beam" if name is None else name,
     )
-    labels = [
-        f"{node}:{d}" for node, kind in zip((1, counts[0] + 1), held, strict=True) for d in kind
-    ]
+    nodes = (1, grid.counts[0] + 1)
+    labels = [f"{node}:{d}" for node, kind in zip(nodes, held, strict=True) for d in kind]
     return free.fixed(labels) if labels else free
 
 
@@ -235,87 +279,71 @@ def _end_supports(ends: Any) -> list[tuple[str, ...]]:
     return [_ENDS[end] for end in ends]
 
 
-def kirchhoff_plate(
-    *,
-    size: Sequence[float],
-    thickness: Field,
-    elements: Sequence[int],
-    density: Field,
-    youngs_modulus: Field,
-    poisson_ratio: Field,
-    name: str | None = None,
-) -> FEModel:
-    """Return a free thin rectangular plate in bending, without shear and rotary inertia.
-
-    The elements are those of Adini, Clough and Melosh. They have four nodes and are non-conforming.
-    The deflection is a complete cubic polynomial with the additional terms x^3 y and x y^3.
-    Stiffness and consistent mass are integrated exactly. The plate lies in the x-y plane with one
-    corner at the origin and its middle plane at z = 0. Nodes are numbered from 1 along x, row by
-    row. Each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad].
-
-    Thickness, density and the constants of the material may each be one number, an array (nx, ny)
-    with a number for each element, or a function of the centre (x, y) of an element.
+@dataclass(frozen=True, eq=False, repr=False)
+class BlockShape(GridShape):
+    """The trilinear shape functions of a box of eight-node bricks.
 
     Parameters
     ----------
-    size : (2,) array [m]
-        Lengths in x and y.
-    thickness : float, (nx, ny) array or function [m]
-        Thickness, symmetric about the middle plane.
-    elements : (2,) array of int
-        Number of elements nx, ny.
-    density : float, (nx, ny) array or function [kg/m^3]
-        Density of the material.
-    youngs_modulus : float, (nx, ny) array or function [Pa]
-        Young's modulus of the material.
-    poisson_ratio : float, (nx, ny) array or function [-]
-        Poisson's ratio, above -1 and below 0.5.
-    name : str, optional
-        Name of the model, as it is printed.
-
-    Returns
-    -------
-    FEModel
-        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
-        shape functions of the elements.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When a number is not physical, or the size of an array differs from the number of elements.
+    size : (float, float, float) [m]
+        Lengths in x, y and z.
+    elements : (int, int, int)
+        Number of elements in x, y and z.
+    present : (nz, ny, nx) array of bool, optional
+        True for each element that exists. None: all elements exist.
+    poisson_ratio : float
+        Poisson's ratio. The transverse curvature of a bent element is proportional to it.
 
     Examples
     --------
-    A square aluminium plate of 8 x 8 elements:
+    The weights add up to one, so that a translation along x is exact:
 
-    >>> kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8), density=2702,
-    ...                 youngs_modulus=70e9, poisson_ratio=0.35)
-    <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
+    >>> import flexplant as fx
+    >>> shape = fx.structure.BlockShape((1.0, 1.0, 1.0), (2, 2, 2))
+    >>> round(float(shape.row((0.3, 0.2, 0.1), "x").sum()), 9)
+    1.0
     """
-    lengths, counts = lengths_of(size, 2), counts_of(elements, 2)
-    h = field_of(thickness, "thickness", lengths, counts)
-    rho = field_of(density, "density", lengths, counts)
-    E = field_of(youngs_modulus, "youngs_modulus", lengths, counts)
-    nu = poisson_of(poisson_ratio, lengths, counts)
-    grid = Grid(counts, 3, np.ones(counts[::-1], dtype=bool))
-    a, b = lengths[0] / counts[0], lengths[1] / counts[1]
-    bending = E * h**3 / (12 * (1 - nu**2))
-    shape = PlateShape((lengths[0], lengths[1]), h, (counts[0], counts[1]))
-    # sums of definite elements are definite, so that no new check is needed
-    return FEModel._proven(
-        M=grid.matrix([(plate_mass(a, b), rho * h)]),
-        K=grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, nu)),
-        D=None,
-        dofs=dofs_of(grid, lengths, ("z", "rx", "ry"), shape),
-        name="plate" if name is None else name,
-    )
 
+    size: tuple[float, float, float]
+    elements: tuple[int, int, int]
+    present: Any = None
+    poisson_ratio: float = 0.0
 
-def _plate_stiffness(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any) -> Any:
-    plain, cross = parts
-    if np.ndim(nu) == 0:
-        return [(plain + nu * cross, bending)]
-    return [(plain, bending), (cross, bending * nu)]
+    motions = DIRECTIONS
+    body = "a solid"
+
+    @cached_property
+    def _grid(self) -> Grid:
+        there = np.ones(self.elements[::-1], dtype=bool) if self.present is None else self.present
+        return Grid(self.size, self.elements, 3, np.asarray(there))
+
+    def _beside(self, points: FloatArray, element: IntArray) -> FloatArray:
+        return np.zeros(len(points))
+
+    def _weights(self, direction: str, element: IntArray, place: FloatArray) -> FloatArray:
+        kind, weights = DIRECTIONS.index(direction), np.zeros((len(place), 11, 3))
+        if kind < 3:
+            weights[:, :, kind] = brick_shape(place)
+        else:
+            slopes = brick_slopes(place) / self._grid.steps
+            after, before = (kind - 2) % 3, (kind - 1) % 3
+            weights[:, :, before] = 0.5 * slopes[:, :, after]
+            weights[:, :, after] = -0.5 * slopes[:, :, before]
+        corners, bends = weights[:, :8].reshape(-1, 24), weights[:, 8:].reshape(-1, 9)
+        return np.asarray(corners + bends @ self._bending)
+
+    @cached_property
+    def _bending(self) -> FloatArray:
+        """Bending modes (9, 24) inside an element that follow its corners."""
+        a, b, c = self._grid.steps
+        return brick_bending(a, b, c, self.poisson_ratio)
+
+    def _off(self, point: FloatArray, element: IntArray, outside: bool) -> LabelError:
+        where = "outside" if outside else "in a hole of"
+        return LabelError(
+            f"the point {tuple(point.tolist())} is {where} the block, which reaches from "
+            f"(0, 0, 0) to {self.size} m: its motion is not known. Coordinates are in metres."
+        )
 
 
 def solid_block(
@@ -372,21 +400,17 @@ def solid_block(
     ...             poisson_ratio=0.33)
     <FEModel 'block': 120 DOFs, sparse, 6 rigid-body motions, D not given>
     """
-    lengths, counts = lengths_of(size, 3), counts_of(elements, 3)
-    present = present_of(holes, lengths, counts)
-    rho = field_of(density, "density", lengths, counts, present)
-    E = field_of(youngs_modulus, "youngs_modulus", lengths, counts, present)
-    nu = poisson_of(real_array(poisson_ratio, "poisson_ratio", ()).item(), lengths, counts)
-    there = np.ones(counts[::-1], dtype=bool) if present is None else present
-    grid = Grid(counts, 3, there)
-    a, b, c = (n / k for n, k in zip(lengths, counts, strict=True))
-    shape = BlockShape(
-        (lengths[0], lengths[1], lengths[2]), (counts[0], counts[1], counts[2]), present, nu
-    )
+    grid = grid_of(size, elements, 3, 3, holes)
+    rho, E = grid.field(density, "density"), grid.field(youngs_modulus, "youngs_modulus")
+    nu = grid.poisson(real_array(poisson_ratio, "poisson_ratio", ()).item())
+    a, b, c = grid.steps
+    (sx, sy, sz), (nx, ny, nz) = grid.lengths, grid.counts
+    present = None if grid.present.all() else grid.present
+    shape = BlockShape((sx, sy, sz), (nx, ny, nz), present, nu)
     return FEModel._proven(
         M=grid.matrix([(brick_mass(a, b, c), rho)]),
         K=grid.matrix([(brick_stiffness(a, b, c, nu), E)]),
         D=None,
-        dofs=dofs_of(grid, lengths, ("x", "y", "z"), shape),
+        dofs=grid.dofs(("x", "y", "z"), shape),
         name="block" if name is None else name,
     )

@@ -1,19 +1,39 @@
-"""Rectangular plates that shear and whose sections have rotary inertia."""
+"""Rectangular plates: thin ones, and those that shear and whose sections have rotary inertia."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, positive
-from .element_matrices import PLATE_CORNERS, POINTS, Grid, edge_share
-from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of
+from ..arrays import FloatArray, IntArray, positive
+from ..errors import LabelError
+from .element_matrices import (
+    PLATE_CORNERS,
+    POINTS,
+    plate_mass,
+    plate_stiffness,
+    thin_coefficients,
+    thin_terms,
+)
+from .grids import Field, Grid, GridShape, grid_of
 from .model import FEModel
-from .shapes import PlateShape
+
+# The shear of an edge is constant and the slope of the section along it quadratic: between ends
+# that turn by t1, t2 and move by z1, z2 over a length L,
+#     shear = (1 - f) d,  slope = linear + 6 s (1 - s) f d,  d = (z2 - z1) / L - (t1 + t2) / 2,
+# with f = 1 / (1 + 12 B / (G L^2)), B the bending and G the shear stiffness, which makes an edge an
+# exact Timoshenko beam ([FriedmanKosmatka1993]_). In a plate both carry over linearly to the
+# opposite edge: the element of [Katili1993]_ on a rectangle. f = 1 is an edge that does not shear.
+
+
+def edge_share(softness: Any, length: float) -> Any:
+    """Return f of an edge whose bending stiffness is `softness` [m^2] of its shear stiffness."""
+    return 1.0 / (1.0 + 12.0 * np.asarray(softness) / length**2)
 
 
 class PlateParts(NamedTuple):
@@ -124,7 +144,7 @@ def plate_terms(
         scaled = 12.0 / length**2 * share
         own = one.T @ (area * one)
         K.append((0.5 * (own + own.T), bending * softness * scaled**2))
-    return _collected(M), _collected(K)
+    return M, K
 
 
 def _collected(terms: Terms) -> Terms:
@@ -132,6 +152,64 @@ def _collected(terms: Terms) -> Terms:
     if any(np.ndim(weight) for _, weight in terms):
         return terms
     return [(np.asarray(sum(weight * matrix for matrix, weight in terms)), 1.0)]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlateShape(GridShape):
+    """The shape functions of a rectangular grid of plate elements.
+
+    Parameters
+    ----------
+    size : (float, float) [m]
+        Lengths in x and y.
+    thickness : float or (ny, nx) array [m]
+        Thickness of the plate. Points between the two surfaces belong to the plate.
+    elements : (int, int)
+        Number of elements in x and y.
+
+    Examples
+    --------
+    The weights of the deflections add up to one, so that a translation in z is exact:
+
+    >>> import flexplant as fx
+    >>> shape = fx.structure.PlateShape((1.0, 1.0), 0.01, (2, 2))
+    >>> round(float(shape.row((0.3, 0.2, 0.0), "z")[::3].sum()), 9)
+    1.0
+    """
+
+    size: tuple[float, float]
+    thickness: float | FloatArray
+    elements: tuple[int, int]
+
+    motions = ("z", "rx", "ry")
+    body = "a plate in bending"
+
+    @cached_property
+    def _grid(self) -> Grid:
+        return Grid(self.size, self.elements, 3, np.ones(self.elements[::-1], dtype=bool))
+
+    def _beside(self, points: FloatArray, element: IntArray) -> FloatArray:
+        return np.asarray(np.abs(points[:, 2]) - 0.5 * self._depth(element))
+
+    def _depth(self, element: IntArray) -> Any:
+        return np.broadcast_to(self.thickness, self.elements[::-1])[tuple(element.T[::-1])]
+
+    def _weights(self, direction: str, element: IntArray, place: FloatArray) -> FloatArray:
+        (a, b), (s, t) = self._grid.steps, place.T
+        if direction == "z":
+            terms = thin_terms(s, t, 0, 0)
+        elif direction == "rx":
+            terms = thin_terms(s, t, 0, 1) / b
+        else:
+            terms = -thin_terms(s, t, 1, 0) / a
+        return np.asarray(terms @ thin_coefficients(a, b))
+
+    def _off(self, point: FloatArray, element: IntArray, outside: bool) -> LabelError:
+        return LabelError(
+            f"the point {tuple(point.tolist())} is off the plate, which reaches from "
+            f"(0, 0) to ({self.size[0]:g}, {self.size[1]:g}) m at |z| <= "
+            f"{0.5 * self._depth(element):g} m: its motion is not known. Coordinates are in metres."
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,16 +236,14 @@ class ThickPlateShape(PlateShape):
 
     softness: float | FloatArray = 0.0
 
-    def _weights(self, direction: str, element: Any, s: Any, t: Any) -> FloatArray:
-        a, b = (n / k for n, k in zip(self.size, self.elements, strict=True))
+    def _weights(self, direction: str, element: IntArray, place: FloatArray) -> FloatArray:
+        (a, b), (s, t) = self._grid.steps, place.T
         fields = plate_parts(s, t, a, b)
         along_x, along_y = fields.slopes
         parts = {"z": fields.z, "rx": along_y, "ry": -along_x}[direction]
-        x, y = element
-        soft = np.broadcast_to(np.asarray(self.softness), self.elements[::-1])[y, x]
-        shares = [edge_share(soft, length)[..., None] for length in (a, b)]
-        found = parts[0] + shares[0] * parts[1] + shares[1] * parts[2]
-        return np.asarray(found.reshape(*np.shape(s), 12))
+        soft = np.broadcast_to(self.softness, self.elements[::-1])[tuple(element.T[::-1])]
+        along = [edge_share(soft, length)[:, None] for length in (a, b)]
+        return np.asarray(parts[0] + along[0] * parts[1] + along[1] * parts[2])
 
 
 def plate(
@@ -245,31 +321,99 @@ def plate(
     ...          youngs_modulus=70e9, poisson_ratio=0.35)
     <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
     """
-    lengths, counts = lengths_of(size, 2), counts_of(elements, 2)
-    h, rho, E = (
-        field_of(value, text, lengths, counts)
-        for value, text in (
-            (thickness, "thickness"),
-            (density, "density"),
-            (youngs_modulus, "youngs_modulus"),
-        )
-    )
-    nu = poisson_of(poisson_ratio, lengths, counts)
+    grid = grid_of(size, elements, 2, 3)
+    h = grid.field(thickness, "thickness")
+    rho = grid.field(density, "density")
+    E = grid.field(youngs_modulus, "youngs_modulus")
+    nu = grid.poisson(poisson_ratio)
     soft = 0.0
     if shear_factor is not None:  # E h^3 / 12 (1 - nu^2) over k E h / 2 (1 + nu)
         soft = h**2 / (6.0 * positive(shear_factor, "shear_factor") * (1.0 - nu))
-    a, b = (n / k for n, k in zip(lengths, counts, strict=True))
+    (x, y), (nx, ny), (a, b) = grid.lengths, grid.counts, grid.steps
     M, K = plate_terms(
         a, b, soft, mass=rho * h, rotary=rho * h**3 / 12.0, nu=nu,
         bending=E * h**3 / (12.0 * (1.0 - nu**2)),
     )  # fmt: skip
-    grid = Grid(counts, 3, np.ones(counts[::-1], dtype=bool))
-    shape = ThickPlateShape((lengths[0], lengths[1]), h, (counts[0], counts[1]), softness=soft)
+    shape = ThickPlateShape((x, y), h, (nx, ny), softness=soft)
+    return _plate_model(grid, M, K, shape, name)
+
+
+def _plate_model(grid: Grid, M: Terms, K: Terms, shape: PlateShape, name: str | None) -> FEModel:
     # sums of definite elements are definite, so that no new check is needed
     return FEModel._proven(
-        M=grid.matrix(M),
-        K=grid.matrix(K),
+        M=grid.matrix(_collected(M)),
+        K=grid.matrix(_collected(K)),
         D=None,
-        dofs=dofs_of(grid, lengths, ("z", "rx", "ry"), shape),
+        dofs=grid.dofs(("z", "rx", "ry"), shape),
         name="plate" if name is None else name,
     )
+
+
+def kirchhoff_plate(
+    *,
+    size: Sequence[float],
+    thickness: Field,
+    elements: Sequence[int],
+    density: Field,
+    youngs_modulus: Field,
+    poisson_ratio: Field,
+    name: str | None = None,
+) -> FEModel:
+    """Return a free thin rectangular plate in bending, without shear and rotary inertia.
+
+    The elements are those of Adini, Clough and Melosh. They have four nodes and are non-conforming.
+    The deflection is a complete cubic polynomial with the additional terms x^3 y and x y^3.
+    Stiffness and consistent mass are integrated exactly. The plate lies in the x-y plane with one
+    corner at the origin and its middle plane at z = 0. Nodes are numbered from 1 along x, row by
+    row. Each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad].
+
+    Thickness, density and the constants of the material may each be one number, an array (nx, ny)
+    with a number for each element, or a function of the centre (x, y) of an element.
+
+    Parameters
+    ----------
+    size : (2,) array [m]
+        Lengths in x and y.
+    thickness : float, (nx, ny) array or function [m]
+        Thickness, symmetric about the middle plane.
+    elements : (2,) array of int
+        Number of elements nx, ny.
+    density : float, (nx, ny) array or function [kg/m^3]
+        Density of the material.
+    youngs_modulus : float, (nx, ny) array or function [Pa]
+        Young's modulus of the material.
+    poisson_ratio : float, (nx, ny) array or function [-]
+        Poisson's ratio, above -1 and below 0.5.
+    name : str, optional
+        Name of the model, as it is printed.
+
+    Returns
+    -------
+    FEModel
+        Model with sparse matrices and without D. Its DofSet interpolates between nodes with the
+        shape functions of the elements.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a number is not physical, or the size of an array differs from the number of elements.
+
+    Examples
+    --------
+    A square aluminium plate of 8 x 8 elements:
+
+    >>> kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8), density=2702,
+    ...                 youngs_modulus=70e9, poisson_ratio=0.35)
+    <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
+    """
+    grid = grid_of(size, elements, 2, 3)
+    h = grid.field(thickness, "thickness")
+    rho = grid.field(density, "density")
+    E = grid.field(youngs_modulus, "youngs_modulus")
+    nu = grid.poisson(poisson_ratio)
+    (x, y), (nx, ny), (a, b) = grid.lengths, grid.counts, grid.steps
+    bending = E * h**3 / (12 * (1 - nu**2))
+    plain, cross = plate_stiffness(a, b)
+    shape = PlateShape((x, y), h, (nx, ny))
+    M, K = [(plate_mass(a, b), rho * h)], [(plain, bending), (cross, bending * nu)]
+    return _plate_model(grid, M, K, shape, name)
