@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from .errors import ModelError, ShapeError, short
+from .errors import LabelError, ModelError, ShapeError, short
+from .tolerances import PRECISION
 
 #: above this, x**3 overflows
 TOO_LARGE = 1e100
@@ -21,6 +22,8 @@ Shape: TypeAlias = tuple[int | None, ...]
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = FloatArray | sp.csc_array
 
+#: node numbers stay exact as floats, and their keys in 64 bits
+LARGEST_NODE = int(2 / PRECISION)
 #: number of numbers of a piece of work that stays in the cache of a processor
 CACHED = 200_000
 #: number of columns that are processed together: one pass over a matrix serves all of them
@@ -191,6 +194,24 @@ def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None
     if number < minimum or (maximum is not None and number > maximum):
         raise ModelError(f"{name} must be a whole number {least}, got {number}. Choose one there.")
     return number
+
+
+def node_numbers(nodes: Any) -> IntArray:
+    """Return node numbers as int64; LabelError when one is not whole or too large."""
+    try:
+        numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
+        if np.iscomplexobj(numbers):
+            raise ValueError(numbers)
+        with np.errstate(invalid="ignore"):  # NaN is refused below
+            whole = numbers.astype(np.int64)
+    except (TypeError, ValueError, OverflowError):
+        numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
+    if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > LARGEST_NODE):
+        raise LabelError(
+            f"node numbers must be whole numbers, got {nodes!r:.80}. Give the nodes numbers, from "
+            "1 say, and keep the foreign program's names elsewhere."
+        )
+    return np.asarray(whole, dtype=np.int64)
 
 
 def positions(values: Any, name: str, count: int) -> IntArray:

@@ -1,4 +1,4 @@
-"""The columns of a set of DOFs: nodes, directions, coordinates; from a table too."""
+"""Directions and places of DOFs, tables of them, and texts on DOFs that are not there."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .arrays import FloatArray, IntArray, real_array
-from .errors import LabelError, ShapeError, short, unknown_label
+from .arrays import FloatArray, IntArray, node_numbers, real_array
+from .errors import LabelError, ShapeError, unknown_label
 from .store import Value
-from .tolerances import PRECISION, SAME
-from .words import check_names, name_list, several
+from .tolerances import SAME
+from .words import as_list
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 #: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}
@@ -45,8 +45,6 @@ class Interpolation(Value):
 
 
 _COLUMNS = ("node", "direction", "x", "y", "z")
-#: node numbers stay exact as floats, and their keys in 64 bits
-LARGEST_NODE = int(2 / PRECISION)
 
 
 def columns_of(
@@ -92,71 +90,6 @@ def _cell_number(row: Mapping[str, Any], column: str, line: int) -> float:
         ) from None
 
 
-def as_list(items: Any, name: str, form: str) -> list[Any]:
-    """Return items as a list; LabelError when there is nothing to list."""
-    if not several(items):
-        raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
-    return list(items)
-
-
-def node_numbers(nodes: Any) -> IntArray:
-    """Return node numbers as int64; LabelError when one is not whole or too large."""
-    try:
-        numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
-        if np.iscomplexobj(numbers):
-            raise ValueError(numbers)
-        with np.errstate(invalid="ignore"):  # NaN is refused below
-            whole = numbers.astype(np.int64)
-    except (TypeError, ValueError, OverflowError):
-        numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
-    if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > LARGEST_NODE):
-        raise LabelError(
-            f"node numbers must be whole numbers, got {nodes!r:.80}. Give the nodes numbers, from "
-            "1 say, and keep the foreign program's names elsewhere."
-        )
-    return np.asarray(whole, dtype=np.int64)
-
-
-def direction_names(directions: Any, name: str = "directions") -> tuple[str, ...]:
-    """Return directions as a tuple of str; LabelError for a single one."""
-    if isinstance(directions, str):
-        raise LabelError(
-            f"directions must be one for each DOF, got the single {directions!r}: write "
-            f"[{directions!r}] * n."
-        )
-    # the million of a large model are strings already, and few different ones
-    given = tuple(as_list(directions, "directions", "a list with one for each DOF"))
-    try:
-        if all(type(d) is str for d in set(given)):
-            return given
-    except TypeError:
-        pass
-    return tuple(str(direction) for direction in given)
-
-
-def component_columns(
-    names: Any, owners: Any, count: int
-) -> tuple[tuple[str, ...], IntArray | None]:
-    """Return the names of components and which of them (count,) each DOF belongs to."""
-    listed_names = name_list(names, "components")
-    if owners is None and not listed_names:
-        return (), None
-    check_names(listed_names, "components")
-    wrong = [name for name in listed_names if ":" in name or name != name.strip(" /")]
-    if wrong:
-        raise LabelError(
-            f"{wrong[0]!r} cannot name a component: labels are 'stage/41:z', so that names hold no "
-            "':' and neither begin nor end with '/' or a blank. Rename it."
-        )
-    numbers = np.zeros(0, dtype=np.int64) if owners is None else node_numbers(owners)
-    if numbers.shape != (count,) or not np.all((numbers >= 0) & (numbers < len(listed_names))):
-        raise LabelError(
-            f"component_of must hold the number (from 0) of one of the {len(listed_names)} "
-            f"components for each of the {count} DOFs, got {short(owners)}."
-        )
-    return listed_names, numbers
-
-
 def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
     """Return the coordinates (n, 3) of some nodes out of a table of all."""
     numbers, count = np.unique(known, return_counts=True)
@@ -179,58 +112,6 @@ def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) ->
 #: up to this number of labels the closest are found by comparing each with the one that is unknown
 _COMPARABLE = 2000
 _ROTATIONS = frozenset(DIRECTIONS[3:])
-
-
-class DofIndex:
-    """The rows of DOFs, given their node numbers (n,) and kinds (n,), 0 to 5 for x to rz."""
-
-    def __init__(
-        self,
-        nodes: IntArray,
-        kinds: IntArray,
-        components: tuple[str, ...] = (),
-        component_of: IntArray | None = None,
-    ) -> None:
-        keys = nodes * len(DIRECTIONS) + kinds
-        self._order = np.arange(keys.size)
-        self._ends = {"": (0, keys.size)}
-        if component_of is not None:
-            self._order = np.lexsort((keys, component_of))
-            ends = np.searchsorted(component_of[self._order], np.arange(len(components) + 1))
-            pairs = zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
-            self._ends = dict(zip(components, pairs, strict=True))
-        elif np.any(keys[1:] < keys[:-1]):
-            self._order = np.argsort(keys, kind="stable")
-        self._keys = keys[self._order]
-
-    @property
-    def doubled(self) -> tuple[int, int] | None:
-        """Two rows with the same DOF, or None."""
-        for start, end in self._ends.values():
-            same = np.flatnonzero(np.diff(self._keys[start:end]) == 0)
-            if same.size:
-                first = start + int(same[0])  # the stable sort keeps equal keys in their order
-                return int(self._order[first]), int(self._order[first + 1])
-        return None
-
-    def found(self, label: object) -> int:
-        """Return the row of a label, or -1; it is found by numbers, without a dictionary."""
-        if not isinstance(label, str):
-            return -1
-        component, _, rest = label.rpartition("/")
-        node, _, direction = rest.partition(":")
-        if direction not in DIRECTIONS or component not in self._ends:
-            return -1
-        try:
-            number = int(node)
-        except ValueError:
-            return -1
-        if str(number) != node or abs(number) > LARGEST_NODE:  # "07:z" and "1_0:z" are not labels
-            return -1
-        start, end = self._ends[component]
-        key = number * len(DIRECTIONS) + DIRECTIONS.index(direction)
-        place = start + int(np.searchsorted(self._keys[start:end], key))
-        return int(self._order[place]) if place < end and self._keys[place] == key else -1
 
 
 def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) -> LabelError:

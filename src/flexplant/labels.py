@@ -11,25 +11,107 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .arrays import FloatArray, IntArray, real_array
+from .arrays import LARGEST_NODE, FloatArray, IntArray, node_numbers, real_array
 from .dof_columns import DIRECTIONS as DIRECTIONS
-from .dof_columns import (
-    DofIndex,
-    as_list,
-    columns_of,
-    component_columns,
-    direction_names,
-    in_box,
-    node_numbers,
-    rotation_hint,
-    unknown_dof,
-)
 from .dof_columns import Interpolation as Interpolation
 from .dof_columns import Place as Place
-from .errors import LabelError, ShapeError, counted, require_known, unknown_label
+from .dof_columns import columns_of, in_box, rotation_hint, unknown_dof
+from .errors import LabelError, ShapeError, counted, require_known, short, unknown_label
 from .store import Value, frozen
 from .tolerances import SAME
-from .words import instance, name_list
+from .words import as_list, check_names, instance, name_list
+
+
+def direction_names(directions: Any, name: str = "directions") -> tuple[str, ...]:
+    """Return directions as a tuple of str; LabelError for a single one."""
+    if isinstance(directions, str):
+        raise LabelError(
+            f"directions must be one for each DOF, got the single {directions!r}: write "
+            f"[{directions!r}] * n."
+        )
+    # the million of a large model are strings already, and few different ones
+    given = tuple(as_list(directions, "directions", "a list with one for each DOF"))
+    try:
+        if all(type(d) is str for d in set(given)):
+            return given
+    except TypeError:
+        pass
+    return tuple(str(direction) for direction in given)
+
+
+def component_columns(
+    names: Any, owners: Any, count: int
+) -> tuple[tuple[str, ...], IntArray | None]:
+    """Return the names of components and which of them (count,) each DOF belongs to."""
+    listed_names = name_list(names, "components")
+    if owners is None and not listed_names:
+        return (), None
+    check_names(listed_names, "components")
+    wrong = [name for name in listed_names if ":" in name or name != name.strip(" /")]
+    if wrong:
+        raise LabelError(
+            f"{wrong[0]!r} cannot name a component: labels are 'stage/41:z', so that names hold no "
+            "':' and neither begin nor end with '/' or a blank. Rename it."
+        )
+    numbers = np.zeros(0, dtype=np.int64) if owners is None else node_numbers(owners)
+    if numbers.shape != (count,) or not np.all((numbers >= 0) & (numbers < len(listed_names))):
+        raise LabelError(
+            f"component_of must hold the number (from 0) of one of the {len(listed_names)} "
+            f"components for each of the {count} DOFs, got {short(owners)}."
+        )
+    return listed_names, numbers
+
+
+class _DofIndex:
+    """The rows of DOFs, given their node numbers (n,) and kinds (n,), 0 to 5 for x to rz."""
+
+    def __init__(
+        self,
+        nodes: IntArray,
+        kinds: IntArray,
+        components: tuple[str, ...] = (),
+        component_of: IntArray | None = None,
+    ) -> None:
+        keys = nodes * len(DIRECTIONS) + kinds
+        self._order = np.arange(keys.size)
+        self._ends = {"": (0, keys.size)}
+        if component_of is not None:
+            self._order = np.lexsort((keys, component_of))
+            ends = np.searchsorted(component_of[self._order], np.arange(len(components) + 1))
+            pairs = zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+            self._ends = dict(zip(components, pairs, strict=True))
+        elif np.any(keys[1:] < keys[:-1]):
+            self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
+
+    @property
+    def doubled(self) -> tuple[int, int] | None:
+        """Two rows with the same DOF, or None."""
+        for start, end in self._ends.values():
+            same = np.flatnonzero(np.diff(self._keys[start:end]) == 0)
+            if same.size:
+                first = start + int(same[0])  # the stable sort keeps equal keys in their order
+                return int(self._order[first]), int(self._order[first + 1])
+        return None
+
+    def found(self, label: object) -> int:
+        """Return the row of a label, or -1; it is found by numbers, without a dictionary."""
+        if not isinstance(label, str):
+            return -1
+        component, _, rest = label.rpartition("/")
+        node, _, direction = rest.partition(":")
+        if direction not in DIRECTIONS or component not in self._ends:
+            return -1
+        try:
+            number = int(node)
+        except ValueError:
+            return -1
+        if str(number) != node or abs(number) > LARGEST_NODE:  # "07:z" and "1_0:z" are not labels
+            return -1
+        start, end = self._ends[component]
+        key = number * len(DIRECTIONS) + DIRECTIONS.index(direction)
+        place = start + int(np.searchsorted(self._keys[start:end], key))
+        return int(self._order[place]) if place < end and self._keys[place] == key else -1
 
 
 def checked_direction(direction: Any, name: str = "direction") -> str:
@@ -159,8 +241,8 @@ class DofSet(Value):
         return np.asarray(frozen(index))
 
     @cached_property
-    def _index(self) -> DofIndex:
-        return DofIndex(self.nodes, self.kinds, self.components, self.component_of)
+    def _index(self) -> _DofIndex:
+        return _DofIndex(self.nodes, self.kinds, self.components, self.component_of)
 
     def __len__(self) -> int:
         return int(self.nodes.size)

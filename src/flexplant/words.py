@@ -124,6 +124,13 @@ def several(value: Any) -> bool:
     return isinstance(value, Iterable)
 
 
+def as_list(items: Any, name: str, form: str) -> list[Any]:
+    """Return items as a list; LabelError when there is nothing to list."""
+    if not several(items):
+        raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
+    return list(items)
+
+
 def name_list(names: Any, name: str) -> tuple[str, ...]:
     """Return names as a tuple of str; one str is one name."""
     if type(names) is tuple and all(type(one) is str for one in names):

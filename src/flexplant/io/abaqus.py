@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray
-from ..dof_columns import LARGEST_NODE, at_nodes
+from ..arrays import LARGEST_NODE, FloatArray, IntArray
+from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices

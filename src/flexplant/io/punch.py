@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray
-from ..dof_columns import LARGEST_NODE
+from ..arrays import LARGEST_NODE, FloatArray, IntArray
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices, completed

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-from ..dof_columns import LARGEST_NODE, at_nodes
+from ..arrays import LARGEST_NODE, FloatArray, IntArray
+from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure.unit_systems import units

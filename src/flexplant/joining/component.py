@@ -12,9 +12,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..arrays import FloatArray, IntArray, real_array
-from ..dof_columns import component_columns
 from ..errors import LabelError, ModelError, require_known
-from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..labels import DIRECTIONS, DofSet, Interpolation, component_columns
 from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel

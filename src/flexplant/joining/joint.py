@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, positive_array, real_array
-from ..dof_columns import node_numbers
+from ..arrays import FloatArray, IntArray, node_numbers, positive_array, real_array
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, DofSet
 from ..store import Value

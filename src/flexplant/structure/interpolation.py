@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
-from ..dof_columns import direction_names
 from ..errors import LabelError, ModelError, require_known
-from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..labels import DIRECTIONS, DofSet, Interpolation, direction_names
 from ..store import Value, checked
 from ..tolerances import SAME, TINY
 from ..words import instance

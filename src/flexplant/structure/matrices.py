@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arrays import FloatArray, IntArray, positive, real_array, whole
-from ..dof_columns import at_nodes, node_numbers
+from ..arrays import FloatArray, IntArray, node_numbers, positive, real_array, whole
+from ..dof_columns import at_nodes
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
