@@ -177,7 +177,9 @@ class UpdateResult(Value):
     chi2 : float or None
         Smallest sum of squares of the residuals (and priors), each divided by the standard
         deviation of its noise. It is about `dof` if the model explains the measurement. Only
-        residuals with known noise count. None: all noise is unknown.
+        residuals with known noise count. Where responses have correlated errors, or a variance that
+        was estimated from few runs, the sum is scaled so that it is distributed as chi-square with
+        `dof` degrees of freedom. None: all noise is unknown.
     dof : int
         Degrees of freedom: number of residuals and priors that count in `chi2`, minus the number of
         parameters that they determine. Parameters at a bound are not subtracted.

@@ -22,16 +22,24 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
     """Return `noise_misfit` and its degrees of freedom; those of all rows where no noise is known.
 
     The degrees of freedom are the number of rows minus the part of the parameters: the trace of
-    these rows of the projector on all slopes, which is its rank where all noise is known.
+    these rows of the projector on all slopes, which is its rank where all noise is known. Rows
+    with shared errors count by their share of independent ones, `Bound.independent`.
     """
     misfit = noise_misfit(objective, point, free)
-    J = objective.slopes(point)[:, free]
-    judged, lost = np.ones(len(J), dtype=bool), 0
+    taken = np.sum(_orthonormal(objective.slopes(point)[:, free]) ** 2, axis=1)
+    dof, data = 0.0, 0
     for bound, rows in objective.rows(point):
-        judged[rows] = misfit is None or bound.has_noise
-        lost += bound.lost if judged[rows].any() else 0
-    taken = float(np.sum(_orthonormal(J)[judged] ** 2))
-    return misfit, max(round(float(np.sum(judged)) - lost - taken), 0)
+        data = rows.stop
+        if misfit is None or bound.has_noise:
+            left = rows.stop - rows.start - bound.lost - float(np.sum(taken[rows]))
+            dof += bound.independent * left
+    return misfit, max(round(dof + float(np.sum(1.0 - taken[data:]))), 0)
+
+
+def independent_share(objective: Objective, point: Point) -> float:
+    """Return the share of all rows that count as independent."""
+    rows = [(bound.independent, at.stop - at.start) for bound, at in objective.rows(point)]
+    return float(sum(share * count for share, count in rows) / sum(count for _, count in rows))
 
 
 def noise_misfit(objective: Objective, point: Point, free: FloatArray) -> float | None:
@@ -50,8 +58,11 @@ def noise_misfit(objective: Objective, point: Point, free: FloatArray) -> float 
             r[at] = 0.0
         elif bound.noise is not None:
             r[at], J[at] = _whitened(bound.noise, r[at]), _whitened(bound.noise, J[at])
-    total = float(r @ r) - float(np.sum((_orthonormal(J).T @ r) ** 2))
-    return max(total, 0.0)
+    Q = _orthonormal(J)
+    r -= Q @ (Q.T @ r)
+    data = objective.rows(point)
+    found = sum(bound.independent * bound.misfit(r[at]) for bound, at in data)
+    return float(found + np.sum(r[data[-1][1].stop :] ** 2))
 
 
 def _orthonormal(J: FloatArray) -> FloatArray:
@@ -124,7 +135,7 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     for bound, rows in objective.rows(point):
         part, data = U[rows].T @ U[rows], rows.stop
         if bound.has_noise:
-            known += part if bound.noise is None else U[rows].T @ (bound.noise @ U[rows])
+            known += U[rows].T @ bound.noise_times(U[rows])
         else:
             other += part
             left += float(r[rows] @ r[rows])

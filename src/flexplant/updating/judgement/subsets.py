@@ -17,7 +17,7 @@ from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, NULL, SETT
 from ..family import Eigen, Family, Point
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
-from .goodness import chance, is_bad, noise_misfit, worst
+from .goodness import chance, independent_share, is_bad, noise_misfit, worst
 
 #: number of best subsets of each size that are extended
 BEAM = 3
@@ -71,6 +71,7 @@ class Subsets:
         self.ends: dict[Subset, Point] = {}
         point = whole.begin(np.where(np.arange(self.start.size) < count, 0.0, self.start))
         self.rows = whole.values(point).size
+        self.share = independent_share(whole, point)
         modal = not any(residual.loaded for residual in residuals)
         self.confines = modal and bool(whole.numbers) and not whole.family.condensed
         highest = np.abs(whole.poles(point)).max(initial=0.0) if self.confines else 0.0
@@ -139,7 +140,7 @@ class Subsets:
         """Return the chi-square of a subset (None if the noise is not known) and its freedom."""
         found = self.fit(subset)
         lost = sum(bound.lost for bound in self.whole.bounds)
-        dof = self.rows - lost - len(subset) - len(self.nuisance)
+        dof = round(self.share * (self.rows - lost - len(subset) - len(self.nuisance)))
         return (None if found is None else found.chi2), dof
 
     def runner_up(self, best: Subset) -> tuple[Subset, float]:

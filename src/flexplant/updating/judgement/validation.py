@@ -26,7 +26,7 @@ from ..search import Objective, checked_residuals
 from ..search.objective import UpdateMethod, compared_modes
 from ..update_result import UpdateResult
 from ..updates import update
-from .goodness import chance, is_bad
+from .goodness import chance, independent_share, is_bad
 
 
 def mac(X: Any, Y: Any) -> FloatArray:
@@ -468,7 +468,8 @@ def _misfit(
     J = objective.slopes(point)
     chi2 = float(after @ la.solve(noise + J @ fit.covariance @ J.T, after, assume_a="pos"))
     rms[1] = np.sqrt(chi2 / after.size)
-    return rms, chance(chi2, after.size)
+    share = independent_share(objective, point)
+    return rms, chance(share * chi2, round(share * after.size))
 
 
 def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.special import ndtri, stdtr
 
 from ...arrays import ComplexArray, FloatArray, divisor, positive, spread_array
 from ...errors import ModelError, counted, require_known, short, warn
@@ -47,7 +48,8 @@ class FrfResidual(Residual):
         Variance ``E|noise|^2`` of each entry. None: the variance of `measured`. If
         `measured.freedom` gives the number nu of degrees of freedom with which this variance was
         estimated, the variance is multiplied by ``nu / (nu - 1)``. The correlation of neighbouring
-        lines follows from the window of the Frf. If no variance is known, each entry is divided by
+        lines follows from the window of the Frf, and that of outputs from its `correlation`. Both
+        count in the covariance and in chi-square. If no variance is known, each entry is divided by
         the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: the lines at which the median of ``|H|^2 / variance`` over the
@@ -100,6 +102,7 @@ class FrfResidual(Residual):
         variance = self.variance
         if variance is None:
             variance = _fair(frf)
+            _warn_of_freedom(frf)
         if variance is not None:
             variance = spread_array(variance, "variance", frf.data.shape)
         require_known("direction", [self.direction], DIRECTIONS)
@@ -172,12 +175,24 @@ class _BoundFrf(Bound):
         if self.magnitude:
             sigma = sigma / np.abs(self.data)
         self.sigma = sigma
-        R = frf.line_correlation()
-        if R is not None and self.noisy:
+        R = frf.line_correlation() if self.noisy else None
+        if R is not None:
             # lines of windowed segments share data: rows are [Re; Im] by line, output and input
             R = R[lines][:, lines]
             one = sp.kron(R, sp.eye_array(self.data[0].size))
             self.noise = sp.csc_array(one if self.magnitude else sp.block_diag([one, one]))
+        self.lines = R
+        fair = _fair(frf)
+        self.freedom: float | None = None
+        if frf.freedom is not None and fair is not None and np.all(residual.variance == fair):
+            self.freedom = max(frf.freedom, LEAST)
+        self.root: ComplexArray | None = None
+        if self.noisy and frf.correlation is not None:
+            C = np.moveaxis(frf.correlation[:, :, lines], 2, 0)
+            self.root, self.independent = _root(C), _independent_share(C, self.freedom)
+        if self.freedom is not None:
+            # rows of all inputs share the estimated noise of their output
+            self.independent /= 1.0 + (len(frf.inputs) - 1) / self.freedom
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma
@@ -188,6 +203,44 @@ class _BoundFrf(Bound):
         )
         self.name = f"{counted(lines.size, 'line')} of FRFs"
         self._last: tuple[Point, ComplexArray, Any] | None = None
+
+    def noise_times(self, columns: FloatArray) -> FloatArray:
+        """Return ``N columns``, in which errors of outputs are correlated as in the Frf."""
+        if self.root is None:
+            return super().noise_times(columns)
+        # the error of an output is `L e` by line, with the root L of the correlation of outputs and
+        # errors e that are correlated between lines only
+        lines, outputs, inputs = self.data.shape
+        turn = (self.data / np.abs(self.data))[..., None] if self.magnitude else np.ones(1)
+        z = (
+            columns
+            if self.magnitude
+            else columns[: self.data.size] + 1j * columns[self.data.size :]
+        )
+        z = turn * z.reshape(lines, outputs, inputs, -1)
+        z = np.einsum("lab,lbic->laic", self.root, z)
+        if self.lines is not None:
+            z = (self.lines @ z.reshape(lines, -1)).reshape(z.shape)
+        z = turn.conj() * np.einsum("lab,lbic->laic", self.root, z)
+        z = z.reshape(self.data.size, -1)
+        return np.asarray(z.real) if self.magnitude else split_parts(z)
+
+    def misfit(self, rows: FloatArray) -> float:
+        """Return chi-square of rows whose variance was estimated with few degrees of freedom.
+
+        The ratio x of ``|error|^2`` and its estimated variance exceeds a value with probability
+        ``(1 + x/nu)^-nu``: ``2 nu ln(1 + x/nu)`` is distributed as chi-square with two degrees of
+        freedom. A magnitude, divided by its deviation, follows Student's distribution.
+        """
+        nu = self.freedom
+        if nu is None:
+            return super().misfit(rows)
+        # rows are divided by the deviation that is larger by the root of nu / (nu - 1)
+        if self.magnitude:
+            t = np.abs(rows) * np.sqrt(nu / (nu - 1))
+            return float(np.sum(ndtri(stdtr(2 * nu, -t)) ** 2))
+        x = np.sum(rows.reshape(2, -1) ** 2, axis=0) / 2 / (nu - 1)
+        return float(2 * nu * np.sum(np.log1p(x)))
 
     def kinds(self) -> list[Kind]:
         """Return no discrepancy, since model errors are correlated over lines."""
@@ -250,14 +303,32 @@ def _fair(frf: Frf) -> FloatArray | None:
     """Return the variance with which ``|error|^2 / variance`` is 1 in the mean."""
     if frf.variance is None or frf.freedom is None:
         return frf.variance
-    if frf.freedom <= LEAST:
+    nu = max(frf.freedom, LEAST)
+    return np.asarray(frf.variance * (nu / (nu - 1)))
+
+
+def _warn_of_freedom(frf: Frf) -> None:
+    if frf.variance is not None and frf.freedom is not None and frf.freedom <= LEAST:
         warn(
             f"the variance of this Frf has {frf.freedom:.3g} degrees of freedom: |error|^2 / "
             "variance hardly has a mean, and chi-square is not reliable. Average more runs or "
             "periods, or give variance= from another source."
         )
-    nu = max(frf.freedom, LEAST)
-    return np.asarray(frf.variance * (nu / (nu - 1)))
+
+
+def _root(C: ComplexArray) -> ComplexArray:
+    """Return the Hermitian square roots of correlations (l, o, o)."""
+    values, vectors = np.linalg.eigh(C)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ vectors.conj().mT)
+
+
+def _independent_share(C: ComplexArray, freedom: float | None) -> float:
+    """Return the share of outputs with independent errors, ``o / sum |C|^2``."""
+    alike = np.mean(np.abs(C) ** 2, axis=0)
+    if freedom is not None:
+        # independent errors have |C|^2 = 1/nu in the mean
+        alike = np.maximum((alike - 1 / freedom) / (1 - 1 / freedom), 0.0)
+    return float(len(alike) / (len(alike) + np.sum(alike * (1 - np.eye(len(alike))))))
 
 
 def _checked_hold(hold: Any, delay: Any, frf: Frf, lines: Any) -> tuple[float | None, float]:

@@ -74,8 +74,10 @@ class Bound(ABC):
     numbers: tuple[int, ...] = ()
     #: whether the covariance of the measurement is known
     noisy: bool = False
-    #: the covariance of the rows where it is known but not the unit matrix
+    #: the covariance of the rows where it is known exactly but not the unit matrix
     noise: Matrix | None = None
+    #: share of the rows, whitened by `noise`, that count as independent in chi-square
+    independent: float = 1.0
     #: directions of the rows in which residuals cannot lie: scale and phase of a shape
     lost: int = 0
     #: the measured value in units of each row
@@ -97,6 +99,14 @@ class Bound(ABC):
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
         """Return the derivatives (m, q) of `values` with respect to the q parameters."""
+
+    def noise_times(self, columns: FloatArray) -> FloatArray:
+        """Return ``N columns`` with the best known covariance N of the rows."""
+        return columns if self.noise is None else np.asarray(self.noise @ columns)
+
+    def misfit(self, rows: FloatArray) -> float:
+        """Return chi-square of rows that are whitened by `noise`."""
+        return float(rows @ rows)
 
     def kinds(self) -> list[Kind]:
         """Return the kinds of model error that are assumed when noise does not explain the rows.

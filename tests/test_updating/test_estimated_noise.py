@@ -1,0 +1,69 @@
+"""Updates from few averaged runs: estimated variances and correlated outputs are taken as such."""
+
+import numpy as np
+import pytest
+import scipy.stats as stats
+
+import noisy_plate
+from flexplant.identification import average_frfs
+from flexplant.lti import Frf
+from flexplant.updating import AddedDamping, AddedMass, FrfResidual, update
+from flexplant.updating.family import Family
+
+FREQ = np.linspace(420, 480, 40)
+
+
+@pytest.fixture
+def campaign(monkeypatch):
+    monkeypatch.setattr(noisy_plate, "FREQ", FREQ)
+    return noisy_plate.Campaign()
+
+
+def averaged(campaign, rng, runs, alike):
+    """Return the mean of runs with errors of which a part `alike` is common to both outputs."""
+    root = np.linalg.cholesky(np.array([[1.0, alike], [alike, 1.0]]))
+    found = []
+    for _ in range(runs):
+        e = rng.normal(size=campaign.H.shape) + 1j * rng.normal(size=campaign.H.shape)
+        e = np.einsum("ab,bif->aif", root, e) * np.sqrt(campaign.variance / 2 * runs)
+        found.append(Frf(FREQ, campaign.H + e, inputs=campaign.inputs, outputs=campaign.outputs))
+    return average_frfs(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("runs", "alike", "magnitude"), [(8, 0.8, False), (6, 0.0, True)])
+def test_chance_and_deviation_with_few_runs(campaign, runs, alike, magnitude):
+    """Forty measurements: p-values are uniform, and errors are as large as their deviations."""
+    rng = np.random.default_rng(3)
+    parameters = [AddedMass(campaign.at), AddedDamping(campaign.at)]
+    scores, chances = [], []
+    for _ in range(40):
+        data = FrfResidual(averaged(campaign, rng, runs, alike), magnitude=magnitude)
+        fit = update(campaign.rom, parameters, [data], start=[0.4, 0.0], starts=1)
+        scores.append((fit.values[0] - 0.5) / fit.std[0])
+        chances.append(fit.p_value)
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.3)
+    assert stats.kstest(chances, "uniform").pvalue > 1e-3
+    assert min(chances) > 1e-4
+
+
+@pytest.mark.parametrize("magnitude", [False, True])
+def test_covariance_of_correlated_outputs(campaign, magnitude):
+    """N has the correlation of outputs and lines: the dense matrix, made entry by entry."""
+    frf = averaged(campaign, np.random.default_rng(1), 12, 0.6)
+    frf = frf.replace(window="hann", resolution=FREQ[1] - FREQ[0])
+    bound = FrfResidual(frf, magnitude=magnitude).bound(Family(campaign.rom, []))
+    n, R = FREQ.size, frf.line_correlation().toarray()
+    values, vectors = np.linalg.eigh(np.moveaxis(frf.correlation, 2, 0))
+    root = vectors @ (np.sqrt(values)[:, :, None] * vectors.conj().transpose(0, 2, 1))
+    C = np.zeros((n, 2, n, 2), complex)
+    for a in range(n):
+        for b in range(n):
+            C[a, :, b] = R[a, b] * root[a] @ root[b]
+    if magnitude:
+        turn = (frf.data / np.abs(frf.data))[:, 0].T
+        C = np.einsum("ao,aobp,bp->aobp", turn.conj(), C, turn)
+    C = C.reshape(2 * n, 2 * n)
+    N = C.real if magnitude else np.block([[C.real, -C.imag], [C.imag, C.real]])
+    np.testing.assert_allclose(bound.noise_times(np.eye(len(N))), N, atol=1e-9)
+    np.testing.assert_allclose(np.diag(N), 1.0, atol=1e-9)
