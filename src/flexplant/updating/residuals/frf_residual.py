@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.special import ndtri, stdtr
 
 from ...arrays import ComplexArray, FloatArray, divisor, positive, spread_array
 from ...errors import ModelError, counted, require_known, short, warn
@@ -237,6 +236,8 @@ class _BoundFrf(Bound):
             return super().misfit(rows)
         # rows are divided by the deviation that is larger by the root of nu / (nu - 1)
         if self.magnitude:
+            from scipy.special import ndtri, stdtr  # slow import
+
             t = np.abs(rows) * np.sqrt(nu / (nu - 1))
             return float(np.sum(ndtri(stdtr(2 * nu, -t)) ** 2))
         x = np.sum(rows.reshape(2, -1) ** 2, axis=0) / 2 / (nu - 1)
