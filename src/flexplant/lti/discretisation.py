@@ -100,9 +100,9 @@ def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
 
     # n states, p outputs, m inputs; the preparation is shared by a number of samples
     def cost(size: int) -> float:
-        prepare = 2 * size * n * n * (m + p) + 4 * np.log2(size) * n**3
+        prepare = 2 * size * n * n * (m + p) + 2 * np.log2(size) * n**3 + size**2 * n * p * m
         step = (2 * ONE_VECTOR * n * n + CALL) / size
-        return float(step + 2 * n * (m + p) + 2 * size * p * m + prepare / max(samples, 1))
+        return float(step + 2 * n * (m + p) + (size + 1) * p * m + prepare / max(samples, 1))
 
     size = min(_SIZES, key=cost)
     return size, cost(size)
@@ -151,54 +151,46 @@ class Recursion(NamedTuple):
         return cheapest(self.F.shape[0], p, m, samples)[0]
 
     def in_blocks(self, size: int) -> Blocks:
-        """Return the matrices of a block of a number of samples."""
-        # out = O x + T v and x[k+b] = F^b x[k] + R v: observability, reachability, Toeplitz of
-        # Markov
-        b, n, (p, m) = size, self.F.shape[0], self.J.shape
-        see, enter = np.empty((b, p, n)), np.empty((b, n, m))
-        see[0], enter[b - 1] = self.H, self.G
-        power, done = self.F, 1
-        while done < b:  # twice the number in each step, by one product each
-            more = min(done, b - done)
-            see[done : done + more] = see[:more] @ power
-            enter[b - done - more : b - done] = power @ enter[b - more :]
-            done += more
-            power = power @ power if done < b else power
-        T = np.zeros((b, p, b, m))
-        late = self.H @ enter  # the Markov parameters, the oldest first
-        for i in range(b):
-            T[i, :, i] = self.J
-            T[i, :, :i] = np.moveaxis(late[b - i :], 0, 1)
-        return Blocks(
-            np.linalg.matrix_power(self.F, b),
-            np.ascontiguousarray(np.moveaxis(enter, 1, 2).reshape(b * m, n)),
-            np.ascontiguousarray(see.reshape(b * p, n).T),
-            np.ascontiguousarray(T.reshape(b * p, b * m).T),
-            b,
-        )
+        """Return the matrices of a block of a number of samples, a power of two."""
+        # with rows: x+ = x F' + v G'. what the first half of a block does to the second passes
+        # through the state between them
+        step, enter, see = (np.ascontiguousarray(part.T) for part in (self.F, self.G, self.H))
+        direct, done = [np.ascontiguousarray(self.J.T)], 1
+        while done < size:
+            direct.append(enter @ see)
+            enter, see = np.vstack([enter @ step, enter]), np.hstack([see, step @ see])
+            step, done = step @ step, 2 * done
+        return Blocks(step, enter, see, direct, size)
 
 
 class Blocks(NamedTuple):
-    """``x[k+b] = step x[k] + v enter``, ``out = x see + v direct``, rows v and out of b samples."""
+    """``x[k+b] = x[k] step + v enter``, ``out = x see + v direct``, rows v and out of b samples.
+
+    `direct` of a sample acts on itself, and then of 1, 2, 4, ... samples on as many that follow.
+    """
 
     step: FloatArray
     enter: FloatArray
     see: FloatArray
-    direct: FloatArray
+    direct: list[FloatArray]
     size: int
 
     def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state."""
-        # N is a whole number of blocks. everything except `step x` is a product of two matrices
+        # N is a whole number of blocks. everything except `x step` is a product of two matrices
         count = v.shape[0] // self.size
-        inputs = np.ascontiguousarray(v).reshape(count, -1)
+        v = np.ascontiguousarray(v)
         states = np.empty((count + 1, x.size))
         states[0] = x
-        np.matmul(inputs, self.enter, out=states[1:])
+        np.matmul(v.reshape(count, -1), self.enter, out=states[1:])
         moved = np.empty(x.size)
         for now, following in pairwise(states):
-            np.dot(self.step, now, out=moved)
+            np.dot(now, self.step, out=moved)
             following += moved
-        out = inputs @ self.direct
-        out += states[:-1] @ self.see
-        return out.reshape(count * self.size, -1), states[-1]
+        out = v @ self.direct[0]
+        for k, later in enumerate(self.direct[1:], 1):
+            first, second = ((len(v) >> k, 2, size) for size in later.shape)
+            out.reshape(second)[:, 1] += v.reshape(first)[:, 0] @ later
+        by_block = out.reshape(count, -1)
+        by_block += states[:-1] @ self.see
+        return out, states[-1]

@@ -68,11 +68,11 @@ class Response(Value, Mapping[str, FloatArray]):
     def __post_init__(self) -> None:
         names = name_list(self.names, "channels")
         check_names(names, "channels")
-        time = real_array(self.time, "time", (None,))
+        time = real_array(self.time, "time", (None,), copy=False)
         steps = np.diff(time)
         if steps.size and (steps.min() <= 0 or np.ptp(steps) > TYPED * steps.mean()):
             raise ModelError("time must increase in equal steps: moving windows count samples.")
-        data = real_array(self.data, "data", limit=np.inf)
+        data = real_array(self.data, "data", limit=np.inf, copy=False)
         if data.ndim not in (2, 3) or data.shape[-2:] != (len(names), time.size):
             raise ShapeError(
                 f"data of {len(names)} channels at {time.size} times must have shape "

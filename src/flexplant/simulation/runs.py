@@ -425,12 +425,14 @@ class InBlocks:
         self.v = np.empty((self.stretch, self.inputs))
 
     @cached_property
-    def blocks(self) -> Blocks:
-        """The matrices of a block."""
+    def blocks(self) -> tuple[Blocks, IntArray]:
+        """The matrices of a block, equal outputs once, and which of them each output is."""
         system = lifted_loop(
             self.loop, self.noise.factor, self.columns, self.hold, self.moving is not None
         )
-        return system.in_blocks(self.size)
+        rows, shown = np.unique(np.hstack([system.H, system.J]), axis=0, return_inverse=True)
+        H, J = np.split(rows, [len(system.F)], axis=1)
+        return system._replace(H=H, J=J).in_blocks(self.size), shown.ravel()
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put the run at a state of plant and controller; it draws from its generator."""
@@ -452,8 +454,9 @@ class InBlocks:
 
     def _run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the outputs of single samples, and the last state."""
-        out, x = self.blocks.run(v.reshape(len(v) // self.hold, -1), x)
-        return out.reshape(-1, self.outputs), x
+        blocks, shown = self.blocks
+        out, x = blocks.run(v.reshape(len(v) // self.hold, -1), x)
+        return np.take(out, shown, axis=1).reshape(-1, self.outputs), x
 
     def _move(self, moving: Moving, out: FloatArray) -> None:
         """Put what POIs along their paths do into out (k, channels, then states)."""

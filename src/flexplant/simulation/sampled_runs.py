@@ -180,7 +180,8 @@ def simulate(
     generators = _generators(seed, numbers)
     grows = _warn_unstable(closed, -(-steps // finer))
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
-    data = np.zeros((len(numbers), len(shown), steps))
+    record = np.zeros((*([] if runs is None else [len(numbers)]), len(shown), steps))
+    data = record.reshape(len(numbers), len(shown), steps)
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
     with one_thread(), overflow:
@@ -213,7 +214,8 @@ def simulate(
                         )
                     bar.advance()
     drawn = seed_of(seed) if white.factor.size or white.columns.size else None
-    run = Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
+    record.flags.writeable = False  # a value keeps such an array, and copies others
+    run = Response(time, record, shown, loop.units, drawn)
     if not positions and not grows and np.any(given):
         warn_of_opposing_forces(loop, run)
     return run
