@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.testbeds.ritz import ritz_block
+from flexplant.testbeds.virtual_blocks import ritz_block
 from oracles_mindlin import mindlin_frequencies
 from oracles_structure import plate_matrices
 from plates import PLATE

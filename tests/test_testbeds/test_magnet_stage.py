@@ -9,8 +9,7 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.plant import suspend
-from flexplant.testbeds.ritz import ritz_block
-from flexplant.testbeds.virtual_stages import BLOCK, PULL
+from flexplant.testbeds.virtual_blocks import BLOCK, PULL, ritz_block
 
 RATE = 10e3
 AXES = ("x", "y", "z", "rx", "ry", "rz")
