@@ -327,9 +327,10 @@ class Moments:
         self.n_out, self.n_in = data.shape[:2]
         R = squares @ powers
         weighted = squares[:, None, :] * data
-        S = -weighted @ powers
-        T = np.einsum("oif,ojf->ijf", data.conj(), weighted) @ powers
         n, m = order + 1, self.n_in
+        S = -(weighted.reshape(self.n_out * m, -1) @ powers).reshape(self.n_out, m, -1)
+        pairs = np.einsum("oif,ojf->ijf", data.conj(), weighted)
+        T = (pairs.reshape(m * m, -1) @ powers).reshape(m, m, -1)
         toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + order
         #: moments of A; column: coefficient r of A, channel i
         self.big = T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
@@ -344,7 +345,7 @@ class Moments:
     def _powers(self, freq: FloatArray, order: int) -> ComplexArray:
         """Return the powers (n_freq, order + 1) of z at frequencies [Hz]."""
         turn = (2 * np.pi * freq - self.centre) * self.step
-        return np.asarray(np.exp(1j * turn[:, None] * np.arange(order + 1)))
+        return np.vander(np.exp(1j * turn), order + 1, increasing=True)
 
     def solve(
         self, orders: Sequence[int], wanted: Callable[[ComplexArray], BoolArray]
@@ -514,8 +515,7 @@ def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
 
 def _last_low(ready: PreparedLines, last: int) -> int:
     """Return the number of lines far below the last one, zero where no line is near zero."""
-    spacing = float(np.median(np.diff(ready.freq)))
-    if ready.freq[0] > NEAREST * spacing:
+    if ready.freq[0] > NEAREST * ready.spacing:
         return 0
     return int(np.searchsorted(ready.freq, ready.freq[last - 1] / WIDEST))
 

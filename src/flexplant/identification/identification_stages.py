@@ -180,7 +180,7 @@ def _rejection(lines: Lines, pole: complex) -> str | None:
     """Return the reason why a pole of the fit is not reported, None where it is reported."""
     freq, width = abs(pole) / (2 * np.pi), -2.0 * pole.real / (2 * np.pi)
     low, high = float(lines.freq[0]), float(lines.freq[-1])
-    spacing = float(np.median(np.diff(lines.freq)))
+    spacing = lines.spacing
     if not low <= freq <= high:
         return "outside the band"
     if min(freq - low, high - freq) < max(spacing, width / 2):
@@ -435,7 +435,7 @@ def _answered(
         uneven,
     )
     if begin.at_peaks:
-        half = np.maximum(-found.poles.real, np.pi * float(np.median(np.diff(lines.freq))))
+        half = np.maximum(-found.poles.real, np.pi * lines.spacing)
         found = found.replace(covariance=np.diag(np.tile(half, 2) ** 2))
     return found
 
@@ -468,7 +468,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 
     Where the phase rises through a resonance (a transient, a record of one run), no pole is stable.
     """
-    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
+    spacing = 2 * np.pi * lines.spacing
     none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
     fit = PoleFit(lines, none[0], none)
     ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,11 @@ class PreparedLines:
     swapped: bool
     line_correlation: sp.csr_array | None = None  # of errors of different lines
     mains: tuple[Rejected, ...] = ()  # mains whose lines are left out
+
+    @cached_property
+    def spacing(self) -> float:
+        """Usual distance [Hz] of neighbouring lines."""
+        return float(np.median(np.diff(self.freq)))
 
     @property
     def side(self) -> str:
@@ -105,10 +111,11 @@ class PreparedLines:
         # at sharp peaks the residual of such a fit exceeds the noise; the median ignores them
         import scipy.ndimage as ndi
 
-        # row by row: SciPy is five times as fast with one axis
-        rows = power.reshape(-1, power.shape[2])
-        median = np.array([ndi.median_filter(row, STRETCH, mode="nearest") for row in rows])
-        return self._weighted(median.reshape(power.shape) / np.log(2.0), fitted_share)
+        # all rows as one: SciPy is five times as fast with one axis
+        beyond = STRETCH // 2
+        rows = np.pad(power, ((0, 0), (0, 0), (beyond, beyond)), mode="edge")
+        median = ndi.median_filter(rows.ravel(), STRETCH).reshape(rows.shape)
+        return self._weighted(median[..., beyond:-beyond] / np.log(2.0), fitted_share)
 
     def from_residuals(self, error: ComplexArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from the residual of a fit, averaged over lines."""
@@ -180,8 +187,7 @@ def mains_multiple(freq: float, spacing: float) -> str | None:
 
 def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
     """Return the same without lines at which some responses contain mains, spread by windows."""
-    freq, keep = ready.freq, np.ones(ready.freq.size, dtype=bool)
-    spacing = float(np.median(np.diff(freq)))
+    freq, spacing, keep = ready.freq, ready.spacing, np.ones(ready.freq.size, dtype=bool)
     at = {
         int(np.argmin(np.abs(freq - n * f))) for f in MAINS for n in range(1, int(freq[-1] / f) + 2)
     }

@@ -72,8 +72,7 @@ def coherence(fit: PoleFit, pole: complex) -> float:
     # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over
     # neighbouring lines: misfit that is smooth over some of them counts as one error
     lines = fit.lines
-    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
-    reach = max(NEAR * spacing, WIDE * abs(pole.real))
+    reach = max(NEAR * 2 * np.pi * lines.spacing, WIDE * abs(pole.real))
     near = np.abs(2 * np.pi * lines.freq - pole.imag) <= reach
     error = (lines.data - fit.model)[..., near] * lines.weight[..., near]
     power = float(np.sum(np.abs(error) ** 2))
@@ -275,8 +274,7 @@ def supported(
 
 def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int], k: int) -> bool:
     """Return whether a pole narrower than the lines are apart is seen at more than two of them."""
-    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
-    if -poles[k].real > spacing:
+    if -poles[k].real > 2 * np.pi * lines.spacing:
         return True
     rest = [other for other in kept if other != k]
     less, more = (PoleFit(lines, poles[some], part[:, some]).model for some in (rest, kept))

@@ -79,6 +79,11 @@ class Lines:
     side: str = "outputs"
     setups: tuple[IntArray, ...] = ()
 
+    @cached_property
+    def spacing(self) -> float:
+        """Usual distance [Hz] of neighbouring lines."""
+        return float(np.median(np.diff(self.freq)))
+
     @property
     def parts(self) -> tuple[IntArray, ...]:
         """Groups of rows that may have separate poles: the rows of a set-up, otherwise each row."""
@@ -416,10 +421,10 @@ class PoleFit:
         left = _real_and_imag((self.lines.data - modal) * self.lines.weight)
         return np.array(
             [
-                [np.linalg.lstsq(R, Q.T @ row)[0] for Q, R, row in zip(Qs, Rs, rows, strict=True)]
-                for (Qs, Rs), rows in zip(self.lines.smooth_bases, left, strict=True)
+                np.linalg.pinv(R) @ (Q.swapaxes(1, 2) @ rows[..., None])
+                for (Q, R), rows in zip(self.lines.smooth_bases, left, strict=True)
             ]
-        )
+        )[..., 0]
 
     @cached_property
     def model(self) -> ComplexArray:
@@ -488,38 +493,41 @@ class PoleFit:
         # itself is formed where the difference would lose more digits than the least damping of a
         # step allows
         n_in, lines, m = self.participation.shape[0], self.lines, self.m
-        count, (n_out, size) = 2 * self.participation.size, (len(self.bases), len(self._rows))
+        count, (size, width) = 2 * self.participation.size, self._rows.shape
         lines.work.add(lines.data.size * count**2)
-        rows, terms = np.empty(self._rows.shape), lines.lower + lines.upper
-        squares = np.empty((n_out, n_in, size, size))
-        right = np.empty((n_out, n_in, size, terms + 2 * m + 1))
-        for o, (Q, error) in enumerate(self.bases):
-            columns = Q.reshape(n_in, -1, 2 * m), error.reshape(n_in, -1, 1)
-            parts = zip(lines.twice[o], lines.smooth_bases[o][0], *columns, strict=True)
-            for i, (w, *others) in enumerate(parts):
+        rows, terms = np.empty((size, width)), lines.lower + lines.upper
+        # the same memory for all outputs: new memory takes longer than its products
+        known = np.empty((n_in, terms + 1, width))
+        squares, right = np.empty((n_in, size, size)), np.empty((n_in, size, terms + 1 + 2 * m))
+        taken = np.zeros((len(self.bases), 2 * m, count))
+        N, g = np.zeros((count, count)), np.zeros(count)
+        parts = zip(self.bases, lines.twice, lines.smooth_bases, self.shapes, taken, strict=True)
+        for o, ((Q, error), weights, (smooth, _), shapes, mean) in enumerate(parts):
+            np.multiply(smooth.swapaxes(1, 2), weights[:, None], out=known[:, :-1])
+            np.multiply(error.reshape(weights.shape), weights, out=known[:, -1])
+            products = self._rows @ known.reshape(-1, width).T
+            right[:, :, : terms + 1] = products.reshape(size, n_in, -1).swapaxes(0, 1)
+            for i, (w, own) in enumerate(zip(weights, Q.reshape(n_in, -1, 2 * m), strict=True)):
                 np.multiply(self._rows, w, out=rows)
-                np.matmul(rows, rows.T, out=squares[o, i])
-                np.concatenate([rows @ one for one in others], axis=1, out=right[o, i])
-        shapes = self.shapes[:, None, :]
-        half = self._combined(squares, shapes).swapaxes(2, 3)
-        whole, own = self._combined(half, shapes), self._combined(right, shapes)
-        off = own[..., :terms]
-        free = whole - off @ off.swapaxes(2, 3)
-        length, left = np.zeros((2, n_out, count))
-        taken, N, g = np.zeros((n_out, 2 * m, count)), np.zeros((count, count)), np.zeros(count)
-        for i, (mine, at) in enumerate(self._places):
-            length[:, at] += whole[:, i, mine, mine]
-            left[:, at] += free[:, i, mine, mine]
-            taken[:, :, at] += own[:, i, mine, terms:-1].swapaxes(1, 2)
-            g[at] += np.sum(own[:, i, mine, -1], axis=0)
-        close = np.any(left - np.sum(taken**2, axis=1) < OWN_SQUARE * length, axis=1)
-        for i, (mine, at) in enumerate(self._places):
-            N[at[:, None], at] += np.sum(free[~close, i], axis=0)[mine[:, None], mine]
-        flat = taken[~close].reshape(-1, count)
-        N -= flat.T @ flat
-        for o in np.flatnonzero(close).tolist():
-            J = self._jacobian(o)
-            N += J.T @ J
+                np.matmul(rows, rows.T, out=squares[i])
+                np.matmul(rows, own, out=right[i, :, terms + 1 :])
+            half = self._combined(squares, shapes).swapaxes(1, 2)
+            whole, seen = self._combined(half, shapes), self._combined(right, shapes)
+            off = seen[..., :terms]
+            free = whole - off @ off.swapaxes(1, 2)
+            length, left = np.zeros((2, count))
+            for i, (mine, at) in enumerate(self._places):
+                length[at] += whole[i, mine, mine]
+                left[at] += free[i, mine, mine]
+                mean[:, at] += seen[i, mine, terms + 1 :].T
+                g[at] += seen[i, mine, terms]
+            if np.any(left - np.sum(mean**2, axis=0) < OWN_SQUARE * length):
+                J = self._jacobian(o)
+                N += J.T @ J
+                continue
+            for i, (mine, at) in enumerate(self._places):
+                N[at[:, None], at] += free[i][mine[:, None], mine]
+            N -= mean.T @ mean
         return N, g, taken
 
     def jacobians(self) -> Iterator[ComplexArray]:
@@ -582,4 +590,9 @@ def _turned(rows: FloatArray, residues: ComplexArray) -> FloatArray:
     m = residues.shape[-1]
     first, second = rows[..., :m, :], rows[..., m:, :]
     real, imag = residues.real[..., None], residues.imag[..., None]
-    return np.concatenate([real * first + imag * second, real * second - imag * first], axis=-2)
+    turned = np.empty(np.broadcast_shapes(rows.shape, (*residues.shape[:-1], 1, 1)))
+    np.multiply(real, first, out=turned[..., :m, :])
+    np.multiply(real, second, out=turned[..., m:, :])
+    turned[..., :m, :] += imag * second
+    turned[..., m:, :] -= imag * first
+    return turned

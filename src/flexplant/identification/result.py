@@ -125,9 +125,10 @@ def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, Comple
     for k in range(m):
         slope = slopes[:, :, k]
         S = np.einsum("oap,pq,ebq->oaeb", slope, common, slope, optimize=True)
-        cross = np.einsum("oap,epb->oaeb", slope, mixed[..., k])
-        S[:, :, :n_out] += cross
-        S[:n_out] += cross.transpose(2, 3, 0, 1)
+        if not ready.independent:
+            cross = np.einsum("oap,epb->oaeb", slope, mixed[..., k])
+            S[:, :, :n_out] += cross
+            S[:n_out] += cross.transpose(2, 3, 0, 1)
         S[:n_out, :, :n_out] += held[:, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     chosen = common[: 2 * m, : 2 * m]

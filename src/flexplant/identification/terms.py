@@ -142,19 +142,18 @@ def orthonormal(rows: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatA
     """Return R of columns, given as rows, its inverse and their lengths; `basis` becomes Q^T."""
     # by the triangle of their products, twice where columns are close: many times faster than `qr`,
     # and equally accurate where no column is nearly a combination of the others
+    if not len(rows):
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0)
     products = rows @ rows.T
     size = np.maximum(np.sqrt(products.diagonal()), TINY)
     now, scale, products = rows, size, products / size / size[:, None]
     whole = inverse = np.eye(len(rows))
     for _ in range(2):
-        try:
-            triangle = np.linalg.cholesky(products)
-        except la.LinAlgError:
+        triangle, fails = la.lapack.dpotrf(products, lower=1)
+        own = np.min(triangle.diagonal())
+        if fails or own < OWN_PART:
             break
-        own = np.min(triangle.diagonal(), initial=1.0)
-        if own < OWN_PART:
-            break
-        back = np.linalg.inv(triangle)
+        back = la.lapack.dtrtri(triangle, lower=1)[0]
         whole, inverse = whole @ triangle, back @ inverse
         if own > FAR_APART:
             np.matmul(back / scale, now, out=basis)
