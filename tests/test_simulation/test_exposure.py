@@ -90,11 +90,11 @@ def test_what_is_no_exposure():
         exposure_errors(run, exposures=[[0.05, 0.2]])
     with pytest.raises(ShapeError, match=r"shape \(k, 2\)"):
         exposure_errors(run, exposures=[0.0, 0.1])
-    with pytest.raises(ModelError, match="does not fit an exposure of 20 samples"):
+    with pytest.raises(ModelError, match="the shortest exposure has 20"):
         exposure_errors(run, window=0.05, exposures=[[0.0, 0.02]])
     with pytest.raises(ModelError, match="has no error of a POI"):
         exposure_errors(made(np.zeros((1, 100)), ["y1"]))
     with pytest.raises(LabelError, match="no channel"):
         exposure_errors(run, ["die:errror"])
-    with pytest.raises(ModelError, match="leaves nothing"):
+    with pytest.raises(ModelError, match="is too late"):
         settling_time(run, "die:error", ma=1.0, after=1.0)

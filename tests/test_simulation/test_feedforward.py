@@ -133,7 +133,7 @@ def test_gains_are_learnt_on_a_machine_that_the_model_does_not_describe(model):
     assert found.errors.argmin() >= 1
     with pytest.raises(ModelError, match="must return a Response with die:error"):
         learn_feedforward(start, lambda f: None, model, MOVE, duration=0.2)
-    with pytest.raises(LabelError, match="a term is one of"):
+    with pytest.raises(LabelError, match="no term 'crackle'"):
         learn_feedforward(start, trial, model, MOVE, duration=0.2, terms=["crackle"])
 
 

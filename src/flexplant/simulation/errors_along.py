@@ -154,7 +154,7 @@ def rms_along(
     steps = round(positive(duration, "duration") / plant.dt)
     time = np.asarray(np.arange(steps) * float(plant.dt), dtype=np.float64)
     machine = MovingMachine(loop, trajectory(plant, moving, time), noise=True, schedule=schedule)
-    P = _periodic(machine, steps) if flag(repeats, "repeats") else _standing(machine)
+    P = _periodic(machine, steps if flag(repeats, "repeats") else 1)
     rms = np.zeros((len(plant.z) + len(plant.y) + len(loop.controller.outputs), steps))
     for k, sample in enumerate(machine.each(steps)):
         A, G, C, D = machine.closed(k, sample)
@@ -164,25 +164,19 @@ def rms_along(
     return PathRms(time, rms, names, {n: u for n, u in loop.units.items() if n in names})
 
 
-def _standing(machine: MovingMachine) -> FloatArray:
-    """Return the stationary covariance of the loop at its present position."""
-    A, G, _, _ = machine.closed(0, next(machine.each(1)))
-    if np.abs(np.linalg.eigvals(A)).max(initial=0.0) >= 1.0:
-        raise AssumptionError(
-            "the loop is not stable where the trajectory begins: it has no variance there. Design "
-            "it for that position, or pass repeats=True if the machine only passes it."
-        )
-    return solve_stein(A, G @ G.T)
-
-
 def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
-    """Return the covariance at the beginning of a trajectory that repeats without end."""
+    """Return the covariance at the beginning of samples that repeat without end."""
     Phi = np.eye(machine.plant.system.n_states + machine.loop.controller.n_states)
     P = np.zeros_like(Phi)
     for k, sample in enumerate(machine.each(steps)):
         A, G, _, _ = machine.closed(k, sample)
         Phi, P = A @ Phi, A @ P @ A.T + G @ G.T
     radius = float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0))
+    if radius >= 1.0 and steps == 1:
+        raise AssumptionError(
+            "the loop is not stable where the trajectory begins: it has no variance there. Design "
+            "it for that position, or pass repeats=True if the machine only passes it."
+        )
     if radius >= 1.0:
         raise AssumptionError(
             f"the loop grows {radius:.3g} times in each repetition of the trajectory: it is not "

@@ -14,7 +14,15 @@ from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
 from ..store import Value
 from ..words import instance, name_list
-from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
+from .response import (
+    Numbers,
+    Response,
+    as_numbers,
+    first_sample,
+    moving_moments,
+    signal_unit,
+    window_samples,
+)
 from .sampled_runs import Signal, simulate
 
 #: fraction of the windows in the third column of the table: three standard deviations of a Gaussian
@@ -125,8 +133,9 @@ def exposure_errors(
         raise ModelError("the run has no error of a POI: name the channels, channels=['y1'].")
     parts = _exposure_slices(run, start, exposures)
     shortest = min(part.stop - part.start for part in parts)
-    where = f"an exposure of {shortest} samples of {run.dt:g} s"
-    count = shortest if window is None else _fitting(window, run.dt, shortest, where)
+    count = shortest
+    if window is not None:
+        count = window_samples(window, run.dt, shortest, "the shortest exposure")
     values = np.zeros((len(names), 4))
     for i, name in enumerate(names):
         both = [_window_moments(run[name][..., part], count, window is None) for part in parts]
@@ -186,7 +195,7 @@ def settling_time(
     limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")
     part = _exposure_slices(run, after, None)[0]
     most = part.stop - part.start
-    count = _fitting(window, run.dt, most, f"the {most} samples after {after:g} s")
+    count = window_samples(window, run.dt, most, f"the run after {after:g} s")
     average, deviation = _window_moments(run[channel][..., part], count, False)
     outside = (np.abs(average) > limit[0]) | (deviation > limit[1])
     late = outside.shape[-1] - np.argmax(outside[..., ::-1], axis=-1)
@@ -218,17 +227,6 @@ def _poi_of(channel: str) -> str:
     return place if axis in _AXES and place else channel.removesuffix(":error")
 
 
-def _fitting(window: float, dt: float, most: int, where: str) -> int:
-    """Return the number of samples of a window, up to a limit."""
-    count = round(positive(window, "window") / dt)
-    if not 1 <= count <= most:
-        raise ModelError(
-            f"a window of {count} samples does not fit {where}: choose a shorter window, or a "
-            "longer run."
-        )
-    return count
-
-
 def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
     """Return the samples of each exposure."""
     if run.time.size < 2:
@@ -236,13 +234,7 @@ def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
             "the run has a single sample, which is too short for a window. Run it longer."
         )
     if exposures is None:
-        first = round((float(real_array(start, "start", ())) - float(run.time[0])) / run.dt)
-        if first >= run.time.size:
-            raise ModelError(
-                f"start={float(start):g} s leaves nothing: the response ends at "
-                f"{run.time[-1]:g} s. Choose an earlier start, or simulate for longer."
-            )
-        return [slice(max(first, 0), run.time.size)]
+        return [slice(first_sample(run, start), run.time.size)]
     windows = real_array(exposures, "exposures")
     if windows.ndim != 2 or windows.shape[1] != 2 or not windows.size:
         raise ShapeError(

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor, real_array, whole
-from ..errors import AssumptionError, LabelError, ModelError, counted, only_one, short, warn
+from ..errors import AssumptionError, ModelError, counted, only_one, require_known, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
 from ..loop.broken import error_sensitivity
@@ -126,7 +126,7 @@ class Feedforward(Value):
     def up_to(self, term: str) -> Feedforward:
         """Return the feedforward without derivatives above `term`, such as "acceleration"."""
         gains = self.gains.copy()
-        gains[:, :, _term_index(term) + 1 :] = 0.0
+        gains[:, :, term_numbers(term)[0] + 1 :] = 0.0
         return self.replace(gains=gains)
 
     def forces(self, move: SetPointProfile, time: npt.ArrayLike) -> dict[str, FloatArray]:
@@ -483,18 +483,13 @@ def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
     return np.asarray(np.linalg.solve(pencil, B.astype(np.complex128)))
 
 
-def _term_index(term: Any) -> int:
-    if not isinstance(term, str) or term not in TERMS:
-        raise LabelError(f"a term is one of {', '.join(TERMS)}, got {short(term)}. Choose one.")
-    return TERMS.index(term)
-
-
 def term_numbers(terms: Any) -> list[int]:
     """Return the orders of derivatives that are named."""
     listed = name_list(terms, "terms")
     if not listed:
         raise ModelError(f"terms names no derivative to feed forward. Choose from {list(TERMS)}.")
-    return [_term_index(term) for term in listed]
+    require_known("term", listed, TERMS)
+    return [TERMS.index(term) for term in listed]
 
 
 def _check_order(move: Any, highest: int) -> None:

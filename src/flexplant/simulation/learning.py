@@ -119,7 +119,13 @@ def learn_feedforward(
     >>> bool(found.errors[1] < 0.2 * found.errors[0])
     True
     """
-    _check_trial(start, loop, move)
+    if not isinstance(start, Feedforward) or len(start.gains) != 1:
+        raise ModelError(
+            f"need a Feedforward with one set of gains, got {short(start)}. Use "
+            "design_feedforward(plant)."
+        )
+    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
     orders = term_numbers(terms)
     part = positive(step, "step")
     if part > 1.0:
@@ -152,16 +158,6 @@ def learn_feedforward(
     return LearnedFeedforward(chosen, np.array(errors), np.array(gains))
 
 
-def _check_trial(start: object, loop: object, move: object) -> None:
-    if not isinstance(start, Feedforward) or len(start.gains) != 1:
-        raise ModelError(
-            f"need a Feedforward with one set of gains, got {short(start)}. Use "
-            "design_feedforward(plant)."
-        )
-    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-    instance(move, SetPointProfile, "move", "Use setpoint(...) or scan(...).")
-
-
 def _gain_effects(
     start: Feedforward,
     loop: ClosedLoop,
@@ -172,9 +168,7 @@ def _gain_effects(
 ) -> FloatArray:
     """Return the effect of a unit of each gain on the errors (n_gain, n_channel * n_time)."""
     plant = loop.machine.replace(evaluation=None)
-    forced = close_loop(
-        plant.replace(evaluation=None), *loop.blocks, known_forces(plant), idle=loop.idle
-    )
+    forced = close_loop(plant, *loop.blocks, known_forces(plant), idle=loop.idle)
     time = np.arange(round(positive(duration, "duration") / loop.machine.dt)) * loop.machine.dt
     signals = move.at(time)
     rows = []

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from ..arrays import FloatArray, between, divisor, positive, real_array
-from ..errors import ModelError, require_known, short, unknown_label
+from ..errors import ModelError, require_known, short
 from ..plant import StandardPlant
 from ..store import Value, checked
 from ..words import instance, why_not_called
@@ -286,7 +286,7 @@ class Acting:
     """
 
     def __init__(
-        self, names: Sequence[str], elements: Mapping[str, Any], dt: float, hold: int = 1
+        self, names: Sequence[str], elements: Mapping[str, list[Acts]], dt: float, hold: int = 1
     ) -> None:
         self.limit, self.change = np.full(len(names), np.inf), np.full(len(names), np.inf)
         self.below, step = np.full(len(names), -np.inf), np.zeros(len(names))
@@ -294,7 +294,7 @@ class Acting:
         self.others: list[tuple[int, Element]] = []
         for name, element in elements.items():
             i = names.index(name)
-            for one in _checked_elements(name, element):
+            for one in element:
                 if isinstance(one, Quantiser):
                     step[i] = one.step
                 elif isinstance(one, Jitter):
@@ -405,18 +405,17 @@ def _acted(act: Act, values: FloatArray) -> FloatArray:
 class Answering:
     """Forces that react to motions in every finer sample: the elements on channels of w."""
 
-    def __init__(self, plant: StandardPlant, elements: Mapping[str, Any], dt: float) -> None:
+    def __init__(self, plant: StandardPlant, elements: Mapping[str, list[Acts]], dt: float) -> None:
         self.dt, self.parts = dt, []
         for name, element in elements.items():
             i = plant.w.index(name)
-            for one in _checked_elements(name, element):
+            for one in element:
                 reads = getattr(one, "reads", None)
                 if not isinstance(one, Element) or reads is None:
                     raise ModelError(
                         f"{name!r} is a disturbance, but {short(one)} does not name the channel of "
                         "y to which it reacts as `reads`. Use simulation.Friction, or an element "
-                        "with "
-                        "`reads`; limits act on sensors and actuators."
+                        "with `reads`; limits act on sensors and actuators."
                     )
                 require_known("channel that an element reads", [reads], plant.y, "the plant's y")
                 if np.any(plant.D21[:, i]):
@@ -443,21 +442,18 @@ class Answering:
 
 def split_elements(
     elements: Any, plant: StandardPlant, driven: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+) -> list[dict[str, list[Acts]]]:
     """Return the elements on sensors, on actuators and on disturbances, by channel."""
     if elements is None:
-        return {}, {}, {}
+        return [{}, {}, {}]
     instance(
         elements, Mapping, "elements", "Name the channel: {'u1': simulation.Saturation(10.0)}."
     )
     forces = [name for name in plant.w if name not in plant.y and not name.endswith(":noise")]
     sides = (plant.y, list(driven), forces)
-    for name, element in elements.items():
-        if not any(name in side for side in sides):
-            raise unknown_label("channel for an element", name, [*plant.y, *driven, *forces])
-        _checked_elements(name, element)
-    on_y, on_u, on_w = ({n: e for n, e in elements.items() if n in side} for side in sides)
-    return on_y, on_u, on_w
+    require_known("channel for an element", elements, [*plant.y, *driven, *forces])
+    listed = {name: _checked_elements(name, element) for name, element in elements.items()}
+    return [{n: e for n, e in listed.items() if n in side} for side in sides]
 
 
 def _checked_elements(name: str, element: Any) -> list[Acts]:

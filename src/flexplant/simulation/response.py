@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ..arrays import FloatArray, IntArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, unknown_label
@@ -205,39 +204,44 @@ class Response(Value, Mapping[str, FloatArray]):
         Windows are centred at each sample. Those centred before `start` [s] are left out, because
         they cover the move and its settling. At the end of the record, windows are shortened.
         """
-        late = self._late(start)
+        first = first_sample(self, start)
         average, deviation = self._moments(channel, window)
-        return float(np.abs(average[..., late]).max()), float(deviation[..., late].max())
+        return float(np.abs(average[..., first:]).max()), float(deviation[..., first:].max())
 
     def _from(self, channel: str, start: float) -> FloatArray:
-        return self[channel][..., self._late(start)]
-
-    def _late(self, start: float) -> npt.NDArray[np.bool_]:
-        first = float(real_array(start, "start", ()))
-        # half a sample of slack: start=0.1 means the sample at 0.1 s, however that was rounded
-        keep = self.time >= first - 0.5 * self.dt
-        if not np.any(keep):
-            raise ModelError(
-                f"start={first:g} s is too late: the response ends at {self.time[-1]:g} s. "
-                "Choose an earlier start, or simulate for longer."
-            )
-        return keep
+        return self[channel][..., first_sample(self, start) :]
 
     def _moments(self, channel: str, window: float) -> tuple[FloatArray, FloatArray]:
         signal = self[channel]
         unit = signal_unit(signal)
-        mean, deviation = moving_moments(signal / unit, self._count(window))
+        count = window_samples(window, self.dt, self.time.size, "the response")
+        mean, deviation = moving_moments(signal / unit, count)
         return unit * mean, unit * deviation
 
-    def _count(self, window: float) -> int:
-        length = positive(window, "window")
-        count = round(length / self.dt) if self.dt else 0
-        if not 1 <= count <= self.time.size:
-            raise ModelError(
-                f"a window of {length:g} s is {count} samples of {self.dt:g} s, but the response "
-                f"has {self.time.size}: choose a window of 1 to {self.time.size} samples."
-            )
-        return count
+
+def first_sample(run: Response, start: float) -> int:
+    """Return the number of the first sample from a time [s] on."""
+    first = float(real_array(start, "start", ()))
+    # half a sample of slack: start=0.1 means the sample at 0.1 s, however that was rounded
+    found = int(np.searchsorted(run.time, first - 0.5 * run.dt))
+    if found == run.time.size:
+        raise ModelError(
+            f"start={first:g} s is too late: the response ends at {run.time[-1]:g} s. "
+            "Choose an earlier start, or simulate for longer."
+        )
+    return found
+
+
+def window_samples(window: float, dt: float, most: int, where: str) -> int:
+    """Return the number of samples of a window [s] in a part of a run that has `most` samples."""
+    length = positive(window, "window")
+    count = round(length / dt) if dt else 0
+    if not 1 <= count <= most:
+        raise ModelError(
+            f"a window of {length:g} s is {count} samples of {dt:g} s, but {where} has {most}: "
+            f"choose a window of 1 to {most} samples, or a longer run."
+        )
+    return count
 
 
 def as_numbers(values: FloatArray) -> Numbers:

@@ -162,8 +162,11 @@ def simulate(
             "positions move in runs without finer samples and without paths of single POIs: "
             "leave these out, or keep the machine at rest."
         )
+    on_y, on_u, on_w = split_elements(elements, plant, loop.driven)
     met = Conditions(
-        *split_elements(elements, plant, loop.driven),
+        on_y,
+        on_u,
+        on_w,
         None if anti_windup is None else positive(anti_windup, "anti_windup"),
         finer,
         _paths(plant, None if positions else moving, time),

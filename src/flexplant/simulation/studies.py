@@ -135,24 +135,19 @@ def study(
             seeds = list(
                 np.random.SeedSequence(entropy, spawn_key=tuple(spawned)).spawn(len(items))
             )
-        left = [i for i in range(len(items)) if i not in log.rows]
-        calls = {i: (pipeline, items[i], seeds[i]) for i in left}
+        calls = {i: (pipeline, item, seeds[i]) for i, item in enumerate(items) if i not in log.rows}
         bar.advance(len(log.rows), known=True)
-        for number, outcome in _outcomes(calls, executor):
+        outcomes: Iterator[tuple[int, Any]]
+        outcomes = ((number, _outcome(*call)) for number, call in calls.items())
+        if executor is not None:
+            outcomes = survived(_outcome, calls, executor)
+        for number, outcome in outcomes:
             log.add(number, _kept(outcome, number))
             bar.advance()
         return tabled([log.rows[i] for i in range(len(items))])
 
 
 _ADVICE = "Fewer machines or executor=ProcessPoolExecutor() help; checkpoint= keeps the rows."
-
-
-def _outcomes(
-    calls: Mapping[int, tuple[Any, ...]], executor: Executor | None
-) -> Iterator[tuple[int, Any]]:
-    if executor is not None:
-        return survived(_outcome, calls, executor)
-    return ((number, _outcome(*call)) for number, call in calls.items())
 
 
 def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome | ModelError:
