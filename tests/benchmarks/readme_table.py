@@ -200,6 +200,17 @@ def simulated():
     return f"100 000 samples of a loop, {g.n_states} states", "python-control", *spent
 
 
+def noisy():
+    """The same with the noises of amplifiers and sensors; rms values are compared."""
+    loop, count = simulation.stage_loop(), 100_000
+    ours, peer, *spent = race(
+        lambda: fx.simulate(loop, duration=count * loop.monitored.dt, rng=1),
+        simulation.noisy_peer(loop, count),
+    )
+    near(ours.rms("die:z"), np.std(peer.outputs[ours.names.index("die:z")]), 0.1)
+    return "the same with its white noises", "python-control", *spent
+
+
 def saturated():
     """The same with commands that saturate; the peer's equations as short as they can be."""
     loop = simulation.stage_loop()
@@ -233,7 +244,7 @@ def saturated():
     assert abs(ours["u1"]).max() == limit
     near(ours["y1"][:part], peer.outputs[plant.y.index("y1")], 1e-8)
     return (
-        "the same, commands saturated",
+        "the loop with saturated commands",
         f"python-control ({part} of them)",
         mine,
         theirs * count / part,
@@ -335,6 +346,7 @@ ROWS = (
     riccati,
     filtered,
     simulated,
+    noisy,
     saturated,
     designed_small,
     designed,

@@ -28,6 +28,27 @@ def stage_loop():
     return fx.close_loop(plant, fx.design_kalman(plant), fx.design_servo(plant, bandwidth=50.0))
 
 
+def noisy_peer(loop, count, reference=0.0):
+    """Return a run of a loop with its noises by python-control, as a function."""
+    import control
+
+    g, noise, random = loop.monitored, white_noise(loop.plant), np.random.default_rng(0)
+    white, w = noise.factor.shape[1], loop.plant.w
+    enter = np.vstack([noise.factor, np.zeros((g.n_states - len(noise.factor), white))])
+    loud = control.ss(g.A, np.hstack([g.B, enter]), g.C, np.hstack([g.D, 0 * g.C @ enter]), g.dt)
+    times = g.dt * np.arange(count)
+
+    def run():
+        given = random.standard_normal((len(w) + white, count))
+        given[: len(w)] = 0.0
+        given[w.index("die:ref")] = reference
+        single = random.standard_normal((noise.columns.size, count))
+        given[noise.columns] += noise.deviation[:, None] * single
+        return control.forced_response(loud, times, given)
+
+    return run
+
+
 @pytest.mark.benchmark
 def test_a_linear_loop():
     loop = stage_loop()
@@ -58,19 +79,12 @@ def test_a_linear_loop():
     control.forced_response(theirs, times[:9], given[:9].T)  # imports of its own
     answer, seconds = best(lambda: control.forced_response(theirs, times, given.T), 2)
     rows.append(("control.forced_response", seconds))
-    noise, random = white_noise(loop.plant), np.random.default_rng(0)
+    noise, random = Drawn(white_noise(loop.plant), loop.plant), np.random.default_rng(0)
     draws = noise.factor.shape[1] + noise.columns.size
     buffer = np.empty((COUNT // 100, draws))
     _, seconds = best(lambda: [random.standard_normal(out=buffer) for _ in range(100)])
     rows.append((f"its {draws} draws a sample alone", seconds))
-    enter = np.vstack([noise.factor, np.zeros((g.n_states - len(noise.factor), draws - 4))])
-    loud = control.ss(g.A, np.hstack([g.B, enter]), g.C, np.hstack([g.D, 0 * g.C @ enter]), g.dt)
-
-    def with_noise():
-        white = random.standard_normal((draws - 4, COUNT))
-        return control.forced_response(loud, times, np.vstack([given.T, white]))
-
-    _, seconds = best(with_noise, 1)
+    _, seconds = best(noisy_peer(loop, COUNT, 1e-6), 1)
     rows.append(("control.forced_response, with noise", seconds))
     (_, theirs, _), seconds = best(lambda: scipy.signal.dlsim((g.A, g.B, g.C, g.D, g.dt), given), 1)
     rows.append(("scipy.signal.dlsim", seconds))

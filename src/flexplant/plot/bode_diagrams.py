@@ -355,12 +355,9 @@ def _within_band(curve: Curve, band: tuple[float, float] | None) -> Curve:
             f"{curve.label!r} has no frequency from {low:g} to {high:g} Hz: it reaches from "
             f"{freq[0]:g} to {freq[-1]:g} Hz. Choose another band."
         )
-    whole = curve.response
-    data, units = whole.data[:, :, inside], whole.channel_units
-    measured = {
+    parts = {
         kind: values[:, :, inside]
-        for kind in ("coherence", "variance")
-        if (values := getattr(whole, kind)) is not None
+        for kind in ("data", "coherence", "variance")
+        if (values := getattr(curve.response, kind)) is not None
     }
-    shown = Frf(freq[inside], data, whole.inputs, whole.outputs, units=units, **measured)
-    return curve._replace(response=shown)
+    return curve._replace(response=curve.response.replace(freq=freq[inside], **parts))

@@ -20,7 +20,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from ..arrays import FloatArray, IntArray, divisor
 from ..modes import Modes
-from .node_lines import neighbours
+from .node_lines import neighbours, translations
 
 
 class Chapter(NamedTuple):
@@ -325,18 +325,14 @@ def _whole_thousandths(values: FloatArray) -> list[int]:
 
 def _translations(modes: Modes) -> tuple[FloatArray, FloatArray]:
     """Return the nodes (n, 3) that translate, and how they do in each mode (n, 3, modes)."""
-    dofs, count = modes.dofs, min(modes.n_modes, _MODES)
-    axis = {"x": 0, "y": 1, "z": 2}
-    rows = [i for i, direction in enumerate(dofs.directions) if direction in axis]
-    nodes = dofs.nodes[rows]
-    unique, first, place = np.unique(nodes, return_index=True, return_inverse=True)
-    shapes = np.zeros((unique.size, 3, count))
-    phi = np.asarray(modes.phi)[:, :count]
+    _, xyz, rows = translations(modes.dofs)
+    moves = np.any(rows >= 0, axis=1)
+    phi = np.asarray(modes.phi)[:, :_MODES]
+    count = phi.shape[1]
     if np.iscomplexobj(phi):  # nearly real shapes, turned so that they are
         largest = phi[np.argmax(np.abs(phi), axis=0), np.arange(count)]
         phi = (phi * np.exp(-1j * np.angle(largest))).real
-    shapes[place, [axis[dofs.directions[i]] for i in rows]] = phi[rows]
-    return dofs.xyz[rows][first], shapes
+    return xyz[moves], np.where(rows[moves, :, None] >= 0, phi[rows[moves]], 0.0)
 
 
 def _thinned(xyz: FloatArray) -> IntArray:

@@ -1,4 +1,4 @@
-"""Lines between nodes: those that a stiffness matrix or elements join, or those that are near."""
+"""Nodes that translate, and lines between nodes: those that elements join, or that are near."""
 
 from __future__ import annotations
 
@@ -9,10 +9,20 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
+from ..labels import DofSet
 from ..structure.model import FEModel
 
 #: neighbours of a node among which its lines are searched
 _NEIGHBOURS = 27
+
+
+def translations(dofs: DofSet) -> tuple[IntArray, FloatArray, IntArray]:
+    """Return the nodes, their places (n, 3), and the DOFs (n, 3) along x, y and z, -1 for none."""
+    nodes, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
+    rows = np.full((nodes.size, 3), -1, dtype=np.int64)
+    moves = dofs.kinds < 3
+    rows[node[moves], dofs.kinds[moves]] = np.flatnonzero(moves)
+    return nodes, np.asarray(dofs.xyz[first]), rows
 
 
 def joined_lines(joined: Any, nodes: IntArray) -> IntArray:

@@ -32,6 +32,7 @@ from ._axes import (
     axes,
     differ,
     finish,
+    kinds_of,
     legend_below,
     mark_devices,
     named,
@@ -92,12 +93,10 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
         style = {"facecolor": "white", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
         label = "no sensor possible" if i == 0 else None
         ax.add_patch(_patch(zone, factor, label=label, **style))
-    if ports is not None:
-        kinds: dict[str, Any] = {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
-        mark_devices(ax, factor, {
-            kind: [Device.of(one, np.array(one.at)) for one in listed if isinstance(one.at, tuple)]
-            for kind, listed in kinds.items()
-        })  # fmt: skip
+    mark_devices(ax, factor, {
+        kind: [Device.of(one, np.array(one.at)) for one in listed if isinstance(one.at, tuple)]
+        for kind, listed in kinds_of(ports).items()
+    })  # fmt: skip
     ax.plot(
         *(found.best[:2] / factor), "*", color=RED, markersize=14, label="best place", clip_on=False
     )
@@ -223,10 +222,11 @@ def placed(
         shape = shape / float(np.max(np.abs(shape[rows])))
         title = f"mode {mode}, {shapes.omega[mode - 1] / 2 / np.pi:.4g} Hz"
     where = candidate_places(plant, (*own.ports.y, *own.ports.u))
+    centres = [points.mean(axis=0)[None] for points in where.pois]
+    places = iter([*where.points, *centres])
     kinds = {
-        "sensors": _point_devices(own.ports.y, where.points),
-        "actuators": _point_devices(own.ports.u, where.points[len(own.ports.y) :]),
-        "POI": _point_devices(own.ports.z, [points.mean(axis=0)[None] for points in where.pois]),
+        kind: [Device.of(port, at) for port in listed for at in next(places)]
+        for kind, listed in kinds_of(own.ports).items()
     }
     height = dofs.xyz[rows, 2]
     middle = 0.5 * float(height.min() + height.max())
@@ -248,12 +248,6 @@ def placed(
     for panel, side in ((upper, "from above"), (lower, "lower half, from below")):
         panel.set_title(f"{title}, {side}" if title else side)
     return upper
-
-
-def _point_devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[Device]:
-    """Return the devices of ports, each of its points one."""
-    pairs = zip(ports, points, strict=False)
-    return [Device.of(port, point) for port, listed in pairs for point in listed]
 
 
 def _is_below(one: Device, middle: float, xyz: FloatArray) -> bool:

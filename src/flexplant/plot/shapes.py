@@ -30,12 +30,13 @@ from ._axes import (
     PURPLE,
     Device,
     axes,
+    kinds_of,
     legend_below,
     mark_devices,
     plan,
     solid_axes,
 )
-from .node_lines import joined_lines, neighbours
+from .node_lines import joined_lines, neighbours, translations
 
 _COLOURS = "viridis"
 #: number of triangles that are drawn quickly; those of a coarse mesh are divided for smooth colours
@@ -228,16 +229,12 @@ def surface_of(dofs: DofSet, joined: Any = None) -> Surface:
     """Return the surface of a structure, by Delaunay's triangulation of its nodes, or its lines."""
     # edges much longer than the distance between nodes are left out, so that holes and notches
     # wider than two elements stay open; their corners are filled by half an element
-    numbers, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
+    numbers, xyz, rows = translations(dofs)
     if numbers.size > MOST:
         raise ModelError(
             f"{numbers.size} nodes are more than a picture shows ({MOST}): reduce the model, or "
             "choose DOFs of its surface (dofs.where)."
         )
-    rows = np.full((numbers.size, 3), -1, dtype=np.int64)
-    moves = dofs.kinds < 3
-    rows[node[moves], dofs.kinds[moves]] = np.flatnonzero(moves)
-    xyz = np.asarray(dofs.xyz[first])
     no_faces = np.zeros((0, 3), dtype=np.int64)
     if joined is not None:
         return Surface(xyz, rows, no_faces, joined_lines(joined, numbers))
@@ -396,12 +393,9 @@ def layout(
 
 def _devices(dofs: DofSet, ports: Ports | None) -> dict[str, list[Device]]:
     """Return what is marked, by kind."""
-    if ports is None:
-        return {}
-    kinds: dict[str, Any] = {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
     return {
         kind: [Device.of(port, _point(dofs, port.at)) for port in listed]
-        for kind, listed in kinds.items()
+        for kind, listed in kinds_of(ports).items()
     }
 
 

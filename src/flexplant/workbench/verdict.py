@@ -75,10 +75,13 @@ class LoopLimits(Value):
                 met = None if stable is None else bool(stable and value >= wanted)
                 yield Judged(name, f"at least {wanted:.4g}{unit}", f"{value:.4g}{unit}", met)
 
+        def at_most(name: str, wanted: float, value: float) -> Judged:
+            met = None if stable is None else bool(stable and value <= wanted)
+            level = 20.0 * np.log10([wanted, max(value, TINY)])
+            return Judged(name, f"at most {level[0]:.3g} dB", f"{level[1]:.3g} dB", met)
+
         peak = 1.0 / margins.modulus_margin if margins.modulus_margin else np.inf
-        met = None if stable is None else bool(stable and peak <= self.peak)
-        decibel = 20.0 * np.log10([self.peak, peak])
-        yield Judged("peak of |S|", f"at most {decibel[0]:.3g} dB", f"{decibel[1]:.3g} dB", met)
+        yield at_most("peak of |S|", self.peak, peak)
         gain = min(margins.gain_margin, 1.0 / (margins.gain_reduction or TINY))
         yield from at_least("gain margin", self.gain_margin, gain, "")
         yield from at_least("phase margin", self.phase_margin, margins.phase_margin, " deg")
@@ -89,14 +92,7 @@ class LoopLimits(Value):
             yield Judged("|S| at low frequencies", f"at most {self.suppressed:.3g}", reached, None)
         elif self.suppressed is not None and self.below is not None:
             worst = float(np.abs(loop.S[low]).max(initial=0.0))
-            met = None if stable is None else bool(stable and worst <= self.suppressed)
-            level = 20.0 * np.log10([self.suppressed, max(worst, TINY)])
-            yield Judged(
-                f"|S| to {self.below:.4g} Hz",
-                f"at most {level[0]:.3g} dB",
-                f"{level[1]:.3g} dB",
-                met,
-            )
+            yield at_most(f"|S| to {self.below:.4g} Hz", self.suppressed, worst)
         if self.rms is not None:
             known = rms is not None and np.isfinite(rms)
             met = bool(rms <= self.rms) if rms is not None and known else None
