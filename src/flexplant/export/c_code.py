@@ -14,7 +14,7 @@ from ..errors import AssumptionError, LabelError, ModelError, require_known, sho
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import applied_law
 from ..lti.statespace import StateSpace, as_statespace
-from ..store import written
+from ..store import named_file, written
 from ..synthesis.aftercare.forms import back_gain, scheduled_form, two_state_form
 from ..tolerances import SAME
 from ..words import flag
@@ -107,7 +107,11 @@ def write_c(
     ...     sorted(os.listdir(folder))
     ['servo.c', 'servo.h']
     """
-    source = _source_path(path)
+    source = named_file(path)
+    if source.suffix != ".c":
+        raise ModelError(
+            f"path must end in .c, got {short(str(path))}. Pass a name such as 'stage.c'."
+        )
     prefix = c_name(source.stem if name is None else name)
     if source.stem != prefix:
         source = source.with_name(f"{prefix}.c")
@@ -120,20 +124,6 @@ def write_c(
         with written(file) as stream:
             stream.write(text.encode("ascii"))
     return source, header
-
-
-def _source_path(path: Any) -> Path:
-    try:
-        source = Path(path)
-    except TypeError as error:
-        raise ModelError(
-            f"path must be a file name, got {short(path)}. Pass one such as 'stage.c'."
-        ) from error
-    if source.suffix != ".c":
-        raise ModelError(
-            f"path must end in .c, got {short(str(path))}. Pass a name such as 'stage.c'."
-        )
-    return source
 
 
 def c_name(name: Any) -> str:

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LabelError, ModelError, warn
-from ..io.files import file_path
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
-from ..store import written
+from ..store import named_file, written
 from ..words import one_of
 from .c_code import c_name, c_program
 from .c_text import CText
@@ -393,7 +392,7 @@ def write_fmu(
     ...     sorted(name for name in zipfile.ZipFile(made).namelist() if name.endswith(".c"))
     ['sources/masses.c', 'sources/masses_fmi.c']
     """
-    target = file_path(path)
+    target = named_file(path)
     if target.suffix != ".fmu":
         raise ModelError(f"path must end in .fmu, got {str(target)!r}. Such as 'stage.fmu'.")
     one_of(version, "version", ("2.0", "3.0"))

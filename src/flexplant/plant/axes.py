@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive
+from ..arrays import ComplexArray, FloatArray, divisor, positive
 from ..errors import AssumptionError, LabelError, ModelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
@@ -268,7 +268,7 @@ def felt(
     """Return the gain (r, m) of channels to actuators on the real axis, rounding set to zero."""
     g = plant.system
     rows, columns = g.output_index(list(channels)), g.input_index(list(actuators))
-    states = _states(g, complex(sigma), columns).real
+    states = states_at(g, g.B[:, columns], complex(sigma)).real
     G = g.C[rows] @ states + g.D[np.ix_(rows, columns)]
     most = np.abs(g.C[rows]) @ np.abs(states)
     return np.asarray(np.where(np.abs(G) > TYPED * most, G, 0.0))
@@ -377,16 +377,16 @@ def complex_gain(
 ) -> ComplexArray:
     """Return the gain (p, m) at any s [rad/s], of a sampled system at z = exp(s dt)."""
     rows, columns = g.output_index(list(outputs)), g.input_index(list(inputs))
-    return np.asarray(g.C[rows] @ _states(g, s, columns) + g.D[np.ix_(rows, columns)])
+    return np.asarray(g.C[rows] @ states_at(g, g.B[:, columns], s) + g.D[np.ix_(rows, columns)])
 
 
-def _states(g: StateSpace, s: complex, columns: IntArray) -> ComplexArray:
-    """Return ``(z I - A)^-1 B`` of some inputs."""
+def states_at(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
+    """Return ``(z I - A)^-1 B`` at any s [rad/s], of a sampled system at z = exp(s dt)."""
     # next to z = 1, with the difference of both, no digit of a slow pole is lost
     shift = np.expm1(s * g.dt) if g.dt else s
     eye = np.eye(g.n_states)
     pencil = shift * eye - (g.A - eye if g.dt else g.A)
-    return np.asarray(np.linalg.solve(pencil, g.B[:, columns].astype(np.complex128)))
+    return np.asarray(np.linalg.solve(pencil, B.astype(np.complex128)))
 
 
 def elastic(plant: Partition) -> FloatArray:

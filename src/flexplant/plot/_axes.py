@@ -20,7 +20,6 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import FlexplantError, ModelError, short
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
-from ..plant import Ports
 from ..plant.port import place_directions
 from ..tolerances import TINY
 from ..words import in_unit
@@ -323,13 +322,6 @@ def port_directions(port: Any) -> tuple[str, ...]:
         return tuple(axes)
     own = getattr(port, "direction", None) or "".join(axes or ())
     return () if not own and at is None else place_directions(at, own)
-
-
-def kinds_of(ports: Ports | None) -> dict[str, Sequence[Any]]:
-    """Return the ports that views of a structure mark, by kind."""
-    if ports is None:
-        return {}
-    return {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
 
 
 class Device(NamedTuple):

@@ -32,13 +32,13 @@ from ._axes import (
     axes,
     differ,
     finish,
-    kinds_of,
     legend_below,
     mark_devices,
     named,
     panel_axes,
     plan,
 )
+from .shapes import kinds_of
 
 #: what a map of sensors shows
 _RATIO = "POI error with / without a further sensor [-],\nlower is better"

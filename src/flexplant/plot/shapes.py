@@ -30,7 +30,6 @@ from ._axes import (
     PURPLE,
     Device,
     axes,
-    kinds_of,
     legend_below,
     mark_devices,
     plan,
@@ -389,6 +388,13 @@ def layout(
     ax.margins(0.08)  # room for names at an edge
     legend_below(ax)
     return ax
+
+
+def kinds_of(ports: Ports | None) -> dict[str, Sequence[Any]]:
+    """Return the ports that views of a structure mark, by kind."""
+    if ports is None:
+        return {}
+    return {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
 
 
 def _devices(dofs: DofSet, ports: Ports | None) -> dict[str, list[Device]]:

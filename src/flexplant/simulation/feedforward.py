@@ -17,7 +17,7 @@ from ..loop.broken import error_sensitivity
 from ..loop.machine_figures import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
-from ..plant.axes import resting_frequency
+from ..plant.axes import resting_frequency, states_at
 from ..plant.inverse_zeros import SlowZeros, slow_zeros
 from ..plant.port import DERIVATIVES, TERMS
 from ..plant.rest_expansion import OfS, at_rest, solved
@@ -378,7 +378,7 @@ class _Tracking(NamedTuple):
             D[:, at] = (direct + by_u @ g.D[u]) @ acts
 
         def found(s: complex) -> ComplexArray:
-            both = C @ _states(g, g.B @ acts, s) + D
+            both = C @ states_at(g, g.B @ acts, s) + D
             led = both[..., r:] @ s ** np.array(orders)[:, None]
             return np.concatenate([both[..., :r], led], axis=-1)
 
@@ -474,13 +474,6 @@ def _least(
         real, imag = np.split(gains[0, :, orders.size :], 2, axis=1)
         zeros = zeros.replace(residues=real + 1j * imag)
     return gains[:, :, : orders.size], zeros
-
-
-def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
-    # next to z = 1 no digit of a slow pole is lost
-    shift, eye = (np.expm1(s * g.dt) if g.dt else s), np.eye(g.n_states)
-    pencil = shift * eye - (g.A - eye if g.dt else g.A)
-    return np.asarray(np.linalg.solve(pencil, B.astype(np.complex128)))
 
 
 def term_numbers(terms: Any) -> list[int]:

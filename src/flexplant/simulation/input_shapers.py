@@ -13,7 +13,7 @@ from ..arrays import FloatArray, between, positive, positive_array, real_array
 from ..errors import ModelError, counted
 from ..store import Value
 from ..words import one_of
-from .motion import SetPointProfile, setpoint
+from .motion import SetPointProfile, constant_snap, setpoint
 
 #: largest number of factors of a shaper; more would take too long
 _MOST = 6
@@ -93,7 +93,7 @@ class InputShaper(Value):
             edges=edges,
             lengths=2.0 * half,
             from_end=np.zeros(middle.size, dtype=bool),
-            states=_earlier(states, half),
+            states=constant_snap(states.T, -half).T,
             gridded=False,
             exposures=move.exposures + self.duration,
         )
@@ -104,22 +104,6 @@ class InputShaper(Value):
         order = np.argsort(times, kind="stable")
         sizes = (self.amplitudes[:, None] * other.amplitudes).ravel()
         return InputShaper(times[order], sizes[order])
-
-
-def _earlier(states: FloatArray, by: FloatArray) -> FloatArray:
-    """Return position to snap (m, 5) a time [s] earlier, the snap being constant."""
-    p, v, a, j, s = states.T
-    h = -by
-    return np.stack(
-        [
-            p + h * (v + h / 2 * (a + h / 3 * (j + h / 4 * s))),
-            v + h * (a + h / 2 * (j + h / 3 * s)),
-            a + h * (j + h / 2 * s),
-            j + h * s,
-            s,
-        ],
-        axis=1,
-    )
 
 
 def input_shaper(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ..arrays import FloatArray
@@ -99,7 +97,7 @@ def gantry(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
         y=[Sensor(f"{name}_encoder", at=place, asd=2e-10) for name, place in drives.items()],
         references=[Reference("tool_x"), Reference("tool_y"), Reference("skew")],
     )
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
@@ -161,7 +159,7 @@ def dual_stage(*, rate: float = 5e3, delay: float = 1.5) -> StandardPlant:
         ],
         references=[Reference("die"), Reference("gap")],
     )
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
@@ -216,7 +214,7 @@ def steering_mirror(*, rate: float = 20e3, delay: float = 1.0) -> StandardPlant:
         references=[Reference("mirror", axes=("rx", "ry"))],
     )
     model = lumped(bodies, springs, name="steering mirror")
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
@@ -269,7 +267,7 @@ def flexible_joint(*, rate: float = 2e3, delay: float = 2.0) -> StandardPlant:
         ],
         references=[Reference("tip")],
     )
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def isolation_table(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
@@ -387,7 +385,7 @@ def hexapod(*, rate: float = 5e3, delay: float = 1.0) -> StandardPlant:
         y=[Sensor(f"{name}_length", at=leg, asd=1e-11) for name, leg in legs.items()],
         references=[Reference(poi.name) for poi in pois],
     )
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
@@ -441,7 +439,7 @@ def ball_screw(*, rate: float = 4e3, delay: float = 1.0) -> StandardPlant:
         ],
         references=[Reference("part")],
     )
-    return _plant(model, ports, 0.01, rate, delay)
+    return _plant(model, ports, rate, delay)
 
 
 def maglev_block(*, rate: float = 10e3, delay: float = 1.0) -> StandardPlant:
@@ -477,7 +475,8 @@ def maglev_block(*, rate: float = 10e3, delay: float = 1.0) -> StandardPlant:
     block = solid_block(size=(side, side, height), elements=(4, 4, 1), density=2530.0,
                         youngs_modulus=90e9, poisson_ratio=0.24, name="maglev block")  # fmt: skip
     near, far = 0.1, 0.3
-    pushes = {f"up{i}": ((x, y, 0.0), "z") for i, (x, y) in enumerate(_square_of(near, far), 1)}
+    corners = [(x, y, 0.0) for x in (near, far) for y in (near, far)]
+    pushes = {f"up{i}": (at, "z") for i, at in enumerate(corners, 1)}
     pushes |= {
         "x1": ((near, 0.0, 0.0), "x"),
         "x2": ((near, side, 0.0), "x"),
@@ -505,11 +504,9 @@ def maglev_block(*, rate: float = 10e3, delay: float = 1.0) -> StandardPlant:
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def _plant(
-    model: FEModel, ports: Ports, damping: float, rate: float, delay: float
-) -> StandardPlant:
+def _plant(model: FEModel, ports: Ports, rate: float, delay: float) -> StandardPlant:
     """Return the sampled plant of all modes of a model."""
-    modes = solve_modes(model, count=model.n_dof, damping=ModalDamping(damping))
+    modes = solve_modes(model, count=model.n_dof, damping=ModalDamping(0.01))
     return assemble_plant(modes, ports).discretized(rate, delay=delay)
 
 
@@ -521,10 +518,6 @@ def _between(moving: str, fixed: str) -> dict[str, float]:
 def _square(freq: float) -> float:
     """Return omega^2 of a frequency [Hz]: stiffness per mass."""
     return float((2.0 * np.pi * freq) ** 2)
-
-
-def _square_of(near: float, far: float) -> Sequence[tuple[float, float]]:
-    return [(x, y) for x in (near, far) for y in (near, far)]
 
 
 def _carried(axis: str) -> dict[str, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray, below_half_rate, positive, whole
 from ..errors import ModelError, require_known
 from ..identification import MeasuredModes
-from ..identification.periodic import frf_of_periods, line_spectra, offsets
+from ..identification.periodic import frf_of_periods, line_spectra, multisine, offsets
 from ..loop import ClosedLoop, ScheduledLoop, close_loop
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace
@@ -127,15 +127,11 @@ class WaferStage(Value):
         """
         own = self._own_poles
         known = range(self._n_rigid + 1, self._n_rigid + own.size + 1)
-        found = []
-        listed = modes if several(modes) else [modes]
-        numbers = tuple(whole(mode, "mode") for mode in listed)
+        numbers = tuple(whole(mode, "mode") for mode in (modes if several(modes) else [modes]))
         require_known("elastic mode", numbers, known)
-        for mode in numbers:
-            pole = own[mode - 1 - self._n_rigid]
+        exact = np.array([own[mode - 1 - self._n_rigid] for mode in numbers], dtype=np.complex128)
+        for mode, pole in zip(numbers, exact, strict=True):
             below_half_rate(abs(pole) / (2.0 * np.pi), f"mode {mode}", self.rate)
-            found.append(pole)
-        exact = np.array(found, dtype=np.complex128)
         if not positive(deviation, "deviation", zero=True):
             return MeasuredModes(poles=exact, modes=numbers)
         size = deviation * np.abs(exact)
@@ -253,32 +249,26 @@ class WaferStage(Value):
         if not ports.u or not ports.y:
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
         random = generator(rng)
-        count, samples = len(ports.u), round(positive(period, "period") * self.rate)
-        if samples < 4:
-            raise ModelError(
-                f"a period of {samples} samples has no frequencies to measure at. Lengthen period."
-            )
-        whole(periods, "periods")
-        whole(discard, "discard", minimum=0)
+        count, duration = len(ports.u), whole(periods, "periods") * period
+        duration += whole(discard, "discard", minimum=0) * period
+        signal = multisine(
+            count, rate=self.rate, period=period, periods=periods + discard, rms=amplitude,
+            rng=random,
+        ).swapaxes(0, 1)  # fmt: skip
+        samples = signal.shape[-1] // (periods + discard)
         shakers = [
             Disturbance(f"{port.name}:excitation", at=port.at, direction=port.direction)
             for port in ports.u
         ]
         own = Ports(w=[*ports.w, *shakers], u=ports.u, z=[self._middle], y=ports.y)
         loop = close_loop(self._plant(own), *_holding(own, self))
-        lines = np.arange(1, samples // 2)
-        spectrum = np.exp(2j * np.pi * random.random(lines.size)) * np.sqrt(samples / 2.0)
-        turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
+        lines = np.arange(1, (samples + 1) // 2)
         near = offsets(periods)[0][:, None] / periods
         lag = np.exp(-2j * np.pi * (lines + near) * self.delay / samples)
-        waves = np.stack(
-            [_multisine(spectrum * turn[:, None], lines, samples) for turn in turns.T], axis=1
-        )
-        signal = np.tile(positive(amplitude, "amplitude") * waves, periods + discard)
         run = simulate(
             loop,
             disturbance=dict(zip((one.name for one in shakers), signal, strict=True)),
-            duration=(periods + discard) * samples / self.rate,
+            duration=duration,
             elements=self._steps(own),
             rng=random,
             runs=count,
@@ -325,11 +315,3 @@ def _of_a_rigid_body(plant: StandardPlant, motions: FloatArray) -> StateSpace:
     names = [port.name for port in read]
     gain = Z @ np.linalg.pinv(Y, rcond=SAME)
     return StateSpace([], [], [], gain, plant.dt, inputs=names, outputs=hats, name="static")
-
-
-def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:
-    """Return waves (n, samples) of unit rms with the given relative spectrum at the lines."""
-    full = np.zeros((spectrum.shape[0], samples // 2 + 1), dtype=np.complex128)
-    full[:, lines] = spectrum
-    waves = np.fft.irfft(full, samples)
-    return np.asarray(waves / np.sqrt(np.mean(waves**2, axis=1, keepdims=True)))
