@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 from ..arrays import FloatArray, positive, positive_array, whole
 from ..dof_columns import Interpolation
 from ..errors import LabelError, require_known
-from ..labels import DofSet
+from ..labels import DIRECTIONS, DofSet
 from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping, kirchhoff_plate
 from ..tolerances import SAME
@@ -156,37 +156,54 @@ def _with_masses(bare: FEModel, masses: Mapping[tuple[float, ...], float]) -> FE
 #: order in each direction: of the paper's plate the first twenty frequencies to 2e-6 and forty, to
 #: 7 kHz, to 1e-3; one of 15 takes twice as long in every loop
 ORDER = 13
-#: derivatives in (x, y) of the deflection and their sign: rx = dz/dy, ry = -dz/dx
-_MOTIONS = {"z": (0, 0, 1.0), "rx": (0, 1, 1.0), "ry": (1, 0, -1.0)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialShape(Interpolation):
-    """Lagrange's polynomials through a grid of nodes (n, n) in [-1, 1], x fastest."""
+    """Lagrange's polynomials through a grid of nodes, x fastest: z of a plate, x, y, z of a block.
 
-    size: tuple[float, float]
-    nodes: FloatArray
+    `size` [m] and `orders` have two entries for a plate, and three for a block.
+    """
+
+    size: tuple[float, ...]
+    orders: tuple[int, ...]
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n^2,) with which the deflections give a motion at a point."""
+        """Return the weights (n,) of all displacements in a motion at a point."""
         return np.asarray(self.rows(np.asarray(xyz)[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n^2) at many points (p, 3)."""
-        require_known("motion", [direction], _MOTIONS, "a plate in bending")
-        places = np.asarray(points)[:, :2] / self.size
-        off = np.any((places < -SAME) | (places > 1.0 + SAME), axis=1)
+        """Return the weights (p, n) at many points (p, 3); rotations are half the curl."""
+        bends = len(self.size) == 2
+        moved, known = ("z", ("z", "rx", "ry")) if bends else ("xyz", DIRECTIONS)
+        require_known("motion", [direction], known, "a plate in bending" if bends else "a solid")
+        places = np.asarray(points)[:, : len(self.size)]
+        off = np.any((places / self.size < -SAME) | (places / self.size > 1.0 + SAME), axis=1)
         if np.any(off):
             raise LabelError(
-                f"the point {tuple(np.asarray(points)[off][0].tolist())} is off the plate of "
-                f"{self.size} m. Choose one on it."
+                f"the point {tuple(np.asarray(points)[off][0].tolist())} is off the plate or block "
+                f"of {self.size} m. Choose one on it."
             )
-        *orders, sign = _MOTIONS[direction]
-        x, y = (
-            lagrange(self.nodes, 2.0 * p - 1.0, int(k)) * (2.0 / length) ** int(k)
-            for p, k, length in zip(places.T, orders, self.size, strict=True)
-        )
-        return np.asarray(sign * np.einsum("pi,pj->pij", y, x).reshape(len(places), -1))
+        # a displacement, the axis of its slope, and the sign: rx is of dz/dy and -dy/dz
+        axis = "xyz".index(direction[-1])
+        y, z = (axis + 1) % 3, (axis + 2) % 3
+        terms: list[tuple[int, int | None, float]] = [(z, y, 1.0), (y, z, -1.0)]
+        terms = [(axis, None, 1.0)] if len(direction) == 1 else terms
+        terms = [term for term in terms if "xyz"[term[0]] in moved]
+        found = np.zeros((len(places), int(np.prod(np.array(self.orders) + 1)), len(moved)))
+        for displacement, slope, sign in terms:
+            column = moved.index("xyz"[displacement])
+            found[:, :, column] = sign / len(terms) * self.polynomials(places, slope)
+        return found.reshape(len(places), -1)
+
+    def polynomials(self, places: FloatArray, slope: int | None = None) -> FloatArray:
+        """Return all polynomials (p, n), or their slopes along an axis, at places (p, d)."""
+        found = np.ones((len(places), 1))
+        for i, (order, at, length) in enumerate(zip(self.orders, places.T, self.size, strict=True)):
+            k = int(slope == i)
+            own = lagrange(lobatto(order), 2.0 * (at / length) - 1.0, k) * (2.0 / length) ** k
+            found = np.einsum("pi,pj->pij", own, found).reshape(len(places), -1)
+        return found
 
 
 def lobatto(order: int) -> FloatArray:
@@ -242,7 +259,7 @@ def ritz_plate(
         M += part.T @ (inertia * mass * part)
     at_x, at_y = np.meshgrid(a * (1.0 + nodes), b * (1.0 + nodes))
     xyz = np.column_stack([at_x.reshape(-1), at_y.reshape(-1), np.zeros(at_x.size)])
-    shape = PolynomialShape((float(size[0]), float(size[1])), nodes)
+    shape = PolynomialShape((float(size[0]), float(size[1])), (order, order))
     dofs = DofSet(np.arange(1, at_x.size + 1), ("z",) * at_x.size, xyz, shape)
     return FEModel(0.5 * (M + M.T), 0.5 * (K + K.T), dofs=dofs, name="plate by Ritz")
 
