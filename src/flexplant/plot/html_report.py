@@ -65,8 +65,6 @@ _HEADINGS = {
     "Measurement and update": ("identification", "updating"),
     "Machine": ("structure", "modes", "reduction", "labels"),
 }
-#: largest number of parameters of an update that are drawn separately
-_PARAMETERS = 6
 
 Picture = tuple[str, Callable[[], Any]]
 
@@ -146,7 +144,7 @@ def _pictures(name: str, value: Any, design: Designed) -> list[Picture]:
         caption = f"Singular values of {name}, the area down to the smallest"
         return [(caption, partial(singular_values, system))]
     if isinstance(value, UpdateResult):
-        few = len(value.parameters) <= _PARAMETERS
+        few = len(value.parameters) <= CHANNELS
         through: list[Picture] = [("Parameters through the update", partial(parameters, value))]
         return through * few + [("Residuals through the update", partial(residual, value))]
     simple: dict[type, tuple[str, Callable[[Any], Any]]] = {

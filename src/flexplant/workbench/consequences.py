@@ -30,10 +30,8 @@ from ..synthesis import LoopDesign, ShapedAxis, tune_loops
 from ..synthesis.laws.law import axes_controller
 from .evaluation import AxisLoop, BenchMachine
 
-#: duration of a step relative to the time of a crossover, and samples at most
-_PERIODS, _SAMPLES = 8.0, 20_000
-#: samples of the response from lines, a power of two
-_LINES = 1 << 14
+#: duration of a step relative to the time of a crossover, and samples at most, a power of two
+_PERIODS, _SAMPLES = 8.0, 1 << 14
 
 
 @dataclass(eq=False)
@@ -167,19 +165,19 @@ def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArr
     # below the lines S falls as the loop gain grows there, above them it is 1; the samples of the
     # error are the sums of its impulse response
     rate, f = loop.law.rate, loop.freq
-    grid = np.linspace(0.0, 0.5 * rate, _LINES // 2 + 1)
+    grid = np.linspace(0.0, 0.5 * rate, _SAMPLES // 2 + 1)
     S = np.interp(grid, f, loop.S.real) + 1j * np.interp(grid, f, loop.S.imag)
     S[grid > f[-1]] = 1.0
     below = grid < f[0]
     slope = np.log(np.abs(loop.S[1] / loop.S[0])) / np.log(f[1] / f[0])
     S[below] = loop.S[0] * (grid[below] / f[0]) ** max(slope, 1.0)
-    error = np.cumsum(np.fft.irfft(S, _LINES))
-    steps = int(np.clip(duration * rate, 50, _LINES // 2))
+    error = np.cumsum(np.fft.irfft(S, _SAMPLES))
+    steps = int(np.clip(duration * rate, 50, _SAMPLES // 2))
     return np.asarray(np.arange(steps) / rate), np.asarray(error[:steps])
 
 
-#: period of the progress reports of the process [s]
-_PERIOD = 0.3
+#: period of the progress reports of the process, and of looking for them [s]
+PERIOD = 0.3
 
 
 class Tuning:
@@ -238,8 +236,8 @@ def search(folder: Path, peak: float, notches: int) -> None:
 
     def report() -> None:
         seconds = 0.0
-        while not over.wait(_PERIOD):
-            seconds += _PERIOD
+        while not over.wait(PERIOD):
+            seconds += PERIOD
             done = bars[-1].done if bars else 0
             step = f"axis {done + 1}" if done < len(design.axes) else "all axes together"
             sys.stdout.write(f"searching, {step} of {len(design.axes)}, {seconds:.0f} s\n")

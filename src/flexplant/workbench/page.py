@@ -16,7 +16,7 @@ from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from ..words import in_unit
 from .bench import Bench, DesignHistory, crossing_axis, first_axis
-from .consequences import Consequences, Tuning
+from .consequences import PERIOD, Consequences, Tuning
 from .controls import ElementCards, Number, new_elements, parsed, with_new
 from .evaluation import AxisLoop, BenchMachine, Evaluator, coupling
 from .side import SideCards, given_file
@@ -35,8 +35,8 @@ from .verdict import (
 from .views import KEPT, Gestures, Views
 
 #: delay before drawing, so that only the last of a burst of changes is drawn; delay before long
-#: computations, until the sliders rest; period of looking for their results [ms]
-_SOON, _LATER, _POLL = 3, 350, 300
+#: computations, until the sliders rest [ms]
+_SOON, _LATER = 3, 350
 
 
 class Page:
@@ -489,7 +489,7 @@ class Page:
         self.tuning = Tuning(plant, self.design, self.limits.peak, notches)
         self.side.show_tuning(self.tuning.said, True)
         if self._doc is not None:
-            self._polled = self._doc.add_periodic_callback(self._poll, _POLL)
+            self._polled = self._doc.add_periodic_callback(self._poll, int(1e3 * PERIOD))
 
     def _tuned(self) -> Tuning | None:
         """Return the search, which is over for the page."""
