@@ -252,8 +252,8 @@ class WaferStage(Value):
         count, duration = len(ports.u), whole(periods, "periods") * period
         duration += whole(discard, "discard", minimum=0) * period
         signal = multisine(
-            count, rate=self.rate, period=period, periods=periods + discard, rms=positive(amplitude, "amplitude"),
-            rng=random,
+            count, rate=self.rate, period=period, periods=periods + discard,
+            rms=positive(amplitude, "amplitude"), rng=random,
         ).swapaxes(0, 1)  # fmt: skip
         samples = signal.shape[-1] // (periods + discard)
         shakers = [
