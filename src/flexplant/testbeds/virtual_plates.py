@@ -180,9 +180,10 @@ class PolynomialShape(Interpolation):
         places = np.asarray(points)[:, : len(self.size)]
         off = np.any((places / self.size < -SAME) | (places / self.size > 1.0 + SAME), axis=1)
         if np.any(off):
+            where = "off the plate" if bends else "outside the block"
             raise LabelError(
-                f"the point {tuple(np.asarray(points)[off][0].tolist())} is off the plate or block "
-                f"of {self.size} m. Choose one on it."
+                f"the point {tuple(np.asarray(points)[off][0].tolist())} is {where} of "
+                f"{self.size} m. Choose one in it."
             )
         # a displacement, the axis of its slope, and the sign: rx is of dz/dy and -dy/dz
         axis = "xyz".index(direction[-1])
