@@ -15,9 +15,6 @@ from ..tolerances import NEGLIGIBLE, SAME, TINY
 
 #: point at which answers are taken, in the unit of the loop's speed: away from resonances
 POINT = complex(np.exp(0.25j * np.pi))
-#: effort or noise that is smaller, relative to the plant's own response at the loop's speed, has no
-#: effect there: this amount is added where it is missing
-FELT = 1e-3
 #: where the search for the loop's speed ends, relative to the fastest pole, or to the fastest zero
 #: where nothing settles before. A double integrator has lost 14 digits there
 _FAR = 1e7
@@ -141,7 +138,7 @@ def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray
     # (m,), counts as zero, and `own` is its unit
     m = D.shape[1]
     sizes = np.linalg.norm(D, axis=0)
-    felt = sizes > FELT * own
+    felt = sizes > NEGLIGIBLE * own
     columns = divisor(np.where(felt, sizes, own))
     left, values, right = la.svd(np.where(felt, D, 0.0) / columns, full_matrices=True)
     sizes = np.zeros(m)

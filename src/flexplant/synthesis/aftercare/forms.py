@@ -21,22 +21,25 @@ from ...lti.minimal_realisations import minimal
 from ...lti.modal import modal_form
 from ...lti.modal_map import eigenvalues_with_error
 from ...lti.statespace import StateSpace, as_statespace
-from ...tolerances import RANK, ROUNDING, TYPED
+from ...tolerances import (
+    CLOSE,
+    FOUR_DIGITS,
+    PRECISION,
+    RANK,
+    RESIDUAL,
+    ROOT,
+    ROUNDING,
+    SPLIT,
+    TYPED,
+)
 
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
 LANES = 4
-#: largest condition number of the states' transformation, which multiplies rounding errors
-_CONDITION = 1e7
 #: relative distances of poles [1] within which they share a block, tried in turn
-_NEAR = (1e-6, 1e-4, 1e-2, 0.1)
+_NEAR = SPLIT, FOUR_DIGITS, CLOSE, 0.1
 #: what the blocks may differ from the system, relative to the largest gain: in double precision
 #: (rounding times the condition), and in single, whose 24 bits a resonance of 1e-4 still stands
-_DOUBLE, _SINGLE = 1e-8, 1e-2
-#: how far rounding may have moved a pole, relative to its distance from a frequency; its square,
-#: for a double pole, is below the required accuracy
-_MOVED = 3e-5
-#: a channel this far below the others of its output and input is not compared separately
-_SMALL = 1e-8
+_DOUBLE, _SINGLE = ROOT, CLOSE
 
 
 class TwoStateForm(NamedTuple):
@@ -171,7 +174,7 @@ def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
             la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, :size] for k, size in enumerate(sizes)
         ]
         V = np.hstack(bases)
-        if np.linalg.cond(V) > _CONDITION:
+        if np.linalg.cond(V) > _DOUBLE / PRECISION:  # which multiplies rounding errors
             continue
         kept = la.block_diag(*(np.ones((size, size)) for size in sizes)) > 0
         new = np.where(kept, np.linalg.solve(V, A @ V), 0.0)
@@ -264,11 +267,12 @@ def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray], most:
     poles, _, moved = eigenvalues_with_error(K.A)
     grid = resonance_grid(poles, K.dt, points=60)
     # nearer to poles than this the response is one of rounding: of a double pole at z = 1 in a
-    # full A, say, which comes out as two, 1e-8 apart
+    # full A, say, which comes out as two, 1e-8 apart. The square of the relative error, for a
+    # double pole, is below the required accuracy
     apart = np.abs(np.exp(2j * np.pi * grid * K.dt)[:, None] - poles)
-    grid = grid[np.all(moved < _MOVED * apart, axis=1)]
+    grid = grid[np.all(moved < np.sqrt(RESIDUAL) * apart, axis=1)]
     size = np.abs(frequency_response(K, grid).data).max(axis=2, initial=0.0)
-    small = max(_SMALL, ROUNDING / most)
+    small = max(_DOUBLE, ROUNDING / most)
     least = small * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
     gap = np.abs(away(grid)).max(axis=2, initial=0.0)
     return float(np.max(gap / divisor(np.maximum(size, least)), initial=0.0))
@@ -387,10 +391,6 @@ def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
     )
 
 
-#: D of a conditioned controller is inverted up to this condition
-_LARGEST = 1e8
-
-
 def anti_windup_form(controller: Any, *, recovery: float | None = None) -> StateSpace:
     """Return an anti-windup form of a controller, with the applied commands as additional inputs.
 
@@ -466,7 +466,7 @@ def back_gain(K: StateSpace, recovery: float | None) -> FloatArray:
 def _hanus(K: StateSpace) -> FloatArray:
     """Return ``B D^-1``, of a wide D its least solution."""
     size = np.linalg.svd(K.D, compute_uv=False)
-    rank = int(np.count_nonzero(size > size.max(initial=0.0) / _LARGEST))
+    rank = int(np.count_nonzero(size > ROOT * size.max(initial=0.0)))
     if rank < len(K.outputs) or not size.max(initial=0.0) > 0:
         raise AssumptionError(
             f"Hanus' form divides by D, which has rank {rank} for {len(K.outputs)} actuators: a "

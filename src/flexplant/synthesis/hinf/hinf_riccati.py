@@ -20,7 +20,7 @@ from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...store import Value, checked
-from ...tolerances import MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED
+from ...tolerances import MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED, TYPED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
@@ -34,9 +34,6 @@ _REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
 #: secants between two bisections of a search, and by how many times a step that rises from a bound
 #: is wider than the last
 _SECANTS, _WIDER = 3, 8.0
-#: relative: by how much rounding may put a gain above its gamma; a sensitivity at infinite
-#: frequency that is taken for zero
-_SLACK = 1e-6
 #: by how much a norm may exceed its gamma, relative to the distance from the smallest one. Of a lag
 #: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
 _MISSED = 0.1
@@ -186,7 +183,7 @@ class _Bracket:
         self.blind = self.blind and attempt.rooms is None
         self.known = [*self.known[-1:], (gamma, attempt.rooms)] if attempt.rooms is not None else []
         # rounding costs some of what is promised
-        if gain <= max(gamma * (1.0 + _SLACK), np.sqrt(gamma * self.high)):
+        if gain <= max(gamma * (1.0 + TYPED), np.sqrt(gamma * self.high)):
             self.high = max(gamma, gain)
             return
         self.high, self.failed = min(self.high, gain), gamma
@@ -254,7 +251,7 @@ def _accepted(problem: Prepared, high: float, step: float) -> tuple[StateSpace |
 def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:
     """Raise InfeasibleError when putting D22 back takes infinite gain at infinite frequency."""
     loop = np.eye(len(problem.y)) + problem.D22 @ controller.D
-    if la.svdvals(loop)[-1] < _SLACK:
+    if la.svdvals(loop)[-1] < TYPED:
         where = "at half the rate" if problem.dt else "at infinite frequency"
         raise InfeasibleError(
             f"gamma has no minimum: {gamma:.3g} is reached, by infinite gain {where}, where "

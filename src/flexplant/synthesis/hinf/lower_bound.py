@@ -11,15 +11,13 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
-from ...lti.frequency_sweep import highest, resonance_grid
+from ...lti.frequency_sweep import POINTS, ROUNDS, highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
-from ...tolerances import NEGLIGIBLE, SAME, SPLIT
+from ...tolerances import NEGLIGIBLE, RANK, SAME, SPLIT
 from ..preparation import Prepared
 
-#: points of the sweep, and times that it is refined
-_POINTS, _REFINEMENTS = 200, 2
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
 
@@ -44,7 +42,7 @@ def pointwise_bound(problem: Prepared) -> float:
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     system = problem.system
     poles = system.poles()
-    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS)])
+    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=POINTS)])
     undamped = poles[np.abs(poles.real) <= SPLIT * np.max(np.abs(poles), initial=1.0)]
     apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))
     grid = grid[np.all(apart > SPLIT * (1.0 + np.abs(undamped.imag)), axis=1)]
@@ -55,7 +53,7 @@ def pointwise_bound(problem: Prepared) -> float:
         return np.maximum(_perp_norms(P[:, :p1, m1:], Pzw), _perp_norms(seen, _adjoint(Pzw)))
 
     # no frequency is left where all poles are as good as zero next to the loop's speed
-    swept = highest(bounds, grid, _REFINEMENTS)[0] if grid.size else 0.0
+    swept = highest(bounds, grid, ROUNDS)[0] if grid.size else 0.0
     return max(swept, *(one.direct for one in both_sides(problem)))
 
 
@@ -101,11 +99,8 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
 
 
 #: relative: errors of X and Y (their residuals are 1e-6), by which eigenvalues of X may be negative
-#: and rho(X Y) may exceed gamma^2; rounding of the terms of their equations
-INACCURATE, _ROUNDED = 1e-5, 1e-14
-#: gamma is tried just below the value after a back-off of 5 %, then with squares of this fraction
-#: until one is refuted; then intervals are halved to a relative width
-_PART, _WIDTH = 0.951, 1e-3
+#: and rho(X Y) may exceed gamma^2
+INACCURATE = 1e-5
 
 
 class FullInformation(NamedTuple):
@@ -153,7 +148,7 @@ class FullInformation(NamedTuple):
         x = vectors[:, 0]
         terms = np.sum(self.C**2) + 2.0 * np.linalg.norm(X @ x) * np.linalg.norm(self.A @ x)
         poles = la.eigvals(self.A + np.hstack([self.B1, self.B2]) @ F)
-        return bool(values[0] < -_ROUNDED * terms / np.min(np.abs(poles.real)))
+        return bool(values[0] < -RANK * terms / np.min(np.abs(poles.real)))
 
     def regular(self) -> FullInformation:
         """Return the problem in which D12 has full rank."""
@@ -194,8 +189,10 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     # [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems)
     sides = [side.regular() for side in both_sides(p)]
     low = max(known, *(one.direct for one in sides))
-    high, part = gamma, _PART
-    while high > low * (1.0 + _WIDTH) and (low > 0.0 or part > NEGLIGIBLE):
+    # gamma is tried just below the value after a back-off, then with squares of that fraction until
+    # one is refuted; then intervals are halved
+    high, part = gamma, 1.0 / (1.0 + _CLOSE)
+    while high > low * (1.0 + NEGLIGIBLE) and (low > 0.0 or part > NEGLIGIBLE):
         middle = max(part * gamma, float(np.sqrt(low * high)))
         part *= part
         if _refuted(sides, middle):

@@ -15,16 +15,15 @@ from ...errors import FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
-from ...tolerances import NEGLIGIBLE, ROUNDING
+from ...tolerances import CLOSE, NEGLIGIBLE, ROOT, ROUNDING, SPLIT
 from ..controller import SolvedController
 from ..preparation import Prepared
-from ..scaling import FELT
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
-LEVELS = (FELT, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
+LEVELS = (NEGLIGIBLE, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 #: where the infimum of gamma is zero, gamma falls at least to this fraction from level to level
 _FALL = 0.5
 #: and at least to this fraction from the first level to the last
@@ -34,11 +33,6 @@ _SETTLED = 1.2
 #: a fastest pole that grows by more than this factor when the level is a tenth has no limit
 _GROWTH = 3.0
 
-
-#: relative to the loop's speed: a mode that decays more slowly is taken for undamped, and what z or
-#: w shows by less than the root of rounding is missed. A chain of modes (lags in a row) is shown by
-#: no more than the product of their decays, so that those up to the fourth root of it count
-_SLOW, _SHOWN, _CHAIN = 1e-6, 1e-8, 1e-2
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
     "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
@@ -102,7 +96,7 @@ def _missed_modes(p: Prepared) -> tuple[str, ...]:
         spectra = [np.asarray(la.eigvals(M), dtype=np.complex128) for M in (A, inner)]
         for s, distance in (point for poles in spectra for point in _limit(p, poles)):
             pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
-            if la.svdvals(pencil)[-1] <= max(distance, _SHOWN):
+            if la.svdvals(pencil)[-1] <= max(distance, ROOT):
                 omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
                 found.append(_MISSED[side].format(f"{p.frequency(omega):.3g} Hz"))
                 break
@@ -111,16 +105,19 @@ def _missed_modes(p: Prepared) -> tuple[str, ...]:
 
 def _limit(p: Prepared, poles: ComplexArray) -> list[tuple[complex, float]]:
     """Return points of the limit of stability at slow poles; distances there, zero in chains."""
+    # relative to the loop's speed: a mode that decays more slowly than poles are known is taken for
+    # undamped. A chain of modes (lags in a row) is shown by no more than the product of their
+    # decays, so that those up to the fourth root of what is shown at all, 1 %, count
     unit = abs(p.point - 1.0) if p.direct else 1.0
-    near = poles[np.abs(np.abs(poles) - 1.0 if p.direct else poles.real) <= _CHAIN * unit]
+    near = poles[np.abs(np.abs(poles) - 1.0 if p.direct else poles.real) <= CLOSE * unit]
     if p.direct:
-        limit = np.where(np.abs(near - 1.0) <= _SLOW * unit, 1.0, near / np.abs(near))
+        limit = np.where(np.abs(near - 1.0) <= SPLIT * unit, 1.0, near / np.abs(near))
     else:
-        limit = 1j * np.where(np.abs(near) <= _SLOW, 0.0, near.imag)
+        limit = 1j * np.where(np.abs(near) <= SPLIT, 0.0, near.imag)
     apart = np.abs(limit[:, None] - near) / unit
     distance = np.diagonal(apart)
-    single = distance <= _SLOW
-    chosen = single | (np.count_nonzero(apart <= _CHAIN, axis=1) > 1)
+    single = distance <= SPLIT
+    chosen = single | (np.count_nonzero(apart <= CLOSE, axis=1) > 1)
     return list(zip(limit[chosen].tolist(), np.where(single, distance, 0.0)[chosen], strict=True))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import CACHED, ComplexArray, FloatArray
 from ...errors import AssumptionError, ModelError
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
@@ -30,8 +30,6 @@ _SHIFT = 0.7
 _DAMPED, _PUSHED = 0.01, 0.1
 #: factor by which a scaling is changed at most in closed loop
 _REBALANCED = 4.0
-#: frequencies whose D is found at once, those of the largest bounds first
-_AT_ONCE = 64
 #: points at most on each side of a mode, two to a half-width of its resonance
 _SWEPT = 100
 
@@ -246,8 +244,7 @@ class ModeLoop:
         """Return beta, the largest over the grid: the Deltas and gains over it are all shown."""
         # the design's D and G first, D for a beta that is `near`; where that is the largest, D that
         # evens out the loop, with G and without, and the best of the three
-        count = len(self.M)
-        pieces = np.array_split(np.arange(count), -(-count // _AT_ONCE))
+        pieces = np.array_split(np.arange(len(self.M)), 1 + self.M.size // CACHED)
         plain = np.concatenate([self._levels(self.M[i], self.shift[i], near) for i in pieces])
         most = 0.0
         for part in np.array_split(np.argsort(-plain), len(pieces)):

@@ -17,20 +17,16 @@ from ...lti.equations import OnAxisError
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...parallel import interruptible
 from ...store import Value, checked
-from ...tolerances import FOUR_DIGITS, RANK, TINY, TYPED
+from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, NULL, RANK, TINY, TYPED
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
 from ..hinf.lower_bound import both_sides, raised_bound
 from ..hinf.singular import Regularised
 from ..preparation import Prepared, beyond_rounding
-from ..scaling import FELT
 
 #: A, B, C, D of a controller
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
-#: singular values below this fraction of the largest count as zero: channels are prepared to about
-#: 1e-12
-NULL = 1e-10
 #: settings of the solver's tolerances
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 
@@ -317,7 +313,7 @@ class Lmi(Value):
         # in units and states of the controller of least quadratic cost; noise and effort of a size
         # that is not felt keep its solutions away from singular
         try:
-            regular = Regularised(given, FELT, modes=True).problem
+            regular = Regularised(given, NEGLIGIBLE, modes=True).problem
             unit = resonance_gain(regular, h2_controller(regular))
             (X, _), (Y, _) = (side.least_squares() for side in both_sides(regular))
         except (la.LinAlgError, OnAxisError, SolverError) as error:

@@ -17,9 +17,17 @@ from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
-from ...tolerances import TINY, TYPED
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, TINY, TYPED
 from ..preparation import less_feedthrough
-from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
+from ..structured.judges import (
+    OVER,
+    GainJudge,
+    H2Judge,
+    Judge,
+    PeakJudge,
+    problem_on,
+    require_finite_h2,
+)
 from ..structured.measured_objective import MeasuredObjective
 from .lmi_programs import (
     TOLERANCES,
@@ -188,7 +196,7 @@ class PoleRegion(Value):
 
 def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
     """Return the largest of ``|D_ij| + int |h_ij(t)| dt`` of a stable continuous system."""
-    # until the slowest pole has decayed by e^-25; refined until it changes by less than 1e-4
+    # until the slowest pole has decayed; refined until it changes by less than 1e-4
     from scipy.linalg import expm
 
     poles = closed.poles()
@@ -196,7 +204,7 @@ def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
         return float(np.abs(closed.D).max(initial=0.0))
     if not np.max(poles.real) < 0:
         return float("inf")
-    end = 25.0 / float(np.min(-poles.real))
+    end = OVER / float(np.min(-poles.real))
     count = int(min(max(points, 20 * end * np.abs(poles.imag).max() / np.pi), 400_000))
     last = np.inf
     for _ in range(4):
@@ -207,7 +215,7 @@ def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
             x = step @ x
             total += np.abs(closed.C @ x)
         found = float((np.abs(closed.D) + total * (end / count)).max())
-        if abs(found - last) < 1e-4 * found or count >= 400_000:  # seconds
+        if abs(found - last) < FOUR_DIGITS * found or count >= 400_000:  # seconds
             break
         last, count = found, 2 * count
     return found
@@ -215,13 +223,13 @@ def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
 
 def impulse_sum(closed: StateSpace) -> float:
     """Return the largest of ``sum_k |h_ij[k]|`` of a stable sampled system."""
-    # until e^-25 of the slowest pole; infinite where that takes more than four million samples
+    # until the slowest pole has decayed; infinite where that takes more than four million samples
     radius = float(np.abs(closed.poles()).max(initial=0.0))
     # a loop of delays alone is over in a few samples
     speed = -np.log(max(radius, 1e-12))
-    if not speed * _LONGEST > 25.0:
+    if not speed * _LONGEST > OVER:
         return float("inf")
-    count = 1 + int(25.0 / speed) // _TOGETHER
+    count = 1 + int(OVER / speed) // _TOGETHER
     powers = [np.eye(closed.n_states)]
     for _ in range(_TOGETHER):
         powers.append(closed.A @ powers[-1])
@@ -414,8 +422,6 @@ def within(speed: float) -> PoleDisc:
 
 #: largest part by which a reachable set shrinks in one sample
 _MOST = 0.9
-#: units in which the optimum is sought
-_UNITS = 7
 
 
 @dataclass(frozen=True)
@@ -497,7 +503,7 @@ class ObjectivePrograms:
         # the unit scales the Lyapunov matrix of this norm, which all objectives share: the bound is
         # smallest in a unit near it, and a third larger in one three times as large
         unit = self.unit
-        for _ in range(_UNITS):
+        for _ in range(MOST_STEPS):
             found = self._optimum(unit, rate)
             if 0.5 < found / unit < 2.0:
                 break

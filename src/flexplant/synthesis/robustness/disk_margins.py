@@ -12,7 +12,7 @@ from ...errors import ModelError, aligned
 from ...loop.broken import BrokenLoop, inverted, scaled_size
 from ...loop.report import LoopMargins, report_loops
 from ...loop.sensitivity_functions import Loop, taken_apart
-from ...lti.frequency_sweep import highest
+from ...lti.frequency_sweep import ROUNDS, highest
 from ...plant.uncertainty.delta_blocks import FullBlock
 from ...store import Value
 from .mu_bounds import mu
@@ -22,8 +22,6 @@ SKEWS = {"S-T": 0.0, "S": 1.0, "T": -1.0}
 #: heads of the two parts of the table
 _CLASSICAL = ("loop", "crosses 1 at [Hz]", "phase [deg]", "delay [ms]", "gain at [Hz]", "factor")
 _DISK = ("loop", "disk", "alpha", "at [Hz]", "gain [dB]", "phase [deg]", "reached by")
-#: refinements of the grid near the largest value, as for the modulus margin
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,7 +180,7 @@ def _disk(parts: BrokenLoop, at: Literal["u", "y"], kind: str, some: slice) -> D
         S = inverted(parts.gain(freq, at))[:, some, some]
         return np.asarray(S + shift * np.eye(S.shape[-1]))
 
-    rounds = 0 if parts.measured is not None else _ROUNDS
+    rounds = 0 if parts.measured is not None else ROUNDS
     size, freq = highest(lambda f: scaled_size(changed(f)), parts.followed, rounds)
     worst = changed(np.array([freq]))[0]
     lower = mu(worst, [FullBlock()] * len(worst)).lower

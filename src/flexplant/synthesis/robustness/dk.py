@@ -22,7 +22,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...plant.uncertainty.delta_blocks import FullBlock, RepeatedScalar
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
-from ...tolerances import ROUNDING
+from ...tolerances import CLOSE, ROUNDING
 from ..controller import Controller, SynthesisMethod
 from ..hinf.hinf_design import HinfDesign, design_hinf
 from ..hinf.hinf_riccati import Riccati
@@ -51,10 +51,6 @@ from .upper import upper_level
 STEPS_OF_MU = "upper bound of mu after each step"
 #: frequencies at which D is found
 _POINTS = 40
-#: relative decrease of mu below which the iteration ends: D(s), one channel a mode
-_SETTLED, _SETTLED_BY_MODES = 0.01, 0.02
-#: relative distance of mu from the level that D was found for, from which on D is found again
-_NEAR = 0.02
 #: machines at corners of the uncertainty that are closed exactly, and by how much their gain may
 #: exceed the bound: the first order of the channels
 _MACHINES, _BEYOND = 8, 0.05
@@ -195,7 +191,7 @@ class _DkIteration(Design):
     def _iterated(self, problem: UncertainPlant[Any], *, sized: bool) -> _Iterated:
         given = self.w, self.z, self.method, self.most, self.order
         steps = _filter_steps(problem, *given, sized=sized)
-        return _best_step(steps, self.most + 1, _SETTLED, self.progress)
+        return _best_step(steps, self.most + 1, self.progress)
 
     def restore(self, plant: UncertainPlant[Any], problem: Any, found: Any) -> StateSpace:
         K: StateSpace = found.best.controller
@@ -222,7 +218,7 @@ class _ModeIteration(_DkIteration):
         # before: at a fixed point the norm is 1 and mu what it was divided by
         weighted = _performance_plant(problem.plant, self.w, self.z)
         steps = _mode_steps(weighted, mode_channels(weighted, problem), self.method, self.most)
-        return _best_step(steps, self.most, _SETTLED_BY_MODES, self.progress)
+        return _best_step(steps, self.most, self.progress)
 
     def certify(self, solution: Solution) -> Controller:
         best, found, notes = solution.found
@@ -239,9 +235,7 @@ class _ModeIteration(_DkIteration):
         )
 
 
-def _best_step(
-    steps: Iterator[_DkStep], most: int, settled: float, progress: bool | None
-) -> _Iterated:
+def _best_step(steps: Iterator[_DkStep], most: int, progress: bool | None) -> _Iterated:
     """Return the best step; the steps end where mu falls no further, or where one fails."""
     best: _DkStep | None = None
     found: list[Verified] = []
@@ -254,7 +248,7 @@ def _best_step(
                 known = np.inf if best is None or step.number < 2 else best.mu
                 if best is None or step.mu < best.mu:
                     best = step
-                if step.mu > (1.0 - settled) * known:
+                if step.mu > (1.0 - CLOSE) * known:
                     break
         except FlexplantError as error:  # D of a loop near its optimum may be badly conditioned
             if best is None:
@@ -323,7 +317,7 @@ def _best_sized(plant: UncertainLoop, scales: _DFilters) -> _DFilters:
     def norm(log_size: float) -> float:
         try:
             g = _scaled(plant, sized(log_size))
-            return Riccati(tolerance=_COARSE, progress=False).solve(prepared(g, own.u, own.y)).gamma
+            return Riccati(tolerance=CLOSE, progress=False).solve(prepared(g, own.u, own.y)).gamma
         except FlexplantError:
             return np.inf
 
@@ -395,10 +389,10 @@ def _filters(
 #: factor by which D differs at most from where mu is largest: where one channel is much larger than
 #: the others D is nearly free, and a tenth of the best D costs 0.5 % of mu there
 _SPREAD = 10.0
-#: factor that D is made larger or smaller by at most, and relative accuracy of the norms for it
-_LARGEST, _COARSE = 1e3, 0.01
+#: factor that D is made larger or smaller by at most
+_LARGEST = 1e3
 #: mean error of the logarithm with which a fit of fewer states is taken
-_CLOSE = 0.05
+_FITTED = 0.05
 
 
 def fitted_magnitude(
@@ -412,7 +406,7 @@ def fitted_magnitude(
     goal = np.log(np.maximum(size, 1e-12 * size.max()))
     at = np.log(omega)
     found = StateSpace([], [], [], [[float(np.exp(goal.mean()))]])
-    if np.std(goal) < _CLOSE:
+    if np.std(goal) < _FITTED:
         return found
     for count in range(1, order + 1):
         corners = np.interp(np.linspace(0, 1, 2 * count + 2)[1:-1], np.linspace(0, 1, at.size), at)
@@ -427,7 +421,7 @@ def fitted_magnitude(
         best = least_squares(error, start, max_nfev=200)
         a, b = np.exp(best.x[1 : count + 1]), np.exp(best.x[count + 1 :])
         found = zpk(-a, -b, float(np.exp(best.x[0])))
-        if np.std(best.fun) < _CLOSE:
+        if np.std(best.fun) < _FITTED:
             break
     return found
 
@@ -472,7 +466,7 @@ def _dk_iteration(
     again = rebalanced(channels, with_mode_channels(weighted, channels), K)
     loop = ModeLoop(again, with_mode_channels(weighted, again), K, 2.0, weighted=True)
     mu = loop.level(level)
-    if abs(mu / level - 1.0) > _NEAR:  # D is found for a level
+    if abs(mu / level - 1.0) > CLOSE:  # D is found for a level
         mu = min(mu, loop.level(mu))
     return _DkStep(number, mu, K, again)
 

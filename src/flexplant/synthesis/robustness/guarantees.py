@@ -22,20 +22,18 @@ from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
 from ...store import Value
-from ...tolerances import NEGLIGIBLE
+from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
-from .lower import Destabilising, crossing_multiple, destabilising, smallest_with_block
+from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising, smallest_with_block
 from .mu_bounds import INTERVALS, Cover, Covered, sought
 from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
 from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
-#: starts of a search at each frequency
-_STARTS = 3
 #: largest multiple of an uncertainty that the quick bound tries
 _REACH = 2.0
-#: frequencies that start a search for the largest gain, rounds over all real Deltas
-_SOUGHT, _ROUNDS = 5, 3
+#: frequencies that start a search for the largest gain
+_SOUGHT = 5
 #: frequencies around the worst one at which gains are compared
 _BAND = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 20), -np.geomspace(1e-4, 0.3, 20)])
 
@@ -236,7 +234,7 @@ def _worst(
     alone = not loop.uncertain.delta_blocks  # reals and one full block, the neglected modes
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
-        for start in power_iterations(gain, where, rng, _STARTS, omega):
+        for start in power_iterations(gain, where, rng, omega):
             if alone:
                 one = smallest_with_block(gain, where, start, 0.99 / upper)
             else:
@@ -443,7 +441,7 @@ def worst_case_gain(
     upper = size * float(np.sqrt(found.level))
     reached = [_machine_gain(loop, one) for one in _candidates(loop, M, listed, found, chance)]
     lower, freq, values, made = max(reached, key=itemgetter(0))
-    if not lower <= upper * (1.0 + 1e-2):
+    if not lower <= upper * (1.0 + CLOSE):
         raise CertificateError(
             f"a machine of the uncertainty has the gain {lower:.6g}, {upper:.6g} was proven as "
             "largest: the loop is too badly conditioned. Report it."
@@ -491,7 +489,7 @@ def _candidates(
         gains = np.array([M.evaluated(1j * one) * tall for one in band])
         skewed = gains[0].copy()
         skewed[where[-1].z] /= np.sqrt(found.level)
-        starts = power_iterations(skewed, where, rng, _STARTS, omega)
+        starts = power_iterations(skewed, where, rng, omega)
         results += [_corner_gain(gains, where, one) for one in starts]
     return [one for _, one in sorted(results, key=lambda pair: -pair[0])[:2]]
 
@@ -502,7 +500,7 @@ def _corner_gain(
     """Return the largest gain in a band, real Deltas moved one after the other to an end or 0."""
     one = one._replace(vectors=one.vectors[:-1])
     best = _perturbed_gain(gains, where, one)
-    for _ in range(_ROUNDS):
+    for _ in range(ASCENTS):
         before = best
         for i, number in enumerate(one.scalars):
             for value in (-1.0, 1.0, 0.0):
@@ -513,7 +511,7 @@ def _corner_gain(
                 gain = _perturbed_gain(gains, where, moved)
                 if gain > best:
                     best, one = gain, moved
-        if best <= before * (1.0 + 1e-4):  # no gain is known better
+        if best <= before * (1.0 + FOUR_DIGITS):
             break
     return best, one
 

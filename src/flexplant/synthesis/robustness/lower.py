@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
-from ...tolerances import FOUR_DIGITS, SPLIT, TINY
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, SPLIT, TINY
 from .power_starts import power_iterations
 from .uncertainty_blocks import (
     Perturbation,
@@ -27,15 +27,13 @@ from .uncertainty_blocks import (
 _MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
 #: phases of complex blocks that are tried
 _PHASES = 25
-#: random starts at each frequency
-_RESTARTS = 4
 #: real Deltas of a matrix of which all signs are tried; of more, random corners that are tried, and
 #: how many of these are improved
 _FEW_SIGNS, _CORNERS, _CLIMBED = 10, 128, 12
 #: real Deltas of which all signs are tried, and the loops that are closed for it
 _FEW, _LOOPS = 5, 256
 #: steps towards worse signs of the real Deltas
-_ASCENTS = 6
+ASCENTS = 6
 
 
 class Destabilising(NamedTuple):
@@ -81,7 +79,7 @@ def crossing_multiple(
     Complex blocks are turned, then real Deltas moved to the ends that lower t, as long as it falls.
     """
     best: tuple[float, Perturbation] | None = None
-    for _ in range(_ASCENTS):
+    for _ in range(ASCENTS):
         one = _crossing_multiple(M, where, found)
         if one is None or (best is not None and one[0] > best[0] * (1.0 - SPLIT)):
             break
@@ -178,7 +176,7 @@ def _crossing(
     """Return the phase, by bisection, at which an eigenvalue is real, and that eigenvalue."""
     low, high = between.tolist()
     sign, phase = np.sign(value.imag), low
-    for _ in range(50):
+    for _ in range(MOST_STEPS):
         phase = 0.5 * (low + high)
         every = np.linalg.eigvals(first + np.exp(1j * phase) * second)
         value = complex(every[np.argmin(np.abs(every - value))])
@@ -189,7 +187,7 @@ def _crossing(
 def _largest_real(values: ComplexArray) -> float:
     """Return the real eigenvalue of the largest size, with its sign; 0 where none is real."""
     # a double eigenvalue comes out complex by the root of rounding
-    real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=TINY)
+    real = np.abs(values.imag) < ROOT * np.abs(values).max(initial=TINY)
     found = np.where(real, values.real, 0.0)
     return float(found[np.argmax(np.abs(found))]) if found.size else 0.0
 
@@ -266,7 +264,7 @@ def smallest_with_block(
 
     q = np.array([number.real for number in start.scalars])
     best = first(q)
-    for _ in range(_ASCENTS):
+    for _ in range(ASCENTS):
         before = best
         for i in range(q.size):
             for value in (-1.0, 1.0):
@@ -274,7 +272,7 @@ def smallest_with_block(
                 moved[i] = value
                 if value != q[i] and (found := first(moved)) < best:
                     best, q = found, moved
-        if not best < before * (1.0 - 1e-4):  # found to that accuracy
+        if not best < before * (1.0 - FOUR_DIGITS):
             break
     if not np.isfinite(best):
         return None
@@ -346,12 +344,12 @@ def destabilising(
     best: Destabilising | None = None
     for omega in omegas:
         gain = M.evaluated(1j * omega)
-        starts = power_iterations(gain, where, rng, _RESTARTS, omega)
+        starts = power_iterations(gain, where, rng, omega)
         first = Destabilising(0.0, starts[0], omega)
         signs = worse_signs(M, blocks, first, near=1j * omega)
         for start in [*starts, *([] if signs is None else [signs])]:
             best = _worse_signs(M, blocks, start, least, best)
-            if best is not None and best.size < 1.001 * least:
+            if best is not None and best.size < (1.0 + NEGLIGIBLE) * least:
                 return best
     return _at_corners(M, blocks, least, best)
 
@@ -369,7 +367,7 @@ def _at_corners(
         for signs in itertools.product([-1.0 + 0j, 1.0 + 0j], repeat=len(blocks))
     ]
     for corner in corners:
-        most = 100.0 * least if best is None else best.size * (1 - 1e-6)
+        most = 100.0 * least if best is None else best.size * (1 - SPLIT)
         delta = realised_delta(corner, blocks)
         for t in np.geomspace(least, most, _LOOPS // len(corners) + 1)[1:].tolist():
             if _abscissa(M, delta, t)[0] >= 0:
@@ -389,13 +387,13 @@ def _worse_signs(
 ) -> Destabilising | None:
     """Return the best so far, after steps from one start to worse signs of its real Deltas."""
     candidate: Perturbation | None = start
-    for _ in range(_ASCENTS):
+    for _ in range(ASCENTS):
         most = best.size if best is not None else 100.0 * least
         one = None if candidate is None else smallest_multiple(M, blocks, candidate, least, most)
         if one is None:
             break
         # no change of the perturbation for rounding
-        if best is None or one.size < best.size * (1 - 1e-6):
+        if best is None or one.size < best.size * (1 - SPLIT):
             best = one
         candidate = worse_signs(M, blocks, one)
     return best

@@ -26,7 +26,7 @@ from ...parallel import one_thread, tick
 from ...plant.uncertainty.delta_blocks import Block, RepeatedScalar, filled_blocks
 from ...seeds import generator
 from ...store import Value
-from ...tolerances import ROUNDING, TINY
+from ...tolerances import NEGLIGIBLE, ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
 from .power_starts import power_iterations
 from .shared_multipliers import shared_scalings
@@ -35,8 +35,6 @@ from .upper import WIDE, centred, reached_level, reached_levels, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
 _SOUGHT, _STARTS = 8, 10
-#: part of the upper bound from which a lower one is not raised further: no design hangs on less
-_MET = 0.999
 #: relative distance of the level to the largest upper bound found at a frequency
 ABOVE = 5e-3
 #: what a bar calls the intervals of frequency that are covered
@@ -46,8 +44,6 @@ _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
 _OFFSETS = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
 _POINTS = 24  # evenly, and by the logarithm
-#: fraction of the level that scalings reach at a frequency, so that they hold around it
-_LEFT = 0.995
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -194,12 +190,12 @@ def _of_matrix(M: ComplexArray, blocks: Sequence[Block], rng: np.random.Generato
     where = block_places(listed)
     upper = float(np.sqrt(upper_level(M, Scalings(listed)).level))
     lower, delta = 0.0, np.zeros(M.shape[::-1], dtype=np.complex128)
-    starts = power_iterations(M, where, rng, _STARTS)
+    starts = power_iterations(M, where, rng, count=_STARTS)
     for found in _multiples(M, where, starts, rng):
         if found is not None and 1.0 / found[0] > lower:
             lower = 1.0 / found[0]
             delta = np.asarray(found[0] * matrix_of(found[1], where))
-        if lower >= _MET * upper:
+        if lower >= (1.0 - NEGLIGIBLE) * upper:
             break
     return MuBounds(upper, min(lower, upper), float("nan"), delta)
 
@@ -279,6 +275,11 @@ class Cover:
         """Return the factors of the columns between two frequencies."""
         return np.ones(self.B.shape[1]) if self.heights is None else self.heights(low, high)
 
+    @property
+    def enough(self) -> float:
+        """The level that scalings reach at a frequency, so that they hold around it."""
+        return (1.0 - ABOVE) * self.level
+
     def run(self) -> Covered:
         """Cover the axis, from the worst frequencies on."""
         self._start()
@@ -316,7 +317,7 @@ class Cover:
                 bounds, reached_levels(W, self.scalings, shared_scalings(M, self.scalings))
             )
         for i in np.argsort(-bounds)[:6]:
-            if self.found and bounds[i] <= _LEFT * self.level:
+            if self.found and bounds[i] <= self.enough:
                 break
             self._raise(M[i], float(tried[i]))
 
@@ -352,7 +353,7 @@ class Cover:
                 omega, x = shared
                 break
             W = np.vstack([np.eye(self.scalings.w), M * tall])
-            if near is not None and reached_level(W, self.scalings, near) < _LEFT * self.level:
+            if near is not None and reached_level(W, self.scalings, near) < self.enough:
                 x = near
                 break
         if x is None:
@@ -377,7 +378,7 @@ class Cover:
             return None
         M = self.at(omegas) * tall
         x = shared_scalings(M, self.scalings)
-        holds = reached_levels(self._with_identity(M), self.scalings, x) < _LEFT * self.level
+        holds = reached_levels(self._with_identity(M), self.scalings, x) < self.enough
         # the longest run of frequencies at which they hold
         ends = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]])))
         if not ends.size:

@@ -9,11 +9,11 @@ import numpy as np
 
 from ...arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...plant.uncertainty.delta_blocks import RepeatedScalar
-from ...tolerances import TINY
+from ...tolerances import MOST_STEPS, TINY, TYPED
 from .uncertainty_blocks import Perturbation, Place
 
-#: steps of a power iteration; change at which it has settled
-_STEPS, _SETTLED = 60, 1e-6
+#: starts of an iteration; they run at once
+STARTS = 4
 
 
 class _Channels(NamedTuple):
@@ -89,8 +89,8 @@ def power_iterations(
     M: ComplexArray,
     where: Sequence[Place],
     rng: np.random.Generator,
-    count: int,
     omega: float = 0.0,
+    count: int = STARTS,
 ) -> list[Perturbation]:
     """Return perturbations of size one for which an eigenvalue of ``M Delta`` is large and real.
 
@@ -109,7 +109,7 @@ def power_iterations(
     old, adjoint = b, M.conj()
     on = np.ones(count, dtype=bool)  # starts that have not settled
     kept = [q.copy(), b @ M.T, w.copy()]
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         a = _unit(b @ M.T)
         q = blocks.updated(q, a, b, w)
         w = _unit(blocks.back(q, a, w) @ adjoint)
@@ -117,7 +117,7 @@ def power_iterations(
         b = _unit(blocks.through(q, a, w))
         for known, new in zip(kept, (q, a, w), strict=True):
             known[on] = new[on]
-        on &= np.linalg.norm(b - old, axis=1) >= _SETTLED
+        on &= np.linalg.norm(b - old, axis=1) >= TYPED
         if not on.any():
             break
         old = b

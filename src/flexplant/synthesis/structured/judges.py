@@ -18,17 +18,13 @@ from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
-from ...tolerances import CLOSE, NEGLIGIBLE, ROUNDING, TINY
+from ...tolerances import CLOSE, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, TINY
 from ..preparation import Prepared, prepared
 from .nonsmooth import Pieces
 
-#: a loop counts as stable with this decay, in the scaled unit of time
-DECAY = 1e-7
 #: frequencies at which gains are sought, how often these are refined at peaks, and the part of the
 #: largest gain from which on they count
-_POINTS, _REFINEMENTS, _PART = 60, 2, 0.5
-#: singular values of one frequency that count
-_SINGULAR = 3
+_POINTS, _REFINEMENTS, PART = 60, 2, 0.5
 
 
 class Matrices(NamedTuple):
@@ -105,7 +101,9 @@ class ScaledLoop:
         worst = int(np.argmax(values.real))
         y, x = lefts[:, worst], rights[:, worst]
         overlap = np.vdot(y, x)
-        overlap = overlap if abs(overlap) > 1e-12 else 1e-12  # a defective pole: any direction
+        overlap = (
+            overlap if abs(overlap) > ROUNDING else ROUNDING
+        )  # a defective pole: any direction
         slope = np.real(np.outer((y.conj() @ loop.Bu) / overlap, loop.Cy @ x))
         by = self.by_controller(slope)
         return float(values[worst].real), by, complex(values[worst])
@@ -113,7 +111,7 @@ class ScaledLoop:
     def stable(self, K: Matrices) -> Closed | None:
         """Return the loop with a controller; None where it is not stable."""
         loop = self.closed(K)
-        if loop is None or float(loop.system.poles().real.max(initial=-1.0)) >= -DECAY:
+        if loop is None or float(loop.system.poles().real.max(initial=-1.0)) >= -ROOT:
             return None
         return loop
 
@@ -157,7 +155,7 @@ class Closed(NamedTuple):
         freq, gain = climbed_grid(gains, first, _REFINEMENTS)
         chosen = np.isin(freq, first)
         chosen[local_maxima(gain)] = True
-        chosen &= gain >= _PART * gain.max()
+        chosen &= gain >= PART * gain.max()
         return np.asarray(freq[chosen])
 
     def channels(self, freq: FloatArray, order: int = 0) -> tuple[ComplexArray, ...]:
@@ -222,17 +220,16 @@ def _squares(rows: ComplexArray | FloatArray, weights: FloatArray, size: float) 
     return np.asarray((rows.conj().T * (weights / size) @ rows).real)
 
 
-#: step of the controller, in parameters of size 1, by which a gradient's derivative is found
-STEP = 1e-5
-#: time constants of the slowest pole after which an impulse response is over: e^-25 is rounding
-_OVER = 25.0
+#: step of the controller, in parameters of size 1, of a central difference: its own error is that
+#: of rounding
+STEP = float(np.cbrt(PRECISION))
+#: time constants of the slowest pole after which an impulse response is over: the rest is rounding
+OVER = -float(np.log(ROUNDING))
 #: points of the times at which its sign is taken: a period of the fastest pole that rings, each
 #: decade of the others, and at most; samples at most
 _PERIOD, _DECADE, _MOST = 40, 100, 200_000
 #: Newton's steps from a secant's crossing, in error by 1e-3 of a period, to rounding
 _NEWTON = 2
-#: relative distance of poles below which a divided difference is a derivative
-_CLOSE = 1e-7
 
 
 class Judge(Protocol):
@@ -296,7 +293,7 @@ class GainJudge(ScaledLoop):
         places = np.append(loop.high() if sweep else np.zeros(0), freq)
         o, i, T, _ = loop.channels(places)
         U, S, Vh = np.linalg.svd(T, full_matrices=False)
-        counted = S[:, :_SINGULAR] >= _PART * S[-1, 0]
+        counted = PART * S[-1, 0] <= S
         counted[-1, 0] = True
         at, which = np.nonzero(counted)
         value = S[at, which]
@@ -388,7 +385,7 @@ class PeakJudge(SmoothJudge):
         first, S, slope = (self._sampled if a else self._continuous)(poles, c * b, loop.D[0, 0], a)
         total = first * loop.D[0, 0] + float(np.real(np.sum(c * b * S)))
         apart = poles[:, None] - poles
-        near = np.abs(apart) < _CLOSE * np.abs(poles)
+        near = np.abs(apart) < ROOT * np.abs(poles)  # a divided difference is a derivative there
         divided = np.where(near, 0.5 * (slope[:, None] + slope), S[:, None] - S)
         divided = divided / np.where(near, 1.0, apart)
         back = np.linalg.inv(V)
@@ -405,7 +402,7 @@ class PeakJudge(SmoothJudge):
         phi = 1.0 / (1.0 - a * poles)
         z = 2.0 * phi - 1.0
         slowest = float(np.max(np.abs(z), initial=0.0))
-        count = min(int(_OVER / max(-np.log(max(slowest, TINY)), _OVER / _MOST)) + 2, _MOST)
+        count = min(int(OVER / max(-np.log(max(slowest, TINY)), OVER / _MOST)) + 2, _MOST)
         k = np.arange(count)[:, None]
         powers = z**k  # z^(k-1) of h[k], k from 1
         f = a * phi * (z + 1.0) * powers
@@ -425,7 +422,7 @@ class PeakJudge(SmoothJudge):
         """Return the sign at once, and S and its derivative over times that resolve all poles."""
         slow, fast = float(np.min(-poles.real)), float(np.max(np.abs(poles)))
         ringing = float(np.abs(poles.imag).max(initial=0.0))
-        end = _OVER / slow
+        end = OVER / slow
         even = min(int(_PERIOD * end * ringing / (2.0 * np.pi)) + 2, _MOST)
         decades = np.log10(end * fast) + 3.0
         t = np.union1d(

@@ -17,13 +17,13 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...seeds import MOST, Rng, generator
-from ...tolerances import CLOSE, NEGLIGIBLE, SAME, TINY
+from ...tolerances import CLOSE, NEGLIGIBLE, ROOT, SAME, TINY, TYPED
 from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf, PeakGain
 from ..pipeline import Design, Solution, designed, posed
 from ..preparation import Prepared, require_reach
-from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
+from .judges import PART, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .measured_objective import MeasuredObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system
@@ -32,23 +32,12 @@ from .structures import ControllerFamily, ControllerStructure, as_system
 _STABLE, _FEW, _MANY = 300, 40, 300
 #: how many starts are continued
 _CONTINUED = 4
-#: what the search adds to the logarithm of the norm for parameters of size 1
-_SMALL = 1e-6
 #: of the evaluations, what is for the starts; the rest is for continuing the best of them
 _SHARE = 0.7
 #: of the evaluations that are left, what each smaller structure takes at most
 _QUARTER = 0.25
 #: spreads of starts around the structure's own, in turn, and around the best end
 _SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
-#: draws of a start until one is stabilised
-_DRAWS = 4
-#: decay [1] of drawn starts before the norm is lowered, and the number of steps for it: a loop that
-#: is barely stable has peaks that hide the others
-_DECAYING, _DEEPER = 1e-2, 50
-#: the norm that the search claims and the one verified on the plant as given agree to this
-_AGREEMENT = 5e-4
-#: part of the largest norm from which on another plant's counts
-_PART = 0.5
 
 
 @one_thread()
@@ -214,7 +203,7 @@ class _Structured(Design):
         each = [on(plant, claim) for plant in plants]
         norms = [one["norm"] for one in each]
         worst = int(np.argmax(norms))
-        if not abs(norms[worst] - claim) <= _AGREEMENT * claim:
+        if not abs(norms[worst] - claim) <= NEGLIGIBLE * claim:
             raise CertificateError(
                 f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
                 f"{claim:.6g} by the search: {_blame(self.objectives)}."
@@ -355,7 +344,7 @@ def _verified_loop(
         found.append(Verified(repr(one), value, "measured on the closed loop"))
         norm = max(norm, value / (one.below or 1.0))
     checks = (
-        Verified("norm", norm, "objectives of the closed loop", claim * (1.0 + _AGREEMENT)),
+        Verified("norm", norm, "objectives of the closed loop", claim * (1.0 + NEGLIGIBLE)),
         stability_check(least, loop.dt),
         Verified("claim", claim, "the search in scaled time"),
     )
@@ -419,14 +408,14 @@ class _StructureSearch:
         self._latest = theta, each
         worst = int(np.argmax([number for number, _ in each]))
         number, place = each[worst]
-        return float(np.log(max(number, TINY))) + _SMALL * _theta_size(theta), (worst, place)
+        return float(np.log(max(number, TINY))) + TYPED * _theta_size(theta), (worst, place)
 
     def pieces(self, theta: FloatArray) -> Pieces:
         """Return the numbers that are near the largest, as `value` counts them."""
         if not np.array_equal(theta, self._latest[0]):
             self.value(theta)
         _, each = self._latest
-        least = _PART * max(gain for gain, _ in each)
+        least = PART * max(gain for gain, _ in each)
         near = [(i, place) for i, (gain, place) in enumerate(each) if gain >= least]
         return reduce(Pieces.and_those, (self._of_judge(theta, *one, sweep=True) for one in near))
 
@@ -439,8 +428,8 @@ class _StructureSearch:
         judge, below = self.judged[which]
         found, size = judge.pieces(K, by, place, sweep=sweep), _theta_size(theta)
         return found._replace(
-            value=found.value - np.log(below) + _SMALL * size,
-            gradient=found.gradient + _SMALL / size * theta,
+            value=found.value - np.log(below) + TYPED * size,
+            gradient=found.gradient + TYPED / size * theta,
         )
 
     def best(self, starts: int, rng: np.random.Generator, bar: Progress) -> _End:
@@ -484,11 +473,11 @@ class _StructureSearch:
         if i == 0:
             return self._descended(name, first)
         best = min(ends, key=lambda end: end.value)
-        for again in range(_DRAWS):
+        for again in range(len(_SPREADS)):  # until one is stabilised
             draw = width * rng.standard_normal(first.size)
             if i % 2 or not np.isfinite(best.value):
                 spread = _SPREADS[(i // 2 + again) % len(_SPREADS)]
-                end = self._descended(name, first + spread * draw, deeper=_DEEPER)
+                end = self._descended(name, first + spread * draw, deeper=_FEW)
             else:
                 size = max(1.0, float(np.sqrt(np.mean(best.x**2))))
                 end = self._descended(name, best.x + _NARROWER * size * draw)
@@ -499,11 +488,12 @@ class _StructureSearch:
     def _descended(self, name: str, theta: FloatArray, steps: int = _FEW, deeper: int = 0) -> _End:
         """Return where a start ends after a few steps."""
         spent = self._spent(_SHARE)
-        for enough, most in ((-10 * DECAY, _STABLE), (-_DECAYING, deeper)):
+        # drawn starts decay first: a loop that is barely stable has peaks that hide the others
+        for enough, most in ((-10 * ROOT, _STABLE), (-CLOSE, deeper)):
             theta, decay = bfgs(self.stability, theta, enough=enough, steps=most, spent=spent)
             if decay > enough:
                 break
-        if not (decay < -DECAY and np.isfinite(self.value(theta)[0])):
+        if not (decay < -ROOT and np.isfinite(self.value(theta)[0])):
             return _End(np.inf, theta, decay, name)
         found = minimax(self, theta, steps=steps, spent=spent)
         return _End(found.value, found.x, decay, name, found.settled)
@@ -547,4 +537,4 @@ def _theta_size(theta: FloatArray) -> float:
 
 
 def _end_norm(end: _End) -> float:
-    return float(np.exp(end.value - _SMALL * _theta_size(end.x)))
+    return float(np.exp(end.value - TYPED * _theta_size(end.x)))

@@ -25,10 +25,7 @@ from ..hinf.hinf_riccati import Riccati
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws
 from ..preparation import Prepared
-from .judges import Matrices
-
-#: steps of a derivative by differences of fourth order, and their weights
-_STEPS = tuple((k * 1e-3, w / 12e-3) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0)))
+from .judges import STEP, Matrices
 
 #: relative distance from the least gamma of the controller of full order that is reduced to a
 #: start: closer to it a controller has fast poles, whose reduction stabilises on some processors
@@ -65,15 +62,15 @@ class ControllerFamily:
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
         """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
-        # those of `slopes`; without them by differences, exact up to the fourth power
+        # those of `slopes`; without them by differences
         if self._slopes is not None:
             return self._slopes(theta)
-        return np.array(
-            [
-                sum(weight * self.matrices(theta + step * one).joined for step, weight in _STEPS)
-                for one in np.eye(theta.size)
-            ]
+        ends = (
+            [self.matrices(theta + step * one).joined for one in np.eye(theta.size)]
+            for step in (STEP, -STEP)
         )
+        up, down = map(np.array, ends)
+        return np.asarray((up - down) / (2.0 * STEP))
 
     def nested(self, minimise: Minimise) -> FloatArray | None:
         """Return a start that comes from smaller structures, each minimised; None without."""
@@ -345,7 +342,7 @@ class Parametrised:
 
 #: what an element may have free; the depth of a notch is not, unless it is named
 _NUMBERS = ("p", "i", "d", "pole", "freq", "ratio", "width", "damping", "depth")
-_FREE = _NUMBERS[:-1]
+_FREE = tuple(name for name in _NUMBERS if name != "depth")
 #: logarithm of the largest factor by which a number changes
 _FARTHEST = 8.0
 #: highest corner relative to half the rate; for a continuous plant relative to its fastest pole
