@@ -138,11 +138,6 @@ class SynthesisMethod(Protocol):
         """Return a controller of the prepared problem."""
 
 
-#: half-widths around a resonance where the gain is computed as well, for peaks that no other search
-#: finds
-_AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
-
-
 #: possible reasons why a controller, given or found, does not stabilise its loop
 _SIGN = "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
 
@@ -248,7 +243,7 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     respond = respond or responder(loop)
     if not loop.n_states:
         return float(swept_gains(respond, np.zeros(1))[0])
-    grid = np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
+    grid = np.append(0.0, resonance_grid(loop.poles(), loop.dt))
     swept, _ = highest(lambda freq: swept_gains(respond, freq), grid, 3)
     return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
 

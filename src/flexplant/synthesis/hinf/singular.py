@@ -19,8 +19,6 @@ from ...tolerances import CLOSE, NEGLIGIBLE, ROOT, ROUNDING, SPLIT
 from ..controller import SolvedController
 from ..preparation import Prepared
 
-#: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
-_RANK = 0.5
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
 LEVELS = (NEGLIGIBLE, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
@@ -67,7 +65,8 @@ def lacking(p: Prepared) -> Lacking:
     ):
         values = np.zeros(D.shape[1])
         values[: min(D.shape)] = la.svdvals(D) if D.size else 0.0
-        rank = int(np.count_nonzero(values > _RANK))
+        # in a prepared problem the others are 1
+        rank = int(np.count_nonzero(values > CLOSE))
         is_full &= bool(np.all(values > ROUNDING))
         if p.dt and not p.direct:
             # the image of a sampled plant has the answers at half the rate for D, and D where z is

@@ -21,10 +21,8 @@ from ...plant.uncertainty.delta_blocks import FullBlock
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...store import Value
 from ...tolerances import RANK, TINY
-from ..robustness.uncertainty_blocks import block_places, evened
+from ..robustness.uncertainty_blocks import SHARE, block_places, evened
 
-#: G over D of real mu, as a part of the response of a channel at its resonance
-_SHIFT = 0.7
 #: of modes that shall be damped: their least relative error, and the part of the largest modal
 #: force of the actuators from which on these push a mode
 _DAMPED, _PUSHED = 0.01, 0.1
@@ -117,7 +115,7 @@ def mode_channels(
             "u": np.hstack([g.B[states][:, columns["u"]], feeds]),
         }
         forces.append([la.norm(h @ rows[side]) / (h @ h) for side in "wu"])
-        found.append(ModeChannel(mode, states, theta, h, v, _SHIFT * share / zeta, 1.0, share))
+        found.append(ModeChannel(mode, states, theta, h, v, SHARE * share / zeta, 1.0, share))
     w, u = np.array(forces).T
     low = [one.theta / (dt or 1.0) < 2.0 * np.pi * damped_below for one in found]
     found = [
@@ -274,7 +272,7 @@ def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArr
     """Return frequencies [Hz] through the places that the modes may take, to half a half-width."""
     found = []
     for one in channels:
-        freq, width = one.theta / (2.0 * np.pi * (dt or 1.0)), one.share * _SHIFT / max(one.c, TINY)
+        freq, width = one.theta / (2.0 * np.pi * (dt or 1.0)), one.share * SHARE / max(one.c, TINY)
         reach = min(1.5 * times * one.share, 0.5)
         count = int(np.clip(2.0 * reach / max(width, TINY), 4, _SWEPT))
         found.append(freq * (1.0 + reach * np.linspace(-1.0, 1.0, 2 * count + 1)))

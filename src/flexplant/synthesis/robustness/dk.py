@@ -22,7 +22,7 @@ from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...plant.uncertainty.delta_blocks import FullBlock, RepeatedScalar
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
-from ...tolerances import CLOSE, ROUNDING
+from ...tolerances import CLOSE, NEGLIGIBLE, ROUNDING
 from ..controller import Controller, SynthesisMethod
 from ..hinf.hinf_design import HinfDesign, design_hinf
 from ..hinf.hinf_riccati import Riccati
@@ -35,7 +35,6 @@ from ..hinf.tolerated_modes import (
 )
 from ..pipeline import Design, Solution, designed, solved
 from ..preparation import prepared
-from .mu_bounds import ABOVE
 from .performance_bounds import performance_bound
 from .uncertain_loops import (
     UncertainLoop,
@@ -199,12 +198,12 @@ class _DkIteration(Design):
 
     def certify(self, solution: Solution) -> Controller:
         best, found, notes = solution.found
-        mu, freq = performance_bound(best.after, ABOVE)  # steps are compared less closely
-        checks = Verified("mu", mu, STEPS_OF_MU), Verified("at Hz", freq, STEPS_OF_MU), *found
+        at = Verified("at Hz", best.freq, STEPS_OF_MU)
+        checks = Verified("mu", best.mu, STEPS_OF_MU), at, *found
         return Controller(
             solution.K,
             f"D-K iteration, {counted(len(found), 'step')}",
-            gamma=mu,
+            gamma=best.mu,
             certificate=Certificate(checks),
             notes=notes,
         )
@@ -321,7 +320,7 @@ def _best_sized(plant: UncertainLoop, scales: _DFilters) -> _DFilters:
         except FlexplantError:
             return np.inf
 
-    most = np.log(_LARGEST)
+    most = -np.log(NEGLIGIBLE)
     found = minimize_scalar(norm, bounds=(-most, most), method="bounded", options={"xatol": 0.1})
     return sized(found.x) if found.fun < norm(0.0) else scales
 
@@ -389,8 +388,6 @@ def _filters(
 #: factor by which D differs at most from where mu is largest: where one channel is much larger than
 #: the others D is nearly free, and a tenth of the best D costs 0.5 % of mu there
 _SPREAD = 10.0
-#: factor that D is made larger or smaller by at most
-_LARGEST = 1e3
 #: mean error of the logarithm with which a fit of fewer states is taken
 _FITTED = 0.05
 

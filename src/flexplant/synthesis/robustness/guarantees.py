@@ -25,15 +25,11 @@ from ...store import Value
 from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising, smallest_with_block
-from .mu_bounds import INTERVALS, Cover, Covered, sought
+from .mu_bounds import INTERVALS, SOUGHT, Cover, Covered, sought
 from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
 from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
-#: largest multiple of an uncertainty that the quick bound tries
-_REACH = 2.0
-#: frequencies that start a search for the largest gain
-_SOUGHT = 5
 #: frequencies around the worst one at which gains are compared
 _BAND = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 20), -np.geomspace(1e-4, 0.3, 20)])
 
@@ -194,7 +190,7 @@ def robust_stability(
     least = between(resolution, "resolution", 0.0, 1.0, hint)
     chance = generator(rng)
     if quick:
-        first = _quick(uncertain, blocks, count, chance)
+        first = _quick(uncertain, blocks, least, count, chance)
         if first is not None:
             return first
     loop = uncertain_loop(uncertain, blocks)
@@ -265,7 +261,11 @@ def _worst_machine(
 
 
 def _quick(
-    uncertain: UncertainPlant[Any], blocks: tuple[Any, ...], count: int, rng: np.random.Generator
+    uncertain: UncertainPlant[Any],
+    blocks: tuple[Any, ...],
+    least: float,
+    count: int,
+    rng: np.random.Generator,
 ) -> RobustStability | None:
     """Return the result with one channel for each mode if it proves stability, otherwise None."""
     if not uncertain.is_of_frequencies:
@@ -280,7 +280,7 @@ def _quick(
     if not upper < 1.0:
         return None
     # the grid goes through the places of the modes at Deltas of a size, not beyond
-    size = 1.0 / max(upper, 1.0 / _REACH)
+    size = 1.0 / max(upper, least)
     upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
     others = [Verified("modes, each by one channel", float(len(channels)), "a grid over frequency")]
     none = np.zeros(0)
@@ -480,7 +480,7 @@ def _candidates(
     where = block_places(listed)
     chosen = [float(found.omega)]
     for omega in found.frequencies[np.argsort(-found.bounds)]:
-        if len(chosen) < _SOUGHT and all(abs(omega - one) > 1e-2 * one for one in chosen):
+        if len(chosen) < SOUGHT and all(abs(omega - one) > CLOSE * one for one in chosen):
             chosen.append(float(omega))
     results: list[tuple[float, Perturbation]] = []
     for omega in chosen:

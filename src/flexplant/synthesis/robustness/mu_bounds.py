@@ -19,6 +19,7 @@ from ...arrays import ComplexArray, FloatArray
 from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
+from ...lti.frequency_sweep import DRAWN, around_resonance
 from ...lti.modal_map import obstacle
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
@@ -34,16 +35,15 @@ from .uncertainty_blocks import Perturbation, Place, Scalings, block_places, eve
 from .upper import WIDE, centred, reached_level, reached_levels, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
-_SOUGHT, _STARTS = 8, 10
+SOUGHT, _STARTS = 8, 10
 #: relative distance of the level to the largest upper bound found at a frequency
 ABOVE = 5e-3
 #: what a bar calls the intervals of frequency that are covered
 INTERVALS = "intervals of frequency"
 #: intervals at most; larger systems are covered by sampling instead of Hamiltonians
 _INTERVALS, _LARGE = 3000, 260
-#: sampling within an interval, in half widths of the resonances, and for the rest of it
-_OFFSETS = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
-_POINTS = 24  # evenly, and by the logarithm
+#: frequencies that sample an interval evenly, and as many by the logarithm, beside the resonances
+_POINTS = 24
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -177,10 +177,10 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
 
 def sought(M: StateSpace, found: Covered) -> list[float]:
     """Return the frequencies [rad/s] at which perturbations are sought: the worst and 0."""
-    worst = [float(one) for one in found.frequencies[np.argsort(-found.bounds)[:_SOUGHT]]]
+    worst = [float(one) for one in found.frequencies[np.argsort(-found.bounds)[:SOUGHT]]]
     poles = M.poles()
     light = poles[poles.imag > 0]
-    swing = light[np.argsort(-light.real / np.abs(light))[:_SOUGHT]].imag
+    swing = light[np.argsort(-light.real / np.abs(light))[:SOUGHT]].imag
     return list(dict.fromkeys([float(found.omega), *worst, *swing.tolist(), 0.0]))
 
 
@@ -242,8 +242,7 @@ class Cover:
     blocks: Sequence[Block]
     leveled: Sequence[bool] | None = None
     heights: Heights | None = None
-    least: float = 1e-12
-    accuracy: float = ABOVE
+    least: float = ROUNDING
 
     def __post_init__(self) -> None:
         g = self.M
@@ -257,7 +256,7 @@ class Cover:
         light = poles[poles.imag > 0]
         light = light[np.argsort(light.imag)]
         #: poles that swing; of those with one peak, as of a mode and its observer, the first
-        self.swinging = light[np.diff(light.imag, prepend=-np.inf) > _OFFSETS[1] * -light.real]
+        self.swinging = light[np.diff(light.imag, prepend=-np.inf) > DRAWN[1] * -light.real]
         #: whether some scalings hold for many resonances: with G, all blocks at the level
         self.shares = bool(np.any(self.scalings.of_G)) and not self.scalings.skewed
         self.level = self.least
@@ -329,8 +328,8 @@ class Cover:
             freer = upper_level(M, self.scalings, found.x, enough=enough)
             found = min(found, freer, key=itemgetter(0))
         self.found.append((omega, found.level))
-        if not found.level * (1 + self.accuracy) ** 2 <= self.level:
-            self.level = max(self.level, found.level * (1 + self.accuracy) ** 2)
+        if not found.level * (1 + ABOVE) ** 2 <= self.level:
+            self.level = max(self.level, found.level * (1 + ABOVE) ** 2)
             self.omega = omega
         if np.isfinite(self.level):
             self.last = [*self.last[-30:], (omega, found.x)]
@@ -446,8 +445,7 @@ class Cover:
         real = self.poles[self.poles.imag == 0]
         kept = np.concatenate([real, self.swinging])
         swing, width = kept.imag, np.abs(kept.real)
-        offsets = np.concatenate([-_OFFSETS[:0:-1], _OFFSETS])
-        near = (swing[:, None] + width[:, None] * offsets).ravel()
+        near = (swing[:, None] + width[:, None] * around_resonance()).ravel()
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
         end = min(high, max(top, 10 * low))
         base = np.linspace(low, end, _POINTS)

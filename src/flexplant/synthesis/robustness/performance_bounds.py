@@ -12,14 +12,11 @@ from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from .mu_bounds import INTERVALS, Cover, MuBounds, mu
 from .uncertain_loops import UncertainLoop, uncertain_loop
 
-#: relative accuracy of mu of a step of the D-K iteration
-_ACCURACY = 0.02
 
-
-def performance_bound(loop: UncertainLoop, accuracy: float = _ACCURACY) -> tuple[float, float]:
+def performance_bound(loop: UncertainLoop) -> tuple[float, float]:
     """Return mu of robust performance from above, real Deltas real, and where it is [Hz]."""
     blocks = [*loop.blocks, loop.performance]
-    found = Cover(loop.system, blocks, heights=loop.heights, accuracy=accuracy).run()
+    found = Cover(loop.system, blocks, heights=loop.heights).run()
     return float(np.sqrt(found.level)), float(loop.freq(found.omega))
 
 

@@ -6,11 +6,7 @@ import numpy as np
 
 from ...arrays import ComplexArray, FloatArray
 from ...plant.uncertainty.delta_blocks import RepeatedScalar
-from .uncertainty_blocks import Scalings, block_places, osborne
-
-#: G relative to Im M at a resonance. One half makes the bound of a mode alone zero at all
-#: frequencies; what is above it is left for the modes nearby
-_SHARE = 0.6
+from .uncertainty_blocks import SHARE, Scalings, block_places, osborne
 
 
 def shared_scalings(M: ComplexArray, scalings: Scalings) -> FloatArray:
@@ -44,7 +40,7 @@ def shared_scalings(M: ComplexArray, scalings: Scalings) -> FloatArray:
         if place.block.real:
             response = even[:, place.z, place.w]
             peak = response[np.argmax(np.linalg.norm(response, axis=(1, 2)))]
-            turn = -_SHARE * (peak - peak.conj().T) / 2j
+            turn = -SHARE * (peak - peak.conj().T) / 2j
             x[own.stop : all_x.stop] = _coordinates(root[:, None] * turn * root, basis)
     return x
 

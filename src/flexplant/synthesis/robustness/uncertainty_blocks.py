@@ -14,6 +14,10 @@ from ...lti.statespace import StateSpace, as_statespace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
 from ...tolerances import ROUNDING, TINY
 
+#: G of real mu over D, relative to Im M at a resonance. One half makes the bound of a mode alone
+#: zero at all frequencies; what is above it is left for the modes nearby
+SHARE = 0.7
+
 
 class Place(NamedTuple):
     """A block and where its channels are."""

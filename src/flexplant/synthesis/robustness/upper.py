@@ -11,17 +11,15 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ...arrays import ComplexArray, FloatArray, IntArray
-from ...tolerances import RESIDUAL, TINY
+from ...tolerances import MOST_STEPS, NEGLIGIBLE, RANK, RESIDUAL, TINY, TYPED
 from .uncertainty_blocks import Scalings, osborne
 
-#: Newton decrement at which a centre is left; steps for one
-_CENTRED, _STEPS = 0.3, 40
+#: Newton decrement at which a centre is left
+_CENTRED = 0.3
 #: growth of the weight of a skewed level from one centre to the next
 _GROWTH = 10.0
 #: part of the way from the level that scalings reach back to the level they were centred at
 _BACK = 0.15
-#: levels; relative distance of a level to what its centre reaches, at which it is the smallest
-_LEVELS, _SETTLED = 200, 2e-3
 #: G relative to the trace of D times the size of M, above which it is too large: G can only cancel
 #: Im M, where D of the blocks are similar; a larger G lowers a bound by up to a few percent, but
 #: its scalings hold on shorter intervals only
@@ -67,7 +65,7 @@ def upper_level(
     x = x / np.sum(scalings.start * x)
     best = Certified(max(reached, 0.0), x)
     level = 1.5 * max(reached, RESIDUAL * size)
-    for _ in range(_LEVELS):
+    for _ in range(MOST_STEPS):
         if best.level <= enough:
             return best
         x = centred(W, scalings, x, level, widest=widest)
@@ -76,7 +74,7 @@ def upper_level(
             return Certified(RESIDUAL * size, x)
         if reached < best.level:
             best = Certified(reached, x)
-        if level - reached <= _SETTLED * level:
+        if level - reached <= NEGLIGIBLE * level:
             break
         level = reached + _BACK * (level - reached)
     return best
@@ -142,7 +140,7 @@ def centred(
     x: FloatArray,
     level: float,
     *,
-    steps: int = _STEPS,
+    steps: int = MOST_STEPS,
     widest: float = WIDE,
 ) -> FloatArray:
     """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level."""
@@ -180,7 +178,7 @@ def _descended(
         gradient, hessian = derivatives(x)
         step, decrement = _newton_step(hessian, gradient, trace)
         # the value is off by the square of it
-        if not decrement > 1e-6:
+        if not decrement > TYPED:
             break
         # full steps from afar lower it too, but end in scalings that hold at one frequency only
         t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
@@ -274,13 +272,13 @@ def _skewed(
         gradient[fixed], hessian[fixed, fixed] = of_level
         return gradient, hessian
 
-    for _ in range(_LEVELS):
-        y = _descended(y, merit, derivatives, _STEPS)
+    for _ in range(MOST_STEPS):
+        y = _descended(y, merit, derivatives, MOST_STEPS)
         x, level = split(y)
         reached = reached_level(W, scalings, x)
         if reached < best.level:
             best = Certified(reached, x)
-        if best.level <= enough or barriers / t <= _SETTLED * max(level, TINY):
+        if best.level <= enough or barriers / t <= NEGLIGIBLE * max(level, TINY):
             break
         t *= _GROWTH
     return Certified(max(best.level, 0.0), best.x)
@@ -293,7 +291,7 @@ def _newton_step(
     size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), TINY))
     scaled = hessian * size * size[:, None]
     # of a unit diagonal: keeps a singular Hessian solvable
-    scaled.reshape(-1)[:: len(size) + 1] += 1e-13
+    scaled.reshape(-1)[:: len(size) + 1] += RANK
     right = gradient[:, None] if trace is None else np.column_stack([gradient, trace])
     _, solution, failed = la.lapack.dposv(scaled, size[:, None] * right)
     if failed:

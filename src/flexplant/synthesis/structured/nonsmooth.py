@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray
-from ...tolerances import NEGLIGIBLE, SAME
+from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, SAME, TINY, TYPED
 
 #: value (infinite where not defined) and gradient
 Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -18,7 +18,7 @@ Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
 _ARMIJO, _WOLFE, _BISECTIONS = 1e-4, 0.9, 30
 #: number of steps whose total gain below this limit ends a search (the gain becomes ever smaller
 #: where parameters grow without bound)
-_STALLED, _GAIN = 8, 1e-4
+_STALLED, _GAIN = 8, FOUR_DIGITS
 #: the first step, relative to the size of the parameters
 _FIRST = 0.3
 #: fraction of the decrease of the model that a step has to reach; below and above which the model
@@ -26,8 +26,6 @@ _FIRST = 0.3
 _ENOUGH, _POOR, _GOOD = 0.05, 0.3, 0.7
 #: factors of the damping after a step that is good, poor, refused with a new peak, and without
 _LESS, _MORE, _ANEW, _AGAIN = 0.2, 3.0, 2.0, 5.0
-#: number of refused steps in a row that ends a search, and a decrease that counts as zero
-_REFUSED, _SETTLED = 20, 1e-6
 
 
 class Pieces(NamedTuple):
@@ -140,8 +138,8 @@ def minimax(
     # [ApkarianNoll2006]_
     value, _ = function.value(x)
     pieces, weights, mu = function.pieces(x), None, None
-    values, refused = [value], 0
-    while len(values) <= steps and refused <= _REFUSED and not spent():
+    values, refused = [value], False
+    while len(values) <= steps and not spent():
         if mu is None:
             slope = float(np.linalg.norm(pieces.gradient[np.argmax(pieces.value)]))
             if not slope:  # the number does not depend on the parameters here
@@ -149,7 +147,7 @@ def minimax(
             mu = slope / (_FIRST * max(1.0, float(np.linalg.norm(x))))
         model = _Model(pieces, value, weights)
         step, weights, decrease = model.step(mu)
-        if decrease <= _SETTLED:
+        if decrease <= TYPED:
             far = float(np.linalg.norm(step)) >= max(1.0, float(np.linalg.norm(x)))
             if refused or far or mu <= 1e-3 * model.size:  # hardly damped
                 break
@@ -158,14 +156,14 @@ def minimax(
         new, place = function.value(x + step)
         part = (value - new) / decrease
         if part >= _ENOUGH:
-            x, value, refused, weights = x + step, new, 0, None
+            x, value, refused, weights = x + step, new, False, None
             pieces = function.pieces(x)
             values.append(value)
             mu *= _LESS if part > _GOOD else _MORE if part < _POOR else 1.0
             if len(values) > _STALLED and values[-_STALLED - 1] - value <= _GAIN:
                 break
         else:
-            refused += 1
+            refused = True
             if np.isfinite(new):
                 pieces = pieces.and_those(function.piece(x, place))
                 weights = np.append(weights, np.zeros(pieces.value.size - weights.size))
@@ -201,7 +199,7 @@ def downhill(gradients: FloatArray, below: FloatArray) -> tuple[FloatArray, Floa
     # [LawsonHanson1995]_
     from scipy.optimize import nnls
 
-    size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny ** 0.5)
+    size = max(float(np.linalg.norm(gradients, axis=1).max()), np.sqrt(TINY))
     # small against the rest of the quadratic program, large against the rounding of its squares
     lift = NEGLIGIBLE
     G, c = gradients / size, np.maximum(below / size**2, -1.0 / lift)

@@ -32,10 +32,9 @@ from .structures import ControllerFamily, ControllerStructure, as_system
 _STABLE, _FEW, _MANY = 300, 40, 300
 #: how many starts are continued
 _CONTINUED = 4
-#: of the evaluations, what is for the starts; the rest is for continuing the best of them
+#: of the evaluations, what is for the starts; the rest is for continuing the best of them, and as
+#: large a part of those that are left is for each smaller structure at most
 _SHARE = 0.7
-#: of the evaluations that are left, what each smaller structure takes at most
-_QUARTER = 0.25
 #: spreads of starts around the structure's own, in turn, and around the best end
 _SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
 
@@ -501,10 +500,10 @@ class _StructureSearch:
     def _minimised(self, family: ControllerFamily) -> FloatArray | None:
         """Return the best parameters of another structure, from its first start and one near it.
 
-        With a quarter of the evaluations that are left; None when it is not stabilised.
+        None when it is not stabilised.
         """
         left = self.limit - self.evaluations
-        other = _StructureSearch(family, self.problems, _QUARTER * left, self._judging)
+        other = _StructureSearch(family, self.problems, (1.0 - _SHARE) * left, self._judging)
         # a plant without a controller may be stationary: a free mass is
         draw = np.random.default_rng(family.order).standard_normal(family.first.size)
         starts = (family.first, family.first + family.spread * draw)
