@@ -21,9 +21,6 @@ from ..work import Work
 from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
 from .problem import ADVICE, Problem, Search, SearchResult, layouts_of
 
-#: from this number of trials on a lower bound shows first which of them could be better
-_MANY = 24
-
 
 @dataclass(frozen=True, eq=False)
 class Exchange(Search):
@@ -127,7 +124,7 @@ class _Run:
         # ten scores, and leaves few of hundreds to be computed
         low = np.full(len(trials), -np.inf)
         scorer = self.problem.layouts.scorer
-        if len(trials) >= _MANY and np.isfinite(value) and isinstance(scorer, Quadratic):
+        if np.isfinite(value) and isinstance(scorer, Quadratic):
             if self.tangent is None or self.tangent[0] != tuple(chosen):
                 weights = chosen_rows([chosen], self.problem.total)[0]
                 self.tangent = tuple(chosen), scorer.inner_tangent(self.problem.root, weights)

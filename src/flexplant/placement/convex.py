@@ -125,8 +125,6 @@ def ascended(
     function: Callable[[FloatArray], tuple[float, FloatArray] | None],
     branch: Branch,
     start: FloatArray,
-    *,
-    steps: int,
     close: Callable[[float, float], bool],
 ) -> tuple[float, FloatArray]:
     """Return a number above the function at every choice of a branch, and weights near the largest.
@@ -137,7 +135,7 @@ def ascended(
     weights, step = branch.nearest(start), 0.0
     most, kept, highest = np.inf, weights, -np.inf
     before: tuple[FloatArray, FloatArray] | None = None
-    for _ in range(steps):
+    for _ in range(MOST_STEPS):
         found = function(weights)
         if found is None:
             break
@@ -242,7 +240,6 @@ def least_sum(
         inverse,
         branch,
         start,
-        steps=MOST_STEPS,
         close=lambda h, most: 1.0 / h - 1.0 / most <= NEGLIGIBLE * (1.0 / h + size),
     )
     if not np.isfinite(most):

@@ -13,15 +13,13 @@ from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..store import checked
-from ..tolerances import NEGLIGIBLE, RANK, ROOT, TINY
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, RANK, ROOT, TINY
 from ..words import one_of
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
 from .criterion import Criterion, Scorer, by_size
 
 MEASURES = ("trace", "log det", "least")
-#: steps to the largest log det
-_STEPS = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class SummedWorth(Scorer):
         kept = list(required)
         free = np.sort(np.delete(self.worth, kept))[::-1]
         used = np.concatenate([self.worth[kept], free[: count - len(kept)]])
-        return -float(used.sum() + 1e-14 * np.abs(used).sum())  # rounding of the sum
+        return -float(used.sum() + RANK * np.abs(used).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +124,7 @@ class LogDetOfSum(SummedMatrices, Convex):
         try:
             root = np.linalg.cholesky(total / size[:, :, None] / size[:, None, :])
             part = np.einsum("mii->mi", root)
-            if np.all(part.min(axis=1) > 1e-4):  # far from singular: nothing to decide
+            if np.all(part.min(axis=1) > FOUR_DIGITS):  # far from singular: nothing to decide
                 return np.asarray(-2.0 * np.sum(np.log(part) + np.log(size), axis=1))
         except np.linalg.LinAlgError:
             pass
@@ -153,11 +151,7 @@ class _LogDet(Below):
         # a weight of zero may make the sum singular, so that the start is moved inwards
         inner = 0.9 * branch.nearest(start) + 0.1 * branch.centre(start.size)
         most, weights = ascended(
-            self.costs.climbed,
-            branch,
-            inner,
-            steps=_STEPS,
-            close=lambda value, most: most - value <= NEGLIGIBLE,
+            self.costs.climbed, branch, inner, close=lambda value, most: most - value <= NEGLIGIBLE
         )
         return -most - ROOT, weights
 

@@ -20,7 +20,7 @@ from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...store import Value, checked
-from ...tolerances import MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED, TYPED
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED, TYPED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
@@ -34,9 +34,6 @@ _REGULAR, _ADDED, _SINGULAR = 0.005, 0.003, 0.05
 #: secants between two bisections of a search, and by how many times a step that rises from a bound
 #: is wider than the last
 _SECANTS, _WIDER = 3, 8.0
-#: by how much a norm may exceed its gamma, relative to the distance from the smallest one. Of a lag
-#: with 0.26 of 0.3 % the loop on the plant itself was 0.7 % worse
-_MISSED = 0.1
 
 _LEAST = (
     "rounding lets no controller of a smaller gamma be computed than that of least quadratic cost, "
@@ -242,7 +239,7 @@ def _accepted(problem: Prepared, high: float, step: float) -> tuple[StateSpace |
         controller = _attempt(problem, high * (1.0 + step)).controller
         if controller is not None:
             norm = _loop_norm(problem, controller)
-            if norm <= high * (1.0 + step + _MISSED * max(step, NEGLIGIBLE)):
+            if norm <= high * (1.0 + step) * (1.0 + FOUR_DIGITS):
                 return controller, norm
         step = max(2.0 * step, NEGLIGIBLE)
     return None, 1.0
