@@ -72,7 +72,7 @@ def test_the_peak_gain_in_closed_form():
         assert h2 == pytest.approx(h2_of(given, found.system), rel=1e-8)
         # both count alike where they meet: 2 / k = H2
         assert found.gamma == pytest.approx(max(2.0 * peak, h2), rel=1e-9)
-        assert 2.0 * peak == pytest.approx(h2, rel=1e-3)
+        assert 2.0 * peak == pytest.approx(h2, rel=2e-3)  # where gamma is flat
 
 
 @pytest.mark.slow
