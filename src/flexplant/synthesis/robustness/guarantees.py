@@ -24,7 +24,7 @@ from ...seeds import MOST, generator
 from ...store import Value
 from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
-from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising, smallest_with_block
+from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising
 from .mu_bounds import INTERVALS, SOUGHT, Cover, Covered, sought
 from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
@@ -227,14 +227,10 @@ def _worst(
     if loop.neglected is None:
         return destabilising(loop.system, loop.blocks, omegas, upper, rng)
     where, best = block_places(loop.blocks), None
-    alone = not loop.uncertain.delta_blocks  # reals and one full block, the neglected modes
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
         for start in power_iterations(gain, where, rng, omega):
-            if alone:
-                one = smallest_with_block(gain, where, start, 0.99 / upper)
-            else:
-                one = crossing_multiple(gain, where, start)
+            one = crossing_multiple(gain, where, start)
             if one is not None and (best is None or one[0] < best.size):
                 best = Destabilising(one[0], one[1], omega)
     return best

@@ -14,14 +14,7 @@ from ...lti.statespace import StateSpace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
 from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, SPLIT, TINY
 from .power_starts import power_iterations
-from .uncertainty_blocks import (
-    Perturbation,
-    Place,
-    block_places,
-    matrix_of,
-    perturbed,
-    realised_delta,
-)
+from .uncertainty_blocks import Perturbation, Place, block_places, matrix_of, realised_delta
 
 #: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
 _MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
@@ -236,49 +229,6 @@ def _all_signs(count: int) -> FloatArray:
     """Return all signs of a number of Deltas (n, count); the opposite ones are left out."""
     rest = list(itertools.product([1.0, -1.0], repeat=count - 1))
     return np.array([(1.0, *signs) for signs in rest])
-
-
-def smallest_with_block(
-    M: ComplexArray, where: Sequence[Place], start: Perturbation, least: float
-) -> tuple[float, Perturbation] | None:
-    """Return the smallest t for real scalars and one full block, the last, at a frequency."""
-    # with the reals closed at t q, the block needs `t sigma_max(F(M, t q)) = 1`: its own worst is
-    # known. The reals are moved one after the other to an end of their interval
-    repeats = [p.block.w for p in where[:-1]]
-    sizes = least * np.geomspace(1.0, 100.0, 60)
-
-    def closed(q: FloatArray, t: FloatArray) -> ComplexArray:
-        return perturbed(M, t[:, None, None] * np.diag(np.repeat(q, repeats)))
-
-    def first(q: FloatArray) -> float:
-        over = sizes * np.linalg.norm(closed(q, sizes), 2, axis=(1, 2)) >= 1.0
-        if not over.any():
-            return np.inf
-        i = int(np.argmax(over))
-        low, high = sizes[max(i - 1, 0)], sizes[i]
-        for _ in range(20):
-            t = 0.5 * (low + high)
-            there = t * np.linalg.norm(closed(q, np.array([t])), 2, axis=(1, 2))[0] >= 1.0
-            low, high = (low, t) if there else (t, high)
-        return float(high)
-
-    q = np.array([number.real for number in start.scalars])
-    best = first(q)
-    for _ in range(ASCENTS):
-        before = best
-        for i in range(q.size):
-            for value in (-1.0, 1.0):
-                moved = q.copy()
-                moved[i] = value
-                if value != q[i] and (found := first(moved)) < best:
-                    best, q = found, moved
-        if not best < before * (1.0 - FOUR_DIGITS):
-            break
-    if not np.isfinite(best):
-        return None
-    left, _, right = np.linalg.svd(closed(q, np.array([best]))[0])
-    pair = (np.asarray(left[:, 0]), np.asarray(right[0].conj()))
-    return best, Perturbation(tuple(q.astype(complex).tolist()), (pair,), start.omega)
 
 
 def loop_matrix(M: StateSpace, delta: StateSpace, t: float) -> FloatArray:
