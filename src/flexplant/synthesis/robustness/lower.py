@@ -12,19 +12,19 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
-from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, SPLIT, TINY
+from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, SPLIT, TINY
 from .power_starts import power_iterations
 from .uncertainty_blocks import Perturbation, Place, block_places, matrix_of, realised_delta
 
-#: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
-_MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
+#: sizes at which a loop is closed, from the least possible one to the largest that is of interest
+_SIZES, _FARTHEST = 24, 100.0
 #: phases of complex blocks that are tried
 _PHASES = 25
 #: real Deltas of a matrix of which all signs are tried; of more, random corners that are tried, and
 #: how many of these are improved
 _FEW_SIGNS, _CORNERS, _CLIMBED = 10, 128, 12
-#: real Deltas of which all signs are tried, and the loops that are closed for it
-_FEW, _LOOPS = 5, 256
+#: real Deltas of which all signs are tried in closed loop
+_FEW = 5
 #: steps towards worse signs of the real Deltas
 ASCENTS = 6
 
@@ -38,23 +38,18 @@ class Destabilising(NamedTuple):
 
 
 def smallest_multiple(
-    M: StateSpace, blocks: Sequence[Block], found: Perturbation, least: float, most: float
+    M: StateSpace, blocks: Sequence[Block], found: Perturbation, least: float, sizes: FloatArray
 ) -> Destabilising | None:
-    """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable."""
+    """Return the multiple t up to some size at which ``t Delta`` makes M's loop unstable."""
     # the loop's eigenvalues decide: on the size before it is stable, on this one it is not
     delta = realised_delta(found, blocks)
-    sizes = least * _MULTIPLES
-    if most < sizes[-1]:  # one loop decides whether this perturbation is worse than the best
-        sizes = np.array([most])
-    stable, unstable = 0.0, np.inf
-    for t in sizes:
-        if _abscissa(M, delta, t)[0] >= 0:
-            unstable = float(t)
+    stable = (1.0 - CLOSE) * least
+    for unstable in sizes.tolist():
+        if _abscissa(M, delta, unstable)[0] >= 0:
             break
-        stable = float(t)
-    if not np.isfinite(unstable):
+        stable = unstable
+    else:
         return None
-    stable = max(stable, 0.99 * least)
     while unstable - stable > FOUR_DIGITS * unstable:
         middle = 0.5 * (stable + unstable)
         if _abscissa(M, delta, middle)[0] >= 0:
@@ -312,19 +307,11 @@ def _at_corners(
     real = all(isinstance(block, RepeatedScalar) and block.real for block in blocks)
     if not real or len(blocks) > _FEW:
         return best
-    corners = [
-        Perturbation(signs, (), 0.0)
-        for signs in itertools.product([-1.0 + 0j, 1.0 + 0j], repeat=len(blocks))
-    ]
-    for corner in corners:
-        most = 100.0 * least if best is None else best.size * (1 - SPLIT)
-        delta = realised_delta(corner, blocks)
-        for t in np.geomspace(least, most, _LOOPS // len(corners) + 1)[1:].tolist():
-            if _abscissa(M, delta, t)[0] >= 0:
-                found = smallest_multiple(M, blocks, corner, least, t)
-                if found is not None and (best is None or found.size < best.size):
-                    best = found
-                break
+    for signs in itertools.product([-1.0 + 0j, 1.0 + 0j], repeat=len(blocks)):
+        most = _FARTHEST * least if best is None else best.size * (1 - SPLIT)
+        sizes = np.geomspace(least, most, _SIZES)
+        found = smallest_multiple(M, blocks, Perturbation(signs, (), 0.0), least, sizes)
+        best = best if found is None else found
     return best
 
 
@@ -338,8 +325,11 @@ def _worse_signs(
     """Return the best so far, after steps from one start to worse signs of its real Deltas."""
     candidate: Perturbation | None = start
     for _ in range(ASCENTS):
-        most = best.size if best is not None else 100.0 * least
-        one = None if candidate is None else smallest_multiple(M, blocks, candidate, least, most)
+        if candidate is None:
+            break
+        # one loop decides whether this perturbation is worse than the best
+        known = np.geomspace(least, _FARTHEST * least, _SIZES) if best is None else [best.size]
+        one = smallest_multiple(M, blocks, candidate, least, np.asarray(known))
         if one is None:
             break
         # no change of the perturbation for rounding
