@@ -215,6 +215,7 @@ def test_the_quick_bound_of_one_mode_is_its_tolerance():
         _quick(
             plant().uncertain(frequency={mode: part * edge}),
             loop.blocks,
+            0.5,
             2,
             np.random.default_rng(0),
         )

@@ -23,7 +23,7 @@ from ...store import Value, checked
 from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROUNDING, SETTLED, TYPED
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
-from .lower_bound import INACCURATE, both_sides, coupling, pointwise_bound
+from .lower_bound import both_sides, coupling, pointwise_bound
 from .singular import lacking, made_regular
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
@@ -303,7 +303,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
         (X, F), (Y, Ht) = solutions
         values = coupling(X, Y)
         rooms[2] = _room(values) - gamma**-2
-        if values.max(initial=0.0) > gamma**2 * (1.0 + INACCURATE):
+        if values.max(initial=0.0) > gamma**2 * (1.0 + FOUR_DIGITS):
             return _Attempt(None, True, rooms)
         return _Attempt(central(problem, gamma, X, F, Y, Ht.T), rooms=rooms)
     except (la.LinAlgError, OnAxisError, FlexplantError):  # near the least gamma one of them fails
@@ -314,7 +314,7 @@ def _room(values: FloatArray) -> float:
     """Return one over the eigenvalue that ends a solution: smooth in gamma, 0 at the limit."""
     # the largest one becomes infinite at the limit and returns from the negative side beyond
     least, most = np.min(values, initial=0.0), np.max(values, initial=0.0)
-    one = float(least if least < -INACCURATE * most else most)
+    one = float(least if least < -FOUR_DIGITS * most else most)
     return 1.0 / one if abs(one) > ROUNDING else np.inf
 
 

@@ -15,7 +15,7 @@ from ...lti.frequency_sweep import POINTS, ROUNDS, highest, resonance_grid
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
-from ...tolerances import NEGLIGIBLE, RANK, SAME, SPLIT
+from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, RANK, SAME, SPLIT
 from ..preparation import Prepared
 
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
@@ -98,11 +98,6 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(M.conj().swapaxes(1, 2), dtype=np.complex128)
 
 
-#: relative: errors of X and Y (their residuals are 1e-6), by which eigenvalues of X may be negative
-#: and rho(X Y) may exceed gamma^2
-INACCURATE = 1e-5
-
-
 class FullInformation(NamedTuple):
     """``x1' = A x1 + B1 w + B2 v``, ``z = C x1 + D11 w + D12 v``, all states known; x1 = T' x.
 
@@ -142,7 +137,7 @@ class FullInformation(NamedTuple):
         self, X: FloatArray, F: FloatArray, values: FloatArray, vectors: FloatArray
     ) -> bool:
         """Return whether a solution with its gain has a negative eigenvalue beyond rounding."""
-        if not X.size or values[0] >= -INACCURATE * max(values[-1], -values[0]):
+        if not X.size or values[0] >= -FOUR_DIGITS * max(values[-1], -values[0]):
             return False
         # a residual of the equation moves X by the residual divided by twice the slowest decay
         x = vectors[:, 0]
@@ -215,7 +210,7 @@ def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
         values.append(one.T @ X @ one.T.T)
     if len(values) < 2:
         return False
-    return bool(coupling(*values).max(initial=0.0) > gamma**2 * (1.0 + INACCURATE))
+    return bool(coupling(*values).max(initial=0.0) > gamma**2 * (1.0 + FOUR_DIGITS))
 
 
 def coupling(X: FloatArray, Y: FloatArray) -> FloatArray:

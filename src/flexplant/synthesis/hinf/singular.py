@@ -22,14 +22,11 @@ from ..preparation import Prepared
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken.
 #: What acts on a chain of k integrators costs the k-th root of its size
 LEVELS = (NEGLIGIBLE, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
-#: where the infimum of gamma is zero, gamma falls at least to this fraction from level to level
+#: where the infimum of gamma is zero, gamma falls at least to this fraction from level to level;
+#: where it is reached by infinite gain, the fastest pole grows by the reciprocal
 _FALL = 0.5
-#: and at least to this fraction from the first level to the last
-_SMALL = 2e-2
 #: a gamma that grows by less from one level to the next has settled, by more it is rounding
 _SETTLED = 1.2
-#: a fastest pole that grows by more than this factor when the level is a tenth has no limit
-_GROWTH = 3.0
 
 #: what an undamped mode lacks, and what to do about it
 _MISSED = {
@@ -218,7 +215,7 @@ def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: 
     least = int(np.argmin(gammas))
     settled = any(later < _SETTLED * gammas[least] for later in gammas[least + 1 :])
     gammas = gammas[: least + 1]
-    if len(gammas) < 3 or settled or gammas[-1] > _SMALL * gammas[0]:
+    if len(gammas) < 3 or settled or gammas[-1] > CLOSE * gammas[0]:
         return
     # rounding may hold the last one up
     if gammas[-2] > _FALL * gammas[-3] or gammas[-1] * _SETTLED > gammas[-2]:
@@ -248,7 +245,7 @@ def _with_notes(found: Sequence[_Found], lack: Lacking, problem: Prepared) -> So
             f"with less than {one.level:.0e} added the equations are solved in rounding no more: "
             "a smaller gamma may exist."
         )
-    if any(not a.settles(b) and b.speed > _GROWTH * a.speed for a, b in pairwise(found[-3:])):
+    if any(not a.settles(b) and a.speed < _FALL * b.speed for a, b in pairwise(found[-3:])):
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "

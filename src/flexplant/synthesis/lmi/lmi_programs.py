@@ -17,7 +17,7 @@ from ...lti.equations import OnAxisError
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...parallel import interruptible
 from ...store import Value, checked
-from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, NULL, RANK, TINY, TYPED
+from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, NULL, RANK, RESIDUAL, TINY, TYPED
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
 from ..hinf.lower_bound import both_sides, raised_bound
@@ -224,11 +224,6 @@ def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
 #: largest relative distance of a program's gamma from its lower bound; and how far above the bound
 #: the controller's own distance begins at most: with that, 0.5 %, it makes 1 %
 _GAP, _NEAR = 2e-2, 5e-3
-#: regularisation of Clarabel's equations: X and Y of smallest gammas are nearly singular, and its
-#: own 1e-8 leaves these gammas up to 4 % too large; 1e-11 fails on one plant in a hundred
-_REGULARISATION = 1e-10
-#: weight of the traces of X and Y next to gamma: it picks one of many, and keeps them finite
-_LITTLE = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,9 +337,12 @@ class Lmi(Value):
         """Return the smallest gamma of the program, as the solver gives it."""
         cp, gamma = modelling(), modelling().Variable()
         X, Y, constraints = projected(states, gamma)
-        goal = cp.Minimize(gamma + _LITTLE * (cp.trace(X) + cp.trace(Y)))
+        # a little of their traces picks one of many X and Y, and keeps them finite
+        goal = cp.Minimize(gamma + NULL * (cp.trace(X) + cp.trace(Y)))
         settings = dict.fromkeys(TOLERANCES, self.tolerance)
-        settings["static_regularization_constant"] = _REGULARISATION
+        # X and Y of smallest gammas are nearly singular: Clarabel's own 1e-8 leaves these gammas up
+        # to 4 % too large; 1e-11 fails on one plant in a hundred
+        settings["static_regularization_constant"] = RESIDUAL
         try:
             solve_program(cp.Problem(goal, constraints), settings)
         except SolverError as error:

@@ -420,10 +420,6 @@ def within(speed: float) -> PoleDisc:
     return PoleDisc(float(centres[best]), float(radii[best]))
 
 
-#: largest part by which a reachable set shrinks in one sample
-_MOST = 0.9
-
-
 @dataclass(frozen=True)
 class ObjectivePrograms:
     """The semidefinite programs of one design."""
@@ -469,7 +465,7 @@ class ObjectivePrograms:
         """Return the rate at which the reachable set shrinks, in the plant's unit of time."""
         speed, dt = self.plant.speed, self.given.dt
         if spec.decay is None:
-            return min(rate, _MOST / speed) if dt else rate
+            return rate
         return float(1.0 - np.exp(-spec.decay * dt)) / speed if dt else spec.decay / speed
 
     def _poles(self, v: Variables, spec: PoleRegion) -> list[Any]:

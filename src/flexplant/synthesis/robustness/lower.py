@@ -20,11 +20,8 @@ from .uncertainty_blocks import Perturbation, Place, block_places, matrix_of, re
 _SIZES, _FARTHEST = 24, 100.0
 #: phases of complex blocks that are tried
 _PHASES = 25
-#: real Deltas of a matrix of which all signs are tried; of more, random corners that are tried, and
-#: how many of these are improved
-_FEW_SIGNS, _CORNERS, _CLIMBED = 10, 128, 12
-#: real Deltas of which all signs are tried in closed loop
-_FEW = 5
+#: choices of signs of real Deltas that are tried: all of a few Deltas, random ones of more
+_CORNERS = 32
 #: steps towards worse signs of the real Deltas
 ASCENTS = 6
 
@@ -189,30 +186,25 @@ def worst_corner(
     all corners of a few Deltas are tried, else one sign after the other is changed from many.
     """
     sizes = [p.block.w for p in where]
-    signs = _all_signs(len(where)) if len(where) <= _FEW_SIGNS else np.vstack([
-        np.where(np.array([one.scalars for one in starts]).real < 0, -1.0, 1.0),
-        rng.choice([-1.0, 1.0], (_CORNERS, len(where))),
-    ])  # fmt: skip
+    signs = _all_signs(len(where))
+    if signs is None:
+        first = np.where(np.array([one.scalars for one in starts]).real < 0, -1.0, 1.0)
+        signs = np.vstack([first, rng.choice([-1.0, 1.0], (_CORNERS, len(where)))])
 
     def values(signs: FloatArray) -> FloatArray:
         every = np.linalg.eigvals(M * np.repeat(signs, sizes, axis=-1)[:, None, :])
         return np.array([_largest_real(row) for row in every])
 
-    found = values(signs)
-    if len(where) > _FEW_SIGNS:
-        best = np.argsort(-np.abs(found))[:_CLIMBED]
-        signs, found = signs[best], found[best]
-        flips = 1.0 - 2.0 * np.eye(len(where))
-        while True:
-            moved = (signs[:, None] * flips).reshape(-1, len(where))
-            there = values(moved).reshape(len(signs), -1)
-            one = np.argmax(np.abs(there), axis=1)
-            size = np.abs(there[np.arange(len(one)), one])
-            better = size > np.abs(found) * (1.0 + SPLIT)
-            if not better.any():
-                break
-            signs = np.where(better[:, None], signs * flips[one], signs)
-            found = np.where(better, there[np.arange(len(one)), one], found)
+    found, better = values(signs), np.array([True])
+    flips = 1.0 - 2.0 * np.eye(len(where))
+    while np.any(better):
+        moved = (signs[:, None] * flips).reshape(-1, len(where))
+        there = values(moved).reshape(len(signs), -1)
+        one = np.argmax(np.abs(there), axis=1)
+        largest = there[np.arange(len(one)), one]
+        better = np.abs(largest) > np.abs(found) * (1.0 + SPLIT)
+        signs = np.where(better[:, None], signs * flips[one], signs)
+        found = np.where(better, largest, found)
     worst = int(np.argmax(np.abs(found)))
     if not found[worst]:
         return None
@@ -220,10 +212,10 @@ def worst_corner(
     return 1.0 / abs(found[worst]), Perturbation(scalars, (), 0.0)
 
 
-def _all_signs(count: int) -> FloatArray:
-    """Return all signs of a number of Deltas (n, count); the opposite ones are left out."""
-    rest = list(itertools.product([1.0, -1.0], repeat=count - 1))
-    return np.array([(1.0, *signs) for signs in rest])
+def _all_signs(count: int) -> FloatArray | None:
+    """Return all signs of a number of Deltas (n, count); None where there are too many."""
+    every = itertools.product([1.0, -1.0], repeat=count)
+    return np.array(list(every)) if 2**count <= _CORNERS else None
 
 
 def loop_matrix(M: StateSpace, delta: StateSpace, t: float) -> FloatArray:
@@ -305,12 +297,13 @@ def _at_corners(
     """Return the best so far, after every choice of signs of a few Deltas that are all real."""
     # at many sizes: those that destabilise may be a narrow range, stable on both sides
     real = all(isinstance(block, RepeatedScalar) and block.real for block in blocks)
-    if not real or len(blocks) > _FEW:
+    signs = _all_signs(len(blocks)) if real else None
+    if signs is None:
         return best
-    for signs in itertools.product([-1.0 + 0j, 1.0 + 0j], repeat=len(blocks)):
+    for corner in (signs + 0j).tolist():
         most = _FARTHEST * least if best is None else best.size * (1 - SPLIT)
         sizes = np.geomspace(least, most, _SIZES)
-        found = smallest_multiple(M, blocks, Perturbation(signs, (), 0.0), least, sizes)
+        found = smallest_multiple(M, blocks, Perturbation(tuple(corner), (), 0.0), least, sizes)
         best = best if found is None else found
     return best
 
