@@ -125,33 +125,30 @@ def _remedy(ranks: Sequence[str]) -> str:
     return " and ".join(cures).capitalize() + "."
 
 
-class Regularised:
-    """A problem with noise on each y and effort for each u, `level` of the channel's own size.
+def regularised(p: Prepared, level: float, *, modes: bool) -> Prepared:
+    """Return a problem with noise on each y and effort for each u, `level` of the channel's size.
 
     With `modes` w also acts where u does, and z sees what y does: no mode that u reaches and y sees
     is missed then.
     """
-
-    def __init__(self, problem: Prepared, level: float, modes: bool = False) -> None:
-        self.given, self.level = problem, level
-        nu, ny = problem.B2.shape[1], problem.C2.shape[0]
-        # a channel that does nothing has the largest size
-        size_u, size_y = (
-            np.where(own > 0.0, own, np.max(own, initial=0.0) or 1.0) for own in problem.own_sizes
-        )
-        gain = level * problem.own_gain
-        drive = (gain * problem.B2 / size_u)[:, : nu * modes]
-        sight = (gain * problem.C2 / size_y[:, None])[: ny * modes]
-        n, mu, my = problem.A.shape[0], drive.shape[1], len(sight)
-        self.problem = problem.replace(
-            B1=np.hstack([problem.B1, drive, np.zeros((n, ny))]),
-            C1=np.vstack([problem.C1, sight, np.zeros((nu, n))]),
-            D11=la.block_diag(problem.D11, np.zeros((my + nu, mu + ny))),
-            D12=np.vstack([problem.D12, np.zeros((my, nu)), level * np.diag(size_u)]),
-            D21=np.hstack([problem.D21, np.zeros((ny, mu)), level * np.diag(size_y)]),
-            u_scale=np.eye(nu),
-            y_scale=np.eye(ny),
-        ).with_unit_channels()
+    n, nu, ny = p.A.shape[0], p.B2.shape[1], p.C2.shape[0]
+    # a channel that does nothing has the largest size
+    size_u, size_y = (
+        np.where(own > 0.0, own, np.max(own, initial=0.0) or 1.0) for own in p.own_sizes
+    )
+    gain = level * p.own_gain
+    drive = (gain * p.B2 / size_u)[:, : nu * modes]
+    sight = (gain * p.C2 / size_y[:, None])[: ny * modes]
+    mu, my = drive.shape[1], len(sight)
+    return p.replace(
+        B1=np.hstack([p.B1, drive, np.zeros((n, ny))]),
+        C1=np.vstack([p.C1, sight, np.zeros((nu, n))]),
+        D11=la.block_diag(p.D11, np.zeros((my + nu, mu + ny))),
+        D12=np.vstack([p.D12, np.zeros((my, nu)), level * np.diag(size_u)]),
+        D21=np.hstack([p.D21, np.zeros((ny, mu)), level * np.diag(size_y)]),
+        u_scale=np.eye(nu),
+        y_scale=np.eye(ny),
+    ).with_unit_channels()
 
 
 class _Found(NamedTuple):
@@ -179,7 +176,8 @@ def made_regular(
     found: list[_Found] = []
     for level in LEVELS:
         try:
-            found.append(_with_level(Regularised(problem, level, bool(lack.modes)), solve, norm))
+            regular = regularised(problem, level, modes=bool(lack.modes))
+            found.append(_judged(problem, regular, solve(regular), level, norm))
         except FlexplantError:  # rounding hides what is smaller
             if not found:
                 raise
@@ -190,24 +188,25 @@ def made_regular(
     return _with_notes(found, lack, problem)
 
 
-def _with_level(
-    regular: Regularised,
-    solve: Callable[[Prepared], SolvedController],
+def _judged(
+    given: Prepared,
+    regular: Prepared,
+    found: SolvedController,
+    level: float,
     norm: Callable[[StateSpace], float],
 ) -> _Found:
     """Return the controller for one level, judged on the problem itself."""
-    given, found = regular.given, solve(regular.problem)
-    u, y = regular.problem.u_scale, regular.problem.y_scale
+    u, y = regular.u_scale, regular.y_scale
     parts = found.A, found.B @ y, u @ found.C, u @ found.D @ y
     K = StateSpace(*parts, inputs=given.y, outputs=given.u, dt=given.system.dt)
     gamma = norm(lft(given.system, K))
     if not np.isfinite(gamma):
         raise SolverError(
-            f"with noise and effort of {regular.level:.0e} added, the controller does not "
+            f"with noise and effort of {level:.0e} added, the controller does not "
             "stabilise in rounding, or a mode that z and w miss stays on the edge of stability. "
             "Weight the efforts and that motion in z, and give each sensor noise in w."
         )
-    return _Found(regular.level, K, gamma, found.notes)
+    return _Found(level, K, gamma, found.notes)
 
 
 def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: Lacking) -> None:

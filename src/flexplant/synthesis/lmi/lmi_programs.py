@@ -21,7 +21,7 @@ from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, NULL, RANK, RESIDUAL, TINY, T
 from ..controller import SolvedController
 from ..hinf.hinf_riccati import back_off_controller, h2_controller, resonance_gain
 from ..hinf.lower_bound import both_sides, raised_bound
-from ..hinf.singular import Regularised
+from ..hinf.singular import regularised
 from ..preparation import Prepared, beyond_rounding
 
 #: A, B, C, D of a controller
@@ -308,7 +308,7 @@ class Lmi(Value):
         # in units and states of the controller of least quadratic cost; noise and effort of a size
         # that is not felt keep its solutions away from singular
         try:
-            regular = Regularised(given, NEGLIGIBLE, modes=True).problem
+            regular = regularised(given, NEGLIGIBLE, modes=True)
             unit = resonance_gain(regular, h2_controller(regular))
             (X, _), (Y, _) = (side.least_squares() for side in both_sides(regular))
         except (la.LinAlgError, OnAxisError, SolverError) as error:

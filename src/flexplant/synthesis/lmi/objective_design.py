@@ -24,7 +24,7 @@ from ..controller import Controller
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati, h2_controller
-from ..hinf.singular import Regularised
+from ..hinf.singular import regularised
 from ..pipeline import Design, Solution, designed, posed
 from ..preparation import Prepared, beyond_rounding, require_reach
 from ..structured.judges import require_finite_h2
@@ -255,7 +255,7 @@ def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most:
 
 def _size_reached(plant: AnyPlant, problem: Prepared, objective: Any) -> float:
     """Return what the controller of least quadratic cost reaches, with some noise and effort."""
-    regular = Regularised(problem, CLOSE, modes=True).problem
+    regular = regularised(problem, CLOSE, modes=True)
     try:
         least = h2_controller(regular)
     except (la.LinAlgError, OnAxisError) as error:

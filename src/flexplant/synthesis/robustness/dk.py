@@ -14,16 +14,15 @@ from ...certificates import Certificate, Verified
 from ...errors import CertificateError, FlexplantError, ModelError, SolverError, counted
 from ...lti.discretisation import tustin
 from ...lti.filters import zpk
-from ...lti.frequency_sweep import largest_gains, resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft, series, side_by_side
-from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
 from ...plant.uncertainty.delta_blocks import FullBlock, RepeatedScalar
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...tolerances import CLOSE, NEGLIGIBLE, ROUNDING
-from ..controller import Controller, SynthesisMethod
+from ..controller import Controller, SynthesisMethod, swept_norm
 from ..hinf.hinf_design import HinfDesign, design_hinf
 from ..hinf.hinf_riccati import Riccati
 from ..hinf.tolerated_modes import (
@@ -236,26 +235,22 @@ class _ModeIteration(_DkIteration):
 
 def _best_step(steps: Iterator[_DkStep], most: int, progress: bool | None) -> _Iterated:
     """Return the best step; the steps end where mu falls no further, or where one fails."""
-    best: _DkStep | None = None
-    found: list[Verified] = []
+    found: list[_DkStep] = []
     notes: tuple[str, ...] = ()
     with Progress(most, "steps of D-K", progress=progress, even=False) as bar:
         try:
             for step in steps:
                 bar.advance()
-                found.append(Verified(f"mu of step {step.number}", step.mu, STEPS_OF_MU))
-                known = np.inf if best is None or step.number < 2 else best.mu
-                if best is None or step.mu < best.mu:
-                    best = step
-                if step.mu > (1.0 - CLOSE) * known:
+                known = min((one.mu for one in found), default=np.inf)
+                found.append(step)
+                if step.number > 1 and step.mu > (1.0 - CLOSE) * known:
                     break
         except FlexplantError as error:  # D of a loop near its optimum may be badly conditioned
-            if best is None:
+            if not found:
                 raise
             notes = (f"the iteration ended after {counted(len(found), 'step')}: {error}",)
-    if best is None:
-        raise SolverError("no step of the D-K iteration gave a controller. Report it.")
-    return _Iterated(best, found, notes)
+    checks = [Verified(f"mu of step {one.number}", one.mu, STEPS_OF_MU) for one in found]
+    return _Iterated(min(found, key=lambda one: one.mu), checks, notes)
 
 
 def _filter_steps(
@@ -487,7 +482,7 @@ def _corner_ratio(uncertain: UncertainPlant[Any], best: _DkStep, w: Any, z: Any)
         ends = size * chance.choice([-1.0, 1.0], len(names))
         machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
         loop = lft(_performance_plant(machine, w, z).system, best.controller)
-        most = max(most, _grid_peak(loop) / best.mu if loop.is_stable else np.inf)
+        most = max(most, swept_norm(loop) / best.mu if loop.is_stable else np.inf)
     if most > 1.0 + _BEYOND:
         raise CertificateError(
             f"of machines within {size:.3g} of the uncertainty one has {most:.4g} times the gain "
@@ -495,9 +490,3 @@ def _corner_ratio(uncertain: UncertainPlant[Any], best: _DkStep, w: Any, z: Any)
             "first order of one channel a mode. State less uncertainty, or raise the rate."
         )
     return most
-
-
-def _grid_peak(loop: StateSpace) -> float:
-    """Return the largest singular value over a grid through the resonances."""
-    gains = responder(loop)(resonance_grid(loop.poles(), loop.dt))
-    return float(largest_gains(gains).max())
