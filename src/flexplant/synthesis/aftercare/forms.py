@@ -36,7 +36,7 @@ from ...tolerances import (
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
 LANES = 4
 #: relative distances of poles [1] within which they share a block, tried in turn
-_NEAR = SPLIT, FOUR_DIGITS, CLOSE, 0.1
+_NEAR = SPLIT, FOUR_DIGITS, CLOSE
 #: what the blocks may differ from the system, relative to the largest gain: in double precision
 #: (rounding times the condition), and in single, whose 24 bits a resonance of 1e-4 still stands
 _DOUBLE, _SINGLE = ROOT, CLOSE

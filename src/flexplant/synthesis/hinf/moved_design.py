@@ -20,7 +20,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
 from ...plant import AnyPlant, StandardPlant, plant_of
 from ...plant.uncertainty.channels import with_channels
-from ...tolerances import SAME
+from ...tolerances import FOUR_DIGITS, SAME
 from ...words import mapping
 from ..controller import Controller
 from ..pipeline import Design, Solution, solved, verified
@@ -30,8 +30,6 @@ from .lower_bound import pointwise_bound
 #: size of the channels relative to the whole motion: they are for complex deltas, which cover more
 #: than a real position
 _SIZE = 0.1
-#: halvings or doublings of a scale, while they help
-_STEPS = 4
 #: what the progress bar counts
 _DESIGNS = "designs over the positions"
 
@@ -131,16 +129,16 @@ class PositionDesign(Design):
                 tick(_DESIGNS)
             return tried[name]
 
-        with Progress(2 + 2 * _STEPS, _DESIGNS, progress=self.progress, even=False):
+        def worst_of_scale(scale: float) -> float:
+            return worst_of(f"scale {scale:g} of the motion", motion.channels(scale))
+
+        with Progress(None, _DESIGNS, progress=self.progress):
             worst_of("the mean plant", motion.mean)
             if motion.scales.size and found:
                 motion.even(found[0].system)
                 for factor in (0.5, 2.0):  # while that helps
                     scale, value = 1.0, np.inf
-                    for _ in range(_STEPS):
-                        reached = worst_of(f"scale {scale:g} of the motion", motion.channels(scale))
-                        if not reached < value:
-                            break
+                    while (reached := worst_of_scale(scale)) < (1.0 - FOUR_DIGITS) * value:
                         scale, value = scale * factor, reached
                     if scale != factor:
                         break

@@ -17,7 +17,7 @@ from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
-from ...tolerances import FOUR_DIGITS, MOST_STEPS, TINY, TYPED
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TINY, TYPED
 from ..preparation import less_feedthrough
 from ..structured.judges import (
     OVER,
@@ -41,10 +41,6 @@ from .lmi_programs import (
 
 #: samples of an impulse response that are computed together, and at most
 _TOGETHER, _LONGEST = 256, 4e6
-#: strictness of the inequalities, relative to unit scale
-_STRICT = 1e-7
-#: how far X Y stays above one
-_APART = 1.005
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -291,7 +287,7 @@ class Variables:
 
     def positive(self) -> list[Any]:
         """Return ``[Y t; t X] > 0``, t above 1: away from the singular I - X Y."""
-        apart = _APART * np.eye(self.plant.A.shape[0])
+        apart = (1.0 + NEGLIGIBLE) * np.eye(self.plant.A.shape[0])
         return _strict(symmetric_blocks([[self.Y, apart], [self.X]]))
 
     def controller(self) -> Matrices:
@@ -303,7 +299,7 @@ class Variables:
 
 def _strict(*blocks: Any) -> list[Any]:
     """Return that block matrices are positive, kept away from singular."""
-    return [one >> _STRICT * np.eye(one.shape[0]) for one in blocks]
+    return [one >> TYPED * np.eye(one.shape[0]) for one in blocks]
 
 
 def hinf(v: Variables, channel: Channel, gamma: Any) -> list[Any]:

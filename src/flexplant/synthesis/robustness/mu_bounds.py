@@ -31,7 +31,15 @@ from ...tolerances import NEGLIGIBLE, ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner
 from .power_starts import power_iterations
 from .shared_multipliers import shared_scalings
-from .uncertainty_blocks import Perturbation, Place, Scalings, block_places, evened, matrix_of
+from .uncertainty_blocks import (
+    SAMPLES,
+    Perturbation,
+    Place,
+    Scalings,
+    block_places,
+    evened,
+    matrix_of,
+)
 from .upper import WIDE, centred, reached_level, reached_levels, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
@@ -42,8 +50,6 @@ ABOVE = 5e-3
 INTERVALS = "intervals of frequency"
 #: intervals at most; larger systems are covered by sampling instead of Hamiltonians
 _INTERVALS, _LARGE = 3000, 260
-#: frequencies that sample an interval evenly, and as many by the logarithm, beside the resonances
-_POINTS = 24
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -448,9 +454,9 @@ class Cover:
         near = (swing[:, None] + width[:, None] * around_resonance()).ravel()
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
         end = min(high, max(top, 10 * low))
-        base = np.linspace(low, end, _POINTS)
+        base = np.linspace(low, end, SAMPLES)
         # six decades, where the interval begins at 0 Hz
-        more = np.geomspace(max(low, 1e-6 * end), end, _POINTS)
+        more = np.geomspace(max(low, 1e-6 * end), end, SAMPLES)
         points = np.unique(np.concatenate([near, base, more, [omega]]))
         return points[(points >= low) & (points <= end)]
 

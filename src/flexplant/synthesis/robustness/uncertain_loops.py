@@ -23,12 +23,10 @@ from ...plant.uncertainty.neglected_dynamics import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plants import UncertainPlant, made_of
 from ...words import name_list
-from .uncertainty_blocks import Perturbation, realised_delta
+from .uncertainty_blocks import SAMPLES, Perturbation, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval
 _SAFE = 1.002
-#: frequencies that sample it
-_POINTS = 9
 
 
 @dataclass(frozen=True)
@@ -159,10 +157,10 @@ def _sampled(W: StateSpace, low: float, high: float) -> FloatArray:
     own = np.unique(np.abs(W.poles()))
     end = high if np.isfinite(high) else max(100.0 * low, 100.0 * float(own.max(initial=1.0)))
     inside = own[(own > low) & (own < end)]
-    points = np.concatenate([np.linspace(low, end, _POINTS), inside])
+    points = np.concatenate([np.linspace(low, end, SAMPLES), inside])
     if end > 2 * low:
         # four decades
-        points = np.concatenate([points, np.geomspace(max(low, 1e-4 * end), end, 4 * _POINTS)])
+        points = np.concatenate([points, np.geomspace(max(low, 1e-4 * end), end, SAMPLES)])
     return np.unique(points / (2 * np.pi))
 
 

@@ -17,6 +17,8 @@ from ...tolerances import ROUNDING, TINY
 #: G of real mu over D, relative to Im M at a resonance. One half makes the bound of a mode alone
 #: zero at all frequencies; what is above it is left for the modes nearby
 SHARE = 0.7
+#: frequencies that sample an interval evenly, and as many by the logarithm, beside the resonances
+SAMPLES = 24
 
 
 class Place(NamedTuple):
