@@ -22,7 +22,7 @@ from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
 from ...store import Value
-from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE
+from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE, TYPED
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
 from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising
 from .mu_bounds import INTERVALS, SOUGHT, Cover, Covered, sought
@@ -244,7 +244,7 @@ def _worst_machine(
     if worst is None:
         return {}, None, 0.0
     values: dict[str, float] = {}
-    for beyond in (0.0, NEGLIGIBLE, 10 * NEGLIGIBLE, 50 * NEGLIGIBLE):
+    for beyond in (TYPED, NEGLIGIBLE, 10 * NEGLIGIBLE, 50 * NEGLIGIBLE):
         size = worst.size * (1.0 + beyond)
         values = loop.deltas(worst.found, size)
         try:
