@@ -233,7 +233,7 @@ WRONG = {
         "was proven as largest",
     ),
     "mu of one channel a mode": (
-        "synthesis.robustness.dk._grid_peak", larger(100.0),
+        "synthesis.robustness.dk.swept_norm", larger(100.0),
         lambda: fx.synthesis.design_mu(
             off_by(0.01), w=["d", "y1:noise"], z=["tip:x", "u1:effort"], iterations=1
         ), "times the gain",

@@ -160,7 +160,7 @@ def test_starts_together_are_power_iterations_one_by_one():
         M = random_matrix(seed, 20)[: sum(s[2] for s in sizes), : sum(s[1] for s in sizes)]
         blocks = [FullBlock(w, z) if k == "full" else make[k](w) for k, w, z in sizes]
         where = block_places(blocks)
-        found = power_iterations(M, where, np.random.default_rng(seed), 4)
+        found = power_iterations(M, where, np.random.default_rng(seed))
         assert len(found) == 4
         rng = np.random.default_rng(seed)
         for one in found[:2]:

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...plant.uncertainty.delta_blocks import Block, FullBlock, RepeatedScalar
-from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, SPLIT, TINY
+from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROOT, ROUNDING, SPLIT, TINY
 from .power_starts import power_iterations
 from .uncertainty_blocks import Perturbation, Place, block_places, matrix_of, realised_delta
 
@@ -165,6 +165,8 @@ def _crossing(
         phase = 0.5 * (low + high)
         every = np.linalg.eigvals(first + np.exp(1j * phase) * second)
         value = complex(every[np.argmin(np.abs(every - value))])
+        if abs(value.imag) <= ROUNDING * abs(value):
+            break
         low, high = (phase, high) if np.sign(value.imag) == sign else (low, phase)
     return phase, value
 
