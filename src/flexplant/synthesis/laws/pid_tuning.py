@@ -8,18 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, between, positive
+from ...arrays import FloatArray, between, positive
 from ...errors import ModelError
 from ...loop.report import report_loops
 from ...loop.sensitivity_functions import bandwidth
-from ...lti.discretisation import tustin
-from ...lti.filters import tf
-from ...lti.interconnection import feedback
+from ...lti.blocks_of_states import trapezoidal
+from ...lti.interconnection import loop_poles
 from ...lti.response_solvers import continuous_poles, responses
 from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...store import Value
 from ...words import with_unit
+from .controller_elements import Pid
+from .law import Section, tustin_s
 
 #: where integral action ends and where the lead is centred, as fractions of the crossover: from a
 #: plant that lags anyway (1) to one that needs all available phase (30); lead of 0 to 67 deg
@@ -181,11 +182,12 @@ def _tuned(g: StateSpace, freq: float, margin: float) -> PidTuning | None:
     if g.dt and freq >= 0.5 / g.dt:
         raise ModelError(f"the bandwidth must lie below half the rate, {0.5 / g.dt:g} Hz.")
     lines = np.append(_grid(g, freq), freq)
-    response = responses(g, lines)[0, 0]
+    response, rate = responses(g, lines)[0, 0], 1.0 / g.dt if g.dt else 0.0
+    s = tustin_s(lines, rate)
     kept: list[tuple[float, _Choice]] = []
     for low, lead, sign in product(_INTEGRAL, _LEAD, (1.0, -1.0)):
         choice = _Choice(freq / low, freq / lead, freq * lead)
-        L = response * choice.response(lines, g.dt, freq)
+        L = response * choice.section(rate, freq).gain(s)
         k = sign / float(abs(L[-1]))
         if np.min(np.abs(1.0 + k * L)) >= margin:
             kept.append((k, choice))
@@ -204,23 +206,19 @@ class _Choice(NamedTuple):
     lead: float
     roll_off: float
 
-    def response(self, freq: FloatArray, dt: float, kept: float) -> ComplexArray:
-        """Return the response of the controller of gain 1, at many frequencies [Hz]."""
-        s = 2j * np.pi * freq
-        if dt:  # Tustin's, with the response at one frequency kept
-            s = 2j * np.pi * kept * np.tan(np.pi * dt * freq) / np.tan(np.pi * dt * kept)
-        w_i, w_d, w_f = (2.0 * np.pi * one for one in self)
-        lead = (1.0 + s / w_d) / (1.0 + s / w_f) if w_f > w_d else 1.0
-        return np.asarray((1.0 + w_i / s) * lead)
+    def section(self, rate: float, freq: float) -> Section:
+        """Return the controller of gain 1, which sampling keeps at a frequency [Hz]."""
+        ahead = self.roll_off > self.lead
+        ends = {"zero": self.lead, "pole": self.roll_off} if ahead else {}
+        section = Pid.corners(1.0, integrator=self.integral, **ends).section
+        return section._replace(centre=2.0 * np.pi * freq).at(rate)
 
-    def law(self, dt: float, freq: float) -> StateSpace:
-        """Return the controller of gain 1, sampled with the response at a frequency kept."""
-        w_i, w_d, w_f = (2.0 * np.pi * one for one in self)
-        num, den = np.array([1.0, w_i]), np.array([1.0, 0.0])
-        if w_f > w_d:
-            num, den = np.polymul(num, [1.0 / w_d, 1.0]), np.polymul(den, [1.0 / w_f, 1.0])
-        law = tf(num, den)
-        return tustin(law, 1.0 / dt, prewarp=freq) if dt else law
+    def law(self, rate: float, freq: float) -> StateSpace:
+        """Return the controller of gain 1 as a system."""
+        matrices = self.section(rate, freq).matrices
+        if not rate:
+            return StateSpace(*matrices)
+        return StateSpace(*trapezoidal(matrices, 2.0 * rate), 1.0 / rate)
 
 
 def _grid(g: StateSpace, freq: float) -> FloatArray:
@@ -236,9 +234,12 @@ def _verified(
     g: StateSpace, k: float, choice: _Choice, freq: float, margin: float
 ) -> PidTuning | None:
     """Return the tuning where the closed loop is stable and keeps the margin, by its poles."""
-    law = choice.law(g.dt, freq)
-    controller = (-k * law).replace(inputs=g.outputs, outputs=g.inputs)
-    if not feedback(g, -controller).is_stable:
+    controller = choice.law(1.0 / g.dt if g.dt else 0.0, freq)
+    controller = controller.replace(
+        C=-k * controller.C, D=-k * controller.D, inputs=g.outputs, outputs=g.inputs
+    )
+    poles = loop_poles(g, controller)
+    if np.max(np.abs(poles) - 1.0 if g.dt else poles.real) >= 0.0:
         return None
     report = report_loops((g, controller))
     (one,) = report.values()
