@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
@@ -92,12 +92,9 @@ class BrokenLoop:
         """Return the units of the channels where it is broken if they have several, else none."""
         # a largest singular value would mix different units, also those of unlike actuators: 1 N at
         # a tool of 0.5 kg asks 130 N of the slide of 60 kg that carries it
-        names = self.u if at == "u" else self.y
-        units = self.units
-        if at == "u" and len(names) > 1 and len({units.get(name) for name in names}) == 1:
-            units = {**units, **self.forces()}
-        known = tuple(dict.fromkeys(units.get(name, "unknown") for name in names))
-        return known if len(known) > 1 else ()
+        if at == "u":
+            return mixed_units(self.u, self.units, self.forces)
+        return mixed_units(self.y, self.units)
 
     @cached_property
     def worst(self) -> Callable[[Side, bool], tuple[float, float]]:
@@ -121,6 +118,17 @@ class BrokenLoop:
         return 1.0 / self.worst(at, bool(self.mixed(at)) if scaled is None else scaled)[0]
 
 
+def mixed_units(
+    names: Sequence[str], units: Mapping[str, str], forces: Callable[[], Mapping[str, str]] = dict
+) -> tuple[str, ...]:
+    """Return the units of channels if they have several, those of forces included, else none."""
+    known = units
+    if len(names) > 1 and len({units.get(name) for name in names}) == 1:
+        known = {**units, **forces()}
+    found = tuple(dict.fromkeys(known.get(name, "unknown") for name in names))
+    return found if len(found) > 1 else ()
+
+
 def inverted(L: ComplexArray) -> ComplexArray:
     """Return (I - L)^-1, frequency first; at the critical point for a slightly different gain."""
     eye = np.eye(L.shape[-1])
@@ -135,26 +143,35 @@ def largest_sensitivity(L: ComplexArray, scaled: bool) -> FloatArray:
     return scaled_size(inverted(L)) if scaled else sensitivity_size(L)
 
 
-def sensitivity_size(L: ComplexArray) -> FloatArray:
-    """Return sigma_max of ``S = (I - L)^-1`` at each frequency, a lower bound where it is not high.
+def sensitivity(L: ComplexArray, inner: ComplexArray | None = None) -> ComplexArray:
+    """Return ``S = (I - L)^-1 (I - inner)``, frequency first: inner loops stay closed."""
+    S = inverted(L)
+    return S if inner is None else S - S @ inner
 
-    Where the Frobenius norm of L is l < 1, sigma_max lies between 1 / (1 + l) and 1 / (1 - l).
-    Elsewhere, with m and s^2 the mean and the variance of the n eigenvalues of S* S, its square
-    lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n - 1)`` [WolkowiczStyan1980]_.
+
+def sensitivity_size(L: ComplexArray, inner: ComplexArray | None = None) -> FloatArray:
+    """Return sigma_max of `sensitivity` at each frequency, a lower bound where it is not high.
+
+    Where the Frobenius norms of L and of the inner loop are l < 1 and k, sigma_max lies between
+    (1 - k) / (1 + l) and (1 + k) / (1 - l). Elsewhere, with m and s^2 the mean and the variance of
+    the n eigenvalues of S* S, its square lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n -
+    1)`` [WolkowiczStyan1980]_.
     """
-    gain = np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2)))
-    size, acts = 1.0 / (1.0 + gain), gain >= _SMALL
-    size[acts] = _norm_or_bound(L[acts])
-    acts = ~acts & (size.max(initial=0.0) * (1.0 - gain) < 1.0)
-    if acts.any():
-        size[acts] = _norm_or_bound(L[acts])
+    gain, less = (_frobenius(one) if one is not None else np.zeros(len(L)) for one in (L, inner))
+    size, acts = np.maximum(1.0 - less, 0.0) / (1.0 + gain), gain >= _SMALL
+    for _ in range(2):
+        size[acts] = norm_or_bound(sensitivity(L[acts], None if inner is None else inner[acts]))
+        acts = (gain < _SMALL) & (size.max(initial=0.0) * (1.0 - gain) < 1.0 + less)
     return np.asarray(size)
 
 
-def _norm_or_bound(L: ComplexArray) -> FloatArray:
+def _frobenius(L: ComplexArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2))))
+
+
+def norm_or_bound(S: ComplexArray) -> FloatArray:
     """Return sigma_max of S where it may be near its maximum, else its lower bound."""
-    S, n = inverted(L), L.shape[-1]
-    square = S.conj().swapaxes(1, 2) @ S
+    n, square = S.shape[-1], S.conj().swapaxes(1, 2) @ S
     mean = np.einsum("fii->f", square).real / n
     spread = np.sum(square.real**2 + square.imag**2, axis=(1, 2)) / n - mean**2
     spread = np.sqrt(np.maximum(spread, 0.0) / max(n - 1, 1))

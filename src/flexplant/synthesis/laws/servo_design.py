@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
-from ...lti.interconnection import connect, loop_poles
+from ...lti.interconnection import loop_poles
+from ...lti.minimal_realisations import minimal
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
@@ -38,6 +39,7 @@ from .servo_loops import (
     highest_bandwidth,
     lines_of,
     observer_system,
+    path_of,
     reading_of,
     seeing,
     servo_loop,
@@ -75,10 +77,10 @@ def design_servo(
     the notches. If two of these laws are possible, the one with the smaller peak of |S| at u is
     used. The gain k makes the loop gain of the axis 1 at the bandwidth. A resonance next to the
     bandwidth can make this k unsuitable, so that |S| at u exceeds 6 dB. If so, k is computed from
-    the response at s = sigma, where no mode resonates; this k is used only if it keeps 6 dB. If a
-    mode lies between one and four times the bandwidth, or if |S| still exceeds 6 dB, a wide lead is
-    tried: each 4 in the law of a mass becomes 16, or 64 if 16 does not keep 6 dB. A wide lead
-    suppresses errors up to a higher frequency. It suppresses them less at low frequencies, and
+    the response at s = sigma, where no mode resonates; this k is used only if it keeps 6 dB. If the
+    loop resonates between one and four times the bandwidth, or if |S| still exceeds 6 dB, a wide
+    lead is tried: each 4 in the law of a mass becomes 16, or 64 if 16 does not keep 6 dB. A wide
+    lead suppresses errors up to a higher frequency. It suppresses them less at low frequencies, and
     passes more noise to the actuators. A notch has the damping of its mode. Its frequency is that
     of the mode, or lower for a fast mode, so that errors of the frequency are tolerated.
     `servo_bandwidth` gives the largest bandwidth with a peak of 6 dB.
@@ -241,7 +243,7 @@ def servo_bandwidth(
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
-    return task.largest(float(peak))
+    return replace(task, searching=True).largest(float(peak))
 
 
 def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
@@ -270,7 +272,7 @@ _INTEGRATOR, _BELOW_ZERO = 0.1, 0.32
 #: raises |S| and lowers the frequency up to which |S| of the references is below 1 by at most this
 #: factor. Those above it are for axes on springs that would follow too little otherwise
 _CORNERS, _COST = (0.5, 0.2, 0.1, 0.05, 0.02), 1.1
-#: wide leads are tried where a mode lies above the bandwidth within this factor
+#: wide leads are tried where the loop resonates above the bandwidth within this factor
 _NEAR = 4.0
 #: |S| that an axis is to have at this fraction of its bandwidth, as a mass has with the usual lead
 _WELL_BELOW, _SUPPRESSED = 20.0, 0.3
@@ -289,6 +291,8 @@ class ServoTask:
     integrator: float | None
     notches: tuple[float, ...] | None
     observer: StateSpace | None
+    #: whether poles that no law moves are found once and left out: there are many loops
+    searching: bool = False
 
     @property
     def rate(self) -> float:
@@ -329,8 +333,9 @@ class ServoTask:
 
     def _plain(self, driven: DrivenAxes, gains: FloatArray) -> ServoLaw:
         """Return the laws, without notches, on the best lines of axes with these gains."""
+        notches, numbers = tuple(map(Notch, self.notches or ())), (driven.freq, gains)
         tried = [
-            ServoLaw(driven, tuple(map(self.axis, lines, driven.freq.tolist(), gains.tolist())))
+            ServoLaw(driven, tuple(map(self.axis, lines, *(n.tolist() for n in numbers))), notches)
             for lines in combinations(lines_of(self.plant, driven))
         ]
         able = [one for one in tried if self.phase_margins(one).min() > 0.0]
@@ -343,19 +348,25 @@ class ServoTask:
         best = self._settling(self.notched(plain))
         if all(axis.line != "mass" for axis in plain.axes):
             return best
-        modes, lowest = elastic(self.plant), float(plain.driven.freq.min())
-        near = bool(np.any((modes > lowest) & (modes < _NEAR * lowest)))
+        seen = self.loop.modes[self.loop.resonant(plain)]
+        near = bool(np.any(seen < _NEAR * plain.driven.freq.min()))
         for lead in LEADS[1:]:
             # the widest leads only where the others do not serve: they cost most noise
             if not (near and lead == LEADS[1]) and self._holds(best, TARGET):
                 break
             axes = (self.axis(a.line, a.bandwidth, a.gain, lead) for a in plain.axes)
-            wide = self.notched(plain._replace(axes=tuple(axes)))
-            loop = self.closed(wide)
-            if self._best([best, wide]) is wide and (loop.completed or loop).is_stable:
+            wide = self.notched(plain.of(axes))
+            if self._runs(wide) and self._best([best, wide]) is wide:
                 wide = self._settling(wide)
                 best = wide if self._suppresses(wide) or not self._suppresses(best) else best
         return best
+
+    def _runs(self, law: ServoLaw) -> bool:
+        """Return whether the loop is stable, with the truncated modes where they are known."""
+        if self.radius(law) >= 1.0 or self.plant.evaluation_plant is None:
+            return self.radius(law) < 1.0
+        loop = self.closed(law)
+        return (loop.completed or loop).is_stable
 
     def _serves(self, law: ServoLaw) -> bool:
         """Return whether a law holds 6 dB and follows its references."""
@@ -380,10 +391,9 @@ class ServoTask:
 
         def faster(parts: Iterable[float]) -> Iterator[ServoLaw]:
             for part in parts:
-                axes = (
+                yield law.of(
                     replace(a, integrator=max(a.integrator, part * a.bandwidth)) for a in law.axes
                 )
-                yield law._replace(axes=tuple(axes))
 
         if not self._suppresses(law):
             able = (one for one in faster(reversed(_CORNERS)) if self._suppresses(one))
@@ -400,11 +410,10 @@ class ServoTask:
 
     def _best(self, laws: Sequence[ServoLaw]) -> ServoLaw:
         """Return the law with the lowest peak of |S| at u among those whose loop is stable."""
-        if len(laws) == 1:
-            return laws[0]
-        rising = sorted(laws, key=lambda law: self.loop.peak(law)[0])
-        stable = (law for law in rising if self.radius(law) < 1.0)
-        return next(stable, None) or min(rising, key=self.radius)
+        stable = [law for law in laws if self.radius(law) < 1.0] if len(laws) > 1 else laws
+        if not stable:
+            return min(laws, key=self.radius)
+        return stable[0] if len(stable) == 1 else min(stable, key=self.loop.peak)
 
     def axis(self, line: str, bandwidth: float, gain: float, lead: float = LEADS[0]) -> Axis:
         """Return the law of an axis on a line, whose plant has a gain there."""
@@ -415,30 +424,22 @@ class ServoTask:
         slow = own if self.integrator is None else self.integrator
         for name, freq in (("rolloff", rolloff), ("integrator", slow)):
             below_half_rate(freq, name, self.rate)
-        notches = tuple(Notch(freq) for freq in self.notches or ())
         corners = float(rolloff), float(slow)
-        return Axis(line, bandwidth, *corners, gain, self.rate, lead if wide else LEADS[0], notches)
+        return Axis(line, bandwidth, *corners, gain, self.rate, lead if wide else LEADS[0])
 
     @cached_property
     def notched(self) -> Callable[[ServoLaw], ServoLaw]:
         """The function of a law that gives it with notches where they serve, or as given."""
-        kept: dict[tuple[Axis, ...], ServoLaw] = {}
-
-        def found(law: ServoLaw) -> ServoLaw:
-            if self.notches is not None:
-                return law
-            if law.axes not in kept:
-                kept[law.axes] = self.loop.notched(law, self.poles)
-            return kept[law.axes]
-
-        return found
+        if self.notches is not None:
+            return lambda law: law
+        return cache(lambda law: self.loop.notched(law, self.poles))
 
     def phase_margins(self, law: ServoLaw) -> FloatArray:
         """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
         # hold and delay turn a line as they turn the plant; its modes are not in it, and the
         # notches at them neither
         if self.notches is None:
-            law = law._replace(axes=tuple(replace(axis, notches=()) for axis in law.axes))
+            law = law._replace(notches=())
         late = np.array([2.0 * np.pi * a.bandwidth for a in law.axes]) * self.plant.dt
         turned = np.diag(law.at(law.driven.freq))
         lines = np.array([POWERS.get(a.line, 1.0) for a in law.axes])
@@ -467,7 +468,8 @@ class ServoTask:
         def found(law: ServoLaw) -> StateSpace:
             before = StateSpace([], [], [], law.driven.T, inputs=reads, outputs=self.plant.u)
             axes = Axes(None, before, after, self.rate)
-            laws = {name: axis.law for name, axis in zip(reads, law.axes, strict=True)}
+            each = zip(reads, law.axes, strict=True)
+            laws = {name: axis.law(law.notches) for name, axis in each}
             system = connected(axes, axes_controller(axes, laws), read)
             system = system.select(inputs=[*read.values(), *reads])
             return system.replace(name="servo", units=self.plant.units)
@@ -475,31 +477,29 @@ class ServoTask:
         return found
 
     @cached_property
-    def path(self) -> StateSpace:
-        """From u to what the servo reads."""
-        reads = list(self.reading.reads.values())
-        if self.observer is None:
-            return self.plant.system.select(self.reading.channels, self.plant.u)
-        direct = [one for one in reads if one in self.plant.y]
-        read = [one for one in self.plant.y if one in (*self.observer.inputs, *direct)]
-        plant = self.plant.system.select(read, self.plant.u)
-        return connect([plant, self.observer], self.plant.u, reads)
+    def path(self) -> tuple[StateSpace, float]:
+        """From u to what the servo reads, and the largest size of a pole left out of it."""
+        whole = path_of(self.plant, self.observer, self.reading)
+        if not self.searching:
+            return whole, 0.0
+        kept, fixed = minimal(whole), whole.poles()
+        for pole in kept.poles():
+            fixed = np.delete(fixed, np.argmin(np.abs(fixed - pole)))
+        return kept, float(np.abs(fixed).max(initial=0.0))
 
     @cached_property
     def poles(self) -> Callable[[ServoLaw], ComplexArray]:
         """The function of a law that gives the poles of its loop."""
-        kept: dict[tuple[Axis, ...], ComplexArray] = {}
 
+        @cache
         def found(law: ServoLaw) -> ComplexArray:
-            if law.axes not in kept:
-                kept[law.axes] = loop_poles(self.path, StateSpace(*law.matrices, self.plant.dt))
-            return kept[law.axes]
+            return loop_poles(self.path[0], StateSpace(*law.matrices, self.plant.dt))
 
         return found
 
     def radius(self, law: ServoLaw) -> float:
         """Return the spectral radius of the loop of a law."""
-        return float(np.abs(self.poles(law)).max())
+        return max(float(np.abs(self.poles(law)).max()), self.path[1])
 
     @cached_property
     def closed(self) -> Callable[[ServoLaw], ClosedLoop]:
@@ -508,14 +508,12 @@ class ServoTask:
         before = () if self.observer is None else (self.observer,)
         if not before and self.reading.estimates:
             plant = seeing(plant, self.reading)
-        kept: dict[tuple[Axis, ...], ClosedLoop] = {}
 
+        @cache
         def found(law: ServoLaw) -> ClosedLoop:
-            if law.axes not in kept:
-                blocks = (*before, self.controller(law))
-                controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
-                kept[law.axes] = ClosedLoop(plant, blocks, controller)
-            return kept[law.axes]
+            blocks = (*before, self.controller(law))
+            controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
+            return ClosedLoop(plant, blocks, controller)
 
         return found
 

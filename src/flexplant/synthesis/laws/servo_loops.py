@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -12,16 +12,11 @@ import numpy as np
 from ...arrays import ComplexArray, FloatArray
 from ...errors import LabelError, warn
 from ...loop import ClosedLoop
-from ...loop.blocks import as_block
-from ...loop.broken import (
-    axis_sensitivities,
-    inverted,
-    least_scaled,
-    peaking_size,
-    sensitivity_size,
-)
-from ...lti.blocks_of_states import Matrices
+from ...loop.blocks import as_block, references
+from ...loop.broken import least_scaled, mixed_units, peaking_size, sensitivity, sensitivity_size
+from ...lti.blocks_of_states import Matrices, cascaded
 from ...lti.frequency_sweep import resonance_grid
+from ...lti.interconnection import connect
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import EvaluationModel, Foreign, StandardPlant
@@ -54,6 +49,22 @@ _ASIDE = 0.8
 _STEP, _BELOW, _VANISHED = 1.05, 1e-3, 1e-2
 
 
+#: |S| at u that a notch is to bring the loop below: 6 dB
+TARGET = 2.0
+#: notches that are placed at most, modes that are tried for each, and the least gain of one
+_NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
+#: damping ratios of a notch's poles that are tried; its zeros have the damping of the mode
+_WIDTHS = (0.3, 0.45)
+#: fraction of it at which notching ends: the grid misses the top of a resonance by up to 2 %
+_BELOW_TARGET = 0.98
+#: points where |S| is at least this fraction of its peak are judged first for a further notch
+_HIGH = 0.5
+#: distance of a growing pole from the mode that it belongs to, relative to its frequency
+_DRIVEN = 0.3
+#: loop gain at a resonance below which a notch there serves nothing
+_QUIET = 0.3
+
+
 #: loops of this number of plants are kept: their designs at other bandwidths begin with them; and
 #: laws of this number of axes
 _KEPT = 8
@@ -76,16 +87,15 @@ class Axis:
     gain: float
     rate: float
     lead: float = LEADS[0]
-    notches: tuple[Notch, ...] = ()
 
-    @cached_property
-    def law(self) -> Law:
-        """Error to command."""
-        return self.shape * (1.0 / self.gain)
+    def law(self, notches: Sequence[Notch]) -> Law:
+        """Return the law with notches, from error to command."""
+        law = Law((*self.action, LowPass(self.rolloff), *notches), rate=self.rate)
+        return law * float(1.0 / (abs(law.at(np.array([self.bandwidth]))[0]) * self.gain))
 
     @cached_property
     def shape(self) -> Law:
-        """The law of a plant of gain 1 at the bandwidth, which axes have in common."""
+        """The law without notches of a plant of gain 1 at the bandwidth, for all such axes."""
         return _shape(replace(self, gain=1.0))
 
     @property
@@ -102,8 +112,25 @@ class Axis:
 
 @lru_cache(maxsize=_KEPT)
 def _shape(axis: Axis) -> Law:
-    law = Law((*axis.action, LowPass(axis.rolloff), *axis.notches), rate=axis.rate)
-    return law * float(1.0 / abs(law.at(np.array([axis.bandwidth]))[0]))
+    return axis.law(())
+
+
+@lru_cache(maxsize=_NOTCHES * _KEPT)
+def _series(shape: Law, notches: tuple[Notch, ...]) -> Matrices:
+    """Return A, B, C and D of a law and notches, sampled."""
+    if not notches:
+        return shape.matrices
+    return cascaded(_series(shape, notches[:-1]), _sampled(notches[-1], shape.rate))
+
+
+@lru_cache(maxsize=_NOTCHES * _KEPT)
+def _notch(freq: float, depth: float, width: float) -> Notch:
+    return Notch(freq, depth, width)
+
+
+@lru_cache(maxsize=_NOTCHES * _KEPT)
+def _sampled(notch: Notch, rate: float) -> Matrices:
+    return notch.sampled(rate).matrices
 
 
 def gains_at(
@@ -153,59 +180,47 @@ def combinations(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(tried))
 
 
-#: |S| at u that a notch is to bring the loop below: 6 dB
-TARGET = 2.0
-#: notches that are placed at most, modes that are tried for each, and the least gain of one
-_NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
-#: damping ratios of a notch's poles that are tried; its zeros have the damping of the mode
-_WIDTHS = (0.3, 0.45)
-#: fraction of it at which notching ends: the grid misses the top of a resonance by up to 2 %
-_BELOW_TARGET = 0.98
-#: points where |S| is at least this fraction of its peak are judged first for a further notch
-_HIGH = 0.5
-#: distance of a growing pole from the mode that it belongs to, relative to its frequency
-_DRIVEN = 0.3
-#: loop gain at a resonance below which a notch there serves nothing
-_QUIET = 0.3
-
-
 class ServoLaw(NamedTuple):
     """Laws of axes, and how their commands reach the actuators."""
 
     driven: DrivenAxes
     axes: tuple[Axis, ...]
-
-    @property
-    def notches(self) -> tuple[Notch, ...]:
-        """The notches, which all axes have in common."""
-        return self.axes[0].notches
+    #: which all axes have in common
+    notches: tuple[Notch, ...] = ()
 
     def notched(self, notch: Notch) -> ServoLaw:
         """Return the laws with a further notch."""
-        return self._replace(
-            axes=tuple(replace(axis, notches=(*axis.notches, notch)) for axis in self.axes)
-        )
+        return self._replace(notches=(*self.notches, notch))
 
-    def changed_by(self, notch: Notch, freq: FloatArray) -> ComplexArray:
-        """Return the factors (n_freq, r) by which a further notch changes the responses."""
-        bandwidths, rate = np.array([axis.bandwidth for axis in self.axes]), self.axes[0].rate
-        gain = notch.section.at(rate).gain(tustin_s(np.append(freq, bandwidths), rate))
-        return np.asarray(gain[: freq.size, None] / np.abs(gain[freq.size :]))
+    def of(self, axes: Iterable[Axis]) -> ServoLaw:
+        """Return the same with other axes."""
+        return self._replace(axes=tuple(axes))
+
+    def gains(self, notch: Notch) -> FloatArray:
+        """Return the gains (r,) of a notch at the bandwidths, which the laws make up for."""
+        rate = self.axes[0].rate
+        s = tustin_s(np.array([axis.bandwidth for axis in self.axes]), rate)
+        return np.abs(notch.section.at(rate).gain(s))
 
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the responses (n_freq, r) of the laws."""
-        shapes = [axis.shape for axis in self.axes]
+        shapes, rate = [axis.shape for axis in self.axes], self.axes[0].rate
         found = {one: one.at(freq) for one in dict.fromkeys(shapes)}
         each = zip(shapes, self.axes, strict=True)
-        return np.stack([found[one] / axis.gain for one, axis in each], axis=-1)
+        at = np.stack([found[one] / axis.gain for one, axis in each], axis=-1)
+        for notch in self.notches:
+            at *= notch.section.at(rate).gain(tustin_s(freq, rate))[:, None] / self.gains(notch)
+        return at
 
     @property
     def matrices(self) -> Matrices:
         """A, B, C and D from what the servo reads to the actuators."""
+        notched = np.prod([self.gains(notch) for notch in self.notches], axis=0)
         parts = []
-        for axis in self.axes:
-            A, B, C, D = axis.shape.matrices
-            parts.append((A, B, C / axis.gain, D / axis.gain))
+        gains = notched * np.array([axis.gain for axis in self.axes])
+        for axis, gain in zip(self.axes, gains, strict=True):
+            A, B, C, D = _series(axis.shape, self.notches)
+            parts.append((A, B, C / gain, D / gain))
         return decoupled(parts, self.driven.T, np.eye(len(self.axes)))
 
 
@@ -226,77 +241,98 @@ class ServoLoop:
     damping: FloatArray
     plant: StandardPlant
 
-    def gain(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> ComplexArray:
-        """Return the loop (k, nu, nu), broken at u, at some points, of laws by their responses."""
-        act = -T * at[some, None, :]
-        if self.own is not None:
-            act = inverted(act @ self.own[some]) @ act
-        return np.asarray(act @ self.moved[some])
+    @cached_property
+    def through(self) -> ComplexArray:
+        """From u to what the servo reads, with all paths."""
+        return self.moved if self.own is None else self.moved + self.own
 
     @cached_property
-    def _mixed(self) -> bool:
-        units = self.plant.units | force_units(self.plant)
-        return len({units.get(name) for name in self.plant.u}) > 1
+    def mixed(self) -> bool:
+        """Whether the actuators have several units, as for `BrokenLoop.mixed`."""
+        plant = self.plant
+        return bool(mixed_units(plant.u, plant.units, lambda: force_units(plant)))
+
+    def broken(
+        self, T: FloatArray, at: ComplexArray, some: Any = slice(None)
+    ) -> tuple[ComplexArray, ComplexArray | None]:
+        """Return L (k, nu, nu) with all paths, and the inner loop of the observer's u."""
+        act = -T * at[some, None, :]
+        return act @ self.through[some], None if self.own is None else act @ self.own[some]
 
     def _sizes(self, T: FloatArray, at: ComplexArray, some: Any = slice(None)) -> FloatArray:
         """Return sigma_max(S_u) at some points, a lower bound where it is not the largest.
 
         It says nothing of stability, so check that.
         """
-        L = self.gain(T, at, some)
-        return peaking_size(inverted(L)) if self._mixed else sensitivity_size(L)
+        loop = self.broken(T, at, some)
+        return peaking_size(sensitivity(*loop)) if self.mixed else sensitivity_size(*loop)
 
     def _at_least(self, T: FloatArray, at: ComplexArray, some: Any) -> float:
         """Return a lower bound of the largest sigma_max(S_u)."""
-        L = self.gain(T, at, some)
-        return float((least_scaled(inverted(L)) if self._mixed else sensitivity_size(L)).max())
+        if self.mixed:
+            return float(least_scaled(sensitivity(*self.broken(T, at, some))).max())
+        return float(self._sizes(T, at, some).max())
 
     @cached_property
-    def swept(self) -> Callable[[ServoLaw], tuple[ComplexArray, FloatArray]]:
-        """The function of a law that gives its responses and sigma_max(S_u) over the grid."""
+    def at(self) -> Callable[[ServoLaw], ComplexArray]:
+        """The function of a law that gives its responses over the grid."""
 
         @lru_cache
-        def found(law: ServoLaw) -> tuple[ComplexArray, FloatArray]:
-            at = law.at(self.freq)
-            return at, self._sizes(law.driven.T, at)
+        def found(law: ServoLaw) -> ComplexArray:
+            if not law.notches:
+                return law.at(self.freq)
+            *first, last = law.notches
+            before = found(law._replace(notches=tuple(first)))
+            return np.asarray(before * self.changed_by(law, last))
 
         return found
 
+    def changed_by(self, law: ServoLaw, notch: Notch) -> ComplexArray:
+        """Return the factors (n_freq, r) by which a further notch changes the responses."""
+        return np.asarray(self._filtered(notch)[:, None] / law.gains(notch))
+
+    @cached_property
+    def _filtered(self) -> Callable[[Notch], ComplexArray]:
+        """The function of a notch that gives its response over the grid."""
+        rate = 1.0 / self.plant.dt
+        s = tustin_s(self.freq, rate)
+        return lru_cache(lambda notch: notch.section.at(rate).gain(s))
+
+    @cached_property
+    def size(self) -> Callable[[ServoLaw], FloatArray]:
+        """The function of a law that gives sigma_max(S_u) over the grid."""
+        return lru_cache(lambda law: self._sizes(law.driven.T, self.at(law)))
+
     def peak(self, law: ServoLaw) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
-        size = self.swept(law)[1]
+        size = self.size(law)
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
-    def _best_notch(
-        self, law: ServoLaw, at: ComplexArray, size: FloatArray, modes: Sequence[int]
-    ) -> tuple[Notch, float]:
+    def _best_notch(self, law: ServoLaw, modes: Sequence[int]) -> tuple[Notch, float]:
         """Return the further notch that gives the lowest peak of |S|, and that peak.
 
         It is a narrow one where that brings |S| below 6 dB: wide ones take more phase.
         """
         narrow, *wider = _WIDTHS
-        best = self._lowest(law, at, size, [self._inverse(mode, narrow) for mode in modes])
-        shallow = replace(best[0], depth=max(best[0].depth, Notch(1.0).depth))  # takes less phase
-        best = self._lowest(law, at, size, [shallow] if shallow != best[0] else [], best)
+        best = self._lowest(law, [self._inverse(mode, narrow) for mode in modes])
+        found = best[0]
+        shallow = _notch(found.freq, max(found.depth, Notch(1.0).depth), found.width)  # less phase
+        best = self._lowest(law, [shallow] if shallow is not found else [], best)
         for width in wider:
             if best[1] <= _BELOW_TARGET * TARGET:
                 break
-            other = replace(best[0], depth=best[0].depth * best[0].width / width, width=width)
-            best = self._lowest(law, at, size, [other], best)
+            other = _notch(best[0].freq, best[0].depth * best[0].width / width, width)
+            best = self._lowest(law, [other], best)
         return best
 
     def _lowest(
-        self,
-        law: ServoLaw,
-        at: ComplexArray,
-        size: FloatArray,
-        notches: Sequence[Notch],
-        best: tuple[Notch, float] | None = None,
+        self, law: ServoLaw, notches: Sequence[Notch], best: tuple[Notch, float] | None = None
     ) -> tuple[Notch, float]:
         """Return the notch with the lowest peak, and that peak, if it is lower than the best."""
-        T, high = law.driven.T, np.flatnonzero(size >= _HIGH * size.max())
-        tried = [at * law.changed_by(notch, self.freq) for notch in notches]
+        T, size = law.driven.T, self.size(law)
+        high = np.flatnonzero(size >= _HIGH * size.max())
+        tried = [self.at(law.notched(notch)) for notch in notches]
         least = np.array([self._at_least(T, one, high) for one in tried])
         best = best or (notches[0], np.inf)
         for i in np.argsort(least, kind="stable").tolist():
@@ -311,10 +347,11 @@ class ServoLoop:
         ends = np.searchsorted(self.freq, [0.98 * self.modes, 1.02 * self.modes])
         return [slice(*pair) for pair in ends.T.tolist()]
 
-    def resonant(self, law: ServoLaw, at: ComplexArray) -> list[int]:
+    def resonant(self, law: ServoLaw) -> list[int]:
         """Return the modes above the bandwidth with loop gain and no notch, the largest first."""
-        through = self.moved if self.own is None else self.moved + self.own
-        size = np.abs(at).max(axis=1) * np.linalg.norm(law.driven.T @ through, axis=(1, 2))
+        size = np.abs(self.at(law)).max(axis=1) * np.linalg.norm(
+            law.driven.T @ self.through, axis=(1, 2)
+        )
         peaks = np.array([size[near].max(initial=0.0) for near in self._near])
         # below the bandwidths a notch would take the gain that suppresses the error
         peaks[self.modes < law.driven.freq.min()] = 0.0
@@ -334,21 +371,21 @@ class ServoLoop:
 
     def _inverse(self, mode: int, width: float) -> Notch:
         """Return the notch of a mode, whose zeros have the damping of the mode."""
-        return Notch(float(self.places[mode]), float(self.damping[mode]) / width, width)
+        return _notch(float(self.places[mode]), float(self.damping[mode]) / width, width)
 
     def notched(self, law: ServoLaw, poles: Callable[[ServoLaw], ComplexArray]) -> ServoLaw:
         """Return the law with notches at the modes where they bring |S| at u down."""
         inside = poles(law)
         for _ in range(_NOTCHES):
-            at, size = self.swept(law)
             stable = np.abs(inside).max() < 1.0
-            if stable and size.max() <= _BELOW_TARGET * TARGET:
+            if stable and self.size(law).max() <= _BELOW_TARGET * TARGET:
                 break
-            left = self.resonant(law, at)
+            left = self.resonant(law)
             left = left[:_TRIED] if stable else self._driven(left, inside)
             if not left:
                 break
-            notch, lower = self._best_notch(law, at, size, left)
+            size = self.size(law)
+            notch, lower = self._best_notch(law, left)
             further = law.notched(notch)
             outside = poles(further)
             # of an unstable loop |S| says little: a notch is to slow the growth
@@ -360,12 +397,14 @@ class ServoLoop:
         return law
 
     def _driven(self, modes: list[int], poles: ComplexArray) -> list[int]:
-        """Return the mode that an unstable loop drives, next to the pole that grows most."""
-        pole = poles[np.argmax(np.abs(poles))]
-        grows = abs(np.angle(pole)) / (2.0 * np.pi * self.plant.dt)
-        off = [abs(self.modes[mode] - grows) for mode in modes]
-        near = [mode for mode, one in zip(modes, off, strict=True) if one == min(off)]
-        return [mode for mode in near if abs(self.modes[mode] - grows) < _DRIVEN * grows]
+        """Return the mode next to the pole that grows most, if each growing pole has one."""
+        growing = poles[np.abs(poles) >= 1.0]
+        growing = growing[np.argsort(-np.abs(growing), kind="stable")]
+        grows = np.abs(np.angle(growing)) / (2.0 * np.pi * self.plant.dt)
+        off = np.abs(self.modes[modes] - grows[:, None])
+        if not modes or np.any(off.min(axis=1) >= _DRIVEN * grows):
+            return []
+        return [modes[int(np.argmin(off[0]))]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,6 +482,15 @@ def _stack(system: StateSpace, grid: FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(responses(system, grid), -1, 0))
 
 
+def path_of(plant: StandardPlant, observer: StateSpace | None, reading: Reading) -> StateSpace:
+    """Return the system from u to what a servo reads."""
+    if observer is None:
+        return plant.system.select(reading.channels, plant.u)
+    reads = list(reading.reads.values())
+    read = [one for one in plant.y if one in (*observer.inputs, *reads)]
+    return connect([plant.system.select(read, plant.u), observer], plant.u, reads)
+
+
 @lru_cache(maxsize=_KEPT)
 def seeing(plant: StandardPlant, reading: Reading) -> StandardPlant:
     """Return the plant whose y are the references and the axes themselves, named as read."""
@@ -494,11 +542,14 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
 
 
 def suppressed_up_to(closed: ClosedLoop) -> float:
-    """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
-    found = []
-    for freq, size in axis_sensitivities(closed).values():
-        below = np.flatnonzero(size < 1.0)
-        above = np.flatnonzero(size >= 1.0)
-        later = above[above > below[0]] if below.size else above
-        found.append(float(freq[later[0]]) if later.size else float(freq[-1]))
+    """Return the least frequency [Hz] of a grid at which |S| of a reference first crosses 1."""
+    plant, found = closed.plant, []
+    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(plant)}
+    response = closed.frequency_response(closed.broken.grid)
+    for reference, error in pairs.items():
+        if error in plant.z:
+            gain = response.data[plant.z.index(error), plant.w.index(reference)]
+            below = np.logical_or.accumulate(np.abs(gain) < 1.0)
+            above = np.flatnonzero((np.abs(gain) >= 1.0) & (below | ~below[-1]))
+            found.append(float(response.freq[above[0] if above.size else -1]))
     return min(found, default=0.0)
