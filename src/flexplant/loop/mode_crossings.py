@@ -18,8 +18,9 @@ relative order omega dt delta, is neglected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -282,19 +283,11 @@ class SizeBound(NamedTuple):
         product = self.a @ inverse @ c @ inverse.conj().swapaxes(1, 2)
         return np.asarray(np.linalg.eigvals(product).real.max(axis=1))
 
-    def highest(self, delta: FloatArray, count: int) -> FloatArray:
-        """Return the largest fraction (modes,) over the points of each mode."""
-        found = np.full(count, -np.inf)
-        np.maximum.at(found, self.modes.mode, self.share(delta))
+    def highest(self, sign: float, change: FloatArray) -> FloatArray:
+        """Return the largest fraction (modes,) over the points of each mode, for its change."""
+        found = np.full(len(change), -np.inf)
+        np.maximum.at(found, self.modes.mode, self.share(sign * change))
         return found
-
-    def halved(self, below: FloatArray, above: FloatArray, sign: float) -> FloatArray:
-        """Return the sizes of change (modes,) between two at which it is reached first."""
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (below + above)
-            over = self.highest(sign * middle, len(middle)) >= 1.0
-            above, below = np.where(over, middle, above), np.where(over, below, middle)
-        return above
 
 
 class ModePeaks(NamedTuple):
@@ -319,16 +312,18 @@ class ModePeaks(NamedTuple):
         fine = self.loops.swept(freq.ravel())
         mode = np.tile(self.modes, _WITHIN_PEAK)
         at_tops = fine.swept_modes(np.arange(mode.size), mode)
-        return SizeBound.of(fine.S, at_tops, self.size).highest(self.sign * change, len(change))
+        return SizeBound.of(fine.S, at_tops, self.size).highest(self.sign, change)
 
-    def reached_first(self, above: FloatArray) -> FloatArray:
-        """Return the least size of change (modes,) below one at which the size is reached."""
-        below = np.zeros_like(above)
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (below + above)
-            over = self.highest(middle) >= 1.0
-            above, below = np.where(over, middle, above), np.where(over, below, middle)
-        return above
+
+def _reached_first(
+    highest: Callable[[FloatArray], FloatArray], below: FloatArray, above: FloatArray
+) -> FloatArray:
+    """Return the least changes (modes,) between two at which a function of them reaches one."""
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (below + above)
+        over = highest(middle) >= 1.0
+        above, below = np.where(over, middle, above), np.where(over, below, middle)
+    return above
 
 
 def _polynomials(
@@ -459,7 +454,7 @@ def size_reached(
     for side, sign in enumerate((-1.0, 1.0)):
         start = np.minimum(SPLIT, 0.5 * ends[:, side])
         steps = np.geomspace(start, ends[:, side], _TRIED)
-        highest = np.array([few.highest(sign * step, count) for step in steps])
+        highest = np.array([few.highest(sign, step) for step in steps])
         reached = highest >= 1.0
         on_line = np.any(reached, axis=0)
         # a peak between two lines of the grid may reach the size where neither line does
@@ -470,7 +465,8 @@ def size_reached(
         first = np.where(on_line, np.argmax(reached, axis=0), np.argmax(highest, axis=0))
         below = np.where(first > 0, steps[first - 1, each], 0.0)
         those, change = few.take(np.isin(few.modes.mode, where)), steps[first, each]
-        change = np.where(on_line, those.halved(below, change, sign), change)
+        first_over = _reached_first(partial(those.highest, sign), below, change)
+        change = np.where(on_line, first_over, change)
         share = few.share(sign * change)
         near_top = np.zeros((count, 2))
         for i in where:
@@ -479,7 +475,7 @@ def size_reached(
             near_top[i] = freq[own[max(k - 1, 0)]], freq[own[min(k + 1, own.size - 1)]]
         peak = ModePeaks(modes.loops, where, near_top[where], sign, change, size)
         where = where[(on_line | (peak.highest(change) >= 1.0))[where]]
-        change = peak.reached_first(change)
+        change = _reached_first(peak.highest, np.zeros_like(change), change)
         found[where, side] = sign * change[where]
     found[np.bincount(modes.mode[high[modes.at]], minlength=count) > 0] = 0.0
     return found
