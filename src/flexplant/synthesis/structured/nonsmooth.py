@@ -24,8 +24,8 @@ _FIRST = 0.3
 #: fraction of the decrease of the model that a step has to reach; below and above which the model
 #: is trusted less and more
 _ENOUGH, _POOR, _GOOD = 0.05, 0.3, 0.7
-#: factors of the damping after a step that is good, poor, refused with a new peak, and without
-_LESS, _MORE, _ANEW, _AGAIN = 0.2, 3.0, 2.0, 5.0
+#: factor of the damping after a step that is poor or refused, its reciprocal after a good one
+_MORE = 3.0
 
 
 class Pieces(NamedTuple):
@@ -159,7 +159,7 @@ def minimax(
             x, value, refused, weights = x + step, new, False, None
             pieces = function.pieces(x)
             values.append(value)
-            mu *= _LESS if part > _GOOD else _MORE if part < _POOR else 1.0
+            mu *= 1.0 / _MORE if part > _GOOD else _MORE if part < _POOR else 1.0
             if len(values) > _STALLED and values[-_STALLED - 1] - value <= _GAIN:
                 break
         else:
@@ -167,7 +167,7 @@ def minimax(
             if np.isfinite(new):
                 pieces = pieces.and_those(function.piece(x, place))
                 weights = np.append(weights, np.zeros(pieces.value.size - weights.size))
-            mu *= _ANEW if np.isfinite(new) else _AGAIN
+            mu *= _MORE
     return Minimum(x, value, len(values) <= steps and not spent())
 
 
