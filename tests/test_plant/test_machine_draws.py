@@ -11,7 +11,7 @@ import scipy.stats
 import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation.machine_noise import _difference, _driven_modes
-from flexplant.plant.machine_draws import MachineFamily, _exponential
+from flexplant.plant.machine_draws import MachineFamily, small_exponential
 from flexplant.plant.machine_plants import interval_of, interval_text
 from flexplant.plant.realisation import realise
 from flexplant.simulation import exposure_errors
@@ -212,10 +212,10 @@ def test_close_pairs_turn_to_their_measured_shapes(case, angle):
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.03])
-def test_the_exponential_is_that_of_scipy(size):
+def test_thesmall_exponential_is_that_of_scipy(size):
     E = size * np.random.default_rng(2).normal(size=(30, 30))
     E = E + E.T
-    np.testing.assert_allclose(_exponential(E), la.expm(E), rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(small_exponential(E), la.expm(E), rtol=1e-12, atol=1e-13)
 
 
 def test_measured_poles_are_put_back():

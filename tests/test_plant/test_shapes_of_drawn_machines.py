@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from flexplant.plant.measured_shapes import MeasuredShapes
+from flexplant.plant.machine_draws import MeasuredShapes
 
 RIGID, SIZE = 2, 9
 OMEGA = np.array([0.0, 0.0, 1.0, 1.7, 2.5, 4.0, 5.5, 8.0, 11.0])

@@ -32,7 +32,7 @@ from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant
 from ..plant.building import sampled_motions
-from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs
+from ..plant.realisation import changed_pairs
 from ..tolerances import SAME, SETTLED, SPLIT, TINY
 from .broken import BrokenLoop, inverted, log_scaling
 
@@ -336,10 +336,12 @@ def _polynomials(
     n, m = plant.system.n_states, len(broken.u)
     A, fed = np.zeros((nodes.size, len(modes), 2, 2)), np.zeros((nodes.size, len(modes), 2, n + m))
     where = {name: j for j, name in enumerate(plant.system.states)}
-    delta = FrequencyDelta if kind == "freq" else DampingDelta
-    deltas = [delta.of(int(mode), 1.0) for mode in modes]
-    amounts = (1.0 + nodes) ** 2 - 1.0 if kind == "freq" else nodes
-    blocks = [changed_pairs(realisation, [(one, float(x)) for one in deltas]) for x in amounts]
+    pairs = realisation.pairs
+    among = np.isin(np.arange(len(pairs)), modes - 1).astype(np.float64)
+    if kind == "freq":
+        blocks = [changed_pairs(pairs, ((1.0 + x) ** 2 - 1.0) * among, 0.0) for x in nodes]
+    else:
+        blocks = [changed_pairs(pairs, 0.0, x * among) for x in nodes]
     for i, g in enumerate(sampled_motions(plant.machine, blocks, broken.y, broken.u)):
         columns = [where[name] for name in g.states]
         rows = [g.states.index(name) for name in names]

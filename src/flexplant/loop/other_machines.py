@@ -18,7 +18,6 @@ from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
 from ..plant.realisation import natural
-from ..plant.uncertainty.mode_delta import modal_realisation
 from ..plant.uncertainty.uncertain_plants import UncertainPlant
 from ..store import Value
 from ..tolerances import CLOSE, DEVIATIONS, TINY
@@ -368,7 +367,7 @@ def mode_tolerances(
     # boundary, a complex change of one mode can place a pole there (`mode_crossings`). Where the
     # imaginary part of this change has a zero along the boundary, a real change makes a pole cross
     # it. The sampled plant's matrices are exact
-    modal_realisation(standard_plant(plant))
+    _ = standard_plant(plant).assembled.realisation.uncoupled
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")

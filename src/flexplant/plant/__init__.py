@@ -132,14 +132,14 @@ from .structure_frf import StructureFrf as StructureFrf
 from .structure_frf import frequency_response as frequency_response
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
-from .uncertainty.dampings import Dampings as Dampings
 from .uncertainty.delay import Delay as Delay
 from .uncertainty.delta import Delta as Delta
 from .uncertainty.fit import Fit as Fit
-from .uncertainty.frequencies import Frequencies as Frequencies
 from .uncertainty.gains import Gains as Gains
 from .uncertainty.kind import Known as Known
 from .uncertainty.kind import Uncertainty as Uncertainty
+from .uncertainty.mode_delta import Dampings as Dampings
+from .uncertainty.mode_delta import Frequencies as Frequencies
 from .uncertainty.neglected import Neglected as Neglected
 from .uncertainty.neglected_dynamics import NeglectedModes as NeglectedModes
 from .uncertainty.neglected_dynamics import neglected_modes as neglected_modes

@@ -19,23 +19,8 @@ from .realisation import ModalRealisation
 from .rigid_body import inertia_load, rigid_body_of
 
 
-class _PlacedForce(ForcePort):
-    """A force (or moment) at a place."""
-
-    at: Place
-
-    @property
-    def unit(self) -> str | None:
-        """N or N m; None for a sum of forces and moments."""
-        return force_unit(self.at, self.direction)
-
-    def push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) over the model's DOFs of a unit force."""
-        return realisation.row(self.at, self.direction)
-
-
 @dataclass(frozen=True, eq=False)
-class Disturbance(_PlacedForce):
+class Disturbance(ForcePort):
     """A force (or moment) from outside, in w.
 
     Parameters
@@ -200,7 +185,7 @@ class OutputDisturbance(ForcePort):
 
 
 @dataclass(frozen=True, eq=False)
-class Actuator(_PlacedForce):
+class Actuator(ForcePort):
     """A force (or moment) that the controller commands, in u.
 
     Parameters
@@ -248,11 +233,6 @@ class Actuator(_PlacedForce):
     asd: float = 0.0
     moves: Any = None
     asd_deviation: float = field(default=0.0, kw_only=True, repr=False)
-
-    @property
-    def filter(self) -> StateSpace | None:
-        """The system of amplifier and motor, from command to force."""
-        return self.dynamics
 
 
 class _Spectrum(Value):

@@ -1,4 +1,4 @@
-"""Whole machines, drawn in modal coordinates of an evaluation model."""
+"""Machines of a fit, drawn in modal coordinates, and what measured shapes say of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import ModelError
 from ..labels import Place
 from ..modes.matching import assigned
@@ -18,13 +18,10 @@ from ..modes.modes import sampled_moves
 from ..seeds import REFUSED
 from ..sparse.symmetric import dense
 from ..structure.rigid import rigid_motions
-from ..tolerances import SAME, TINY, TYPED
+from ..tolerances import ROUNDING, SAME, TINY, TYPED
 from ..updating.machines import MIXED, Draw, Machines
 from ..updating.parameters import Parameter, PointParameter
-from .measured_shapes import MeasuredShapes
 from .realisation import MODAL, ModalRealisation, modes_as_states, natural
-from .uncertainty.delta import Delta
-from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, ModeDelta, changed_pairs
 
 #: angles at which a pair is compared with its measured shapes, a quarter of a degree apart
 _ANGLES = 721
@@ -32,6 +29,8 @@ _ANGLES = 721
 _TERMS = 9
 #: a drawn mode swings
 _MOST_DAMPING = 0.9
+#: trial variances of the noise of shapes, over the decades of rounding: 15 % apart
+_VARIANCES = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -335,14 +334,14 @@ class MachineFamily:
         r, b, rng = self.whole.n_rigid, self.omega.size, draw.rng
         g = self.omega / (2.0 * np.pi * self.machines.trend.highest)
         trend = 0.5 * np.sign(draw.slope) * np.log1p(2.0 * abs(draw.slope) * g)
-        E = draw.deviation * self._together * _symmetric(rng, b)
+        E = draw.deviation * self._together * symmetric_draw(rng, b)
         # nothing holds rigid-body motions: their rows are mass, which nobody weighed
         unweighed = np.zeros((b, b))
         unweighed[:r], unweighed[:, :r] = E[:r], E[:, :r]
-        mass = _exponential(unweighed)
+        mass = small_exponential(unweighed)
         E -= unweighed
         E += np.diag(2.0 * (1.0 - draw.as_mass) * trend)
-        K = self.omega[:, None] * _exponential(E) * self.omega
+        K = self.omega[:, None] * small_exponential(E) * self.omega
         for change, amount in zip(self.changes, draw.parameters.tolist(), strict=True):
             mass += amount * change.mass
             K += amount * change.stiffness
@@ -353,13 +352,13 @@ class MachineFamily:
         return 0.5 * (M + M.T), 0.5 * (K + K.T)
 
 
-def _symmetric(rng: np.random.Generator, b: int) -> FloatArray:
+def symmetric_draw(rng: np.random.Generator, b: int) -> FloatArray:
     """Return N + N' (b, b) of standard normal N: deviations 2 on the diagonal, sqrt(2) off it."""
     N = rng.standard_normal((b, b))
     return np.asarray(N + N.T)
 
 
-def _exponential(E: FloatArray) -> FloatArray:
+def small_exponential(E: FloatArray) -> FloatArray:
     """Return exp(E) of a small symmetric matrix: the square of a series, five times as fast."""
     found = unit = np.eye(len(E))
     for k in range(_TERMS, 0, -1):
@@ -367,54 +366,118 @@ def _exponential(E: FloatArray) -> FloatArray:
     return np.asarray(found @ found.T)
 
 
-class StatedFamily:
-    """Machines whose modes are off by stated Deltas: frequencies, shapes with them, and dampings.
+class MeasuredShapes:
+    """Mode shapes measured at n places, which condition draws of the scatter E of stiffness.
 
-    ``K' = Omega exp(E) Omega``, E symmetric with the drawn relative changes of stiffness on its
-    diagonal and deviations ``sqrt(2 s_i s_j)`` off it, s the deviations of the frequencies. A
-    mode that the plant leaves out is known as well as the mode that is known least.
+    A machine of stiffness ``Omega exp(E) Omega`` has, to first order, the mode shapes
+    ``phi_i + sum_j g_ij E_ij phi_j`` with ``g_ij = w_i w_j / (w_i^2 - w_j^2)``; a rigid-body motion
+    j has ``g_ij = -1``, because its E is mass. The difference r (k,) of the measured shapes and the
+    model's is therefore ``r = G E + noise``, with the scale of each shape removed. Close pairs,
+    whose shapes mix by more than a small angle, say nothing of the scatter within the pair.
+    The noise contains errors of the model's shapes. Its variance v is drawn from its posterior, by
+    ``r ~ N(0, G C G' + v I)`` with the covariance C of E.
+
+    Parameters
+    ----------
+    seen : (n, b) array
+        Rows of the places over the modes.
+    shapes : (n, m) array
+        Measured shapes, each of any scale.
+    omega : (b,) array [rad/s]
+        Frequencies, rigid-body motions first.
+    measured : (m,) array of int
+        Places of the measured modes among the modes.
+    pairs : sequence of pairs of int
+        Places of close pairs among the measured modes.
+    covariance : (b, b) array
+        Variances of the elements of E for a relative deviation of the frequencies of 1.
+    deviation : float
+        Relative deviation of the frequencies.
     """
 
-    def __init__(self, whole: ModalRealisation, uncertain: Any) -> None:
-        self.space = ModeSpace(whole)
-        std = np.sqrt(np.diag(uncertain.covariance))
-        self.scatter: dict[type[ModeDelta], FloatArray] = {}
-        for kind in (FrequencyDelta, DampingDelta):
-            known = {
-                delta.mode - 1: delta.scale * x
-                for delta, x in zip(uncertain.deltas, std, strict=True)
-                if isinstance(delta, kind)
-            }
-            size = np.zeros(whole.pairs.shape[0])
-            size[uncertain.plant.realisation.n_modes :] = max(known.values(), default=0.0)
-            size[list(known)] = list(known.values())
-            self.scatter[kind] = size
-
-    def machine(self, rng: np.random.Generator, drawn: Sequence[tuple[Delta, float]]) -> DrawnModes:
-        """Return the modes of one machine at drawn values of the Deltas."""
-        logs = {kind: size * rng.standard_normal(size.size) for kind, size in self.scatter.items()}
-        for delta, x in drawn:
-            logs[type(delta)][delta.mode - 1] = delta.scale * x  # type: ignore[index]
-        space, (stiffer, damped) = self.space, logs.values()
-        root = np.sqrt(0.5 * self.scatter[FrequencyDelta][space.own])
-        E = root[:, None] * _symmetric(rng, root.size) * root
-        np.fill_diagonal(E, stiffer[space.own])
-        K = space.omega[:, None] * _exponential(E) * space.omega
-        mixed = space.mixed(np.eye(root.size), 0.5 * (K + K.T))
-        if mixed is None:
-            raise ModelError("what is stated of the frequencies leaves no stiffness.")
-        omega, V = mixed
-        # the damping force of a mode stays where its stiffness changes
-        force = space.zeta * space.omega * np.exp(damped[space.own])
-        if force.size:
-            force = force[np.argmax(np.abs(V), axis=0)]
-        zeta = np.divide(force, omega, out=np.zeros_like(omega), where=omega > 0.0)
-        pairs = changed_pairs(
-            space.whole,
-            [
-                (kind.of(i + 1, 1.0), float(np.expm1(log[i])))
-                for kind, log in logs.items()
-                for i in space.rest.tolist()
-            ],
+    def __init__(
+        self,
+        seen: FloatArray,
+        shapes: ComplexArray,
+        omega: FloatArray,
+        measured: IntArray,
+        pairs: Sequence[tuple[int, int]],
+        covariance: FloatArray,
+        deviation: float,
+    ) -> None:
+        self.measured, self.covariance, self.omega = measured, covariance, omega
+        own = omega[measured, None]
+        gap = own**2 - omega**2
+        gains = np.divide(
+            own * omega, gap, out=np.zeros_like(gap), where=np.abs(gap) > SAME * own**2
         )
-        return space.realisation(omega, zeta, V, pairs[space.rest])
+        gains[:, omega == 0.0] = -1.0
+        self._near = np.zeros(gains.shape, dtype=bool)
+        n, m = len(seen), len(measured)
+        self.rows, self.effects = np.zeros((2, m, n, omega.size))
+        self.off, count = np.zeros((m, n)), 0
+        for k, i in enumerate(measured.tolist()):
+            near = [k, *(sum(pair) - k for pair in pairs if k in pair)]
+            self._near[k, measured[near]] = True
+            gains[k, self._near[k]] = 0.0
+            plane = la.orth(seen[:, measured[near]])
+            apart = (np.eye(n) - plane @ plane.T) / divisor(la.norm(seen[:, i]))
+            self.rows[k] = apart @ seen
+            self.effects[k] = self.rows[k] * gains[k]
+            scale = np.vdot(shapes[:, k], seen[:, i]) / divisor(la.norm(shapes[:, k]) ** 2)
+            self.off[k] = apart @ (scale * shapes[:, k]).real
+            count += n - plane.shape[1]
+        values, self._vectors = la.eigh(self._prior())
+        self._values = np.where(values > ROUNDING * values[-1], values, 0.0)
+        self.variances, self.chances = self._noise(count, deviation)
+
+    def _prior(self) -> FloatArray:
+        """Return G C G' (m n, m n): two measured modes share one element of E."""
+        m, n, _ = self.effects.shape
+        of = self.covariance[self.measured]
+        A = np.zeros((m, n, m, n))
+        each = np.arange(m)
+        A[each, :, each, :] = np.einsum("knb,kb,kpb->knp", self.effects, of, self.effects)
+        both = self.effects[:, :, self.measured]
+        A += np.einsum("knl,kl,lpk->knlp", both, of[:, self.measured], both)
+        return A.reshape(m * n, m * n)
+
+    def _noise(self, count: int, deviation: float) -> tuple[FloatArray, FloatArray]:
+        """Return trial variances of the noise and their posterior probabilities.
+
+        Its standard deviation has a flat prior between rounding and all of the misfit.
+        """
+        misfit = (self._vectors.T @ self.off.ravel()) ** 2
+        most = max(float(misfit.sum()) / max(count, 1), TINY)
+        v = most * np.geomspace(ROUNDING, 1.0, _VARIANCES)
+        of = deviation**2 * self._values[:, None] + v
+        # directions along the shapes have no misfit, because their scale was removed
+        log = (misfit.size - count + 1) * np.log(v) - np.sum(
+            np.log(of) + misfit[:, None] / of, axis=0
+        )
+        chance = np.exp(0.5 * (log - log.max()))
+        return v, chance / chance.sum()
+
+    def given(
+        self, M: FloatArray, K: FloatArray, deviation: float, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mass and stiffness (b, b) of a draw, conditioned on the shapes by Matheron's rule.
+
+        What its shapes miss is taken to first order, with all that moves them.
+        """
+        own, size = self.measured, np.diag(K) / np.diag(M)
+        gap = size[own, None] - size
+        mixed = (K[own] - size[own, None] * M[own]) / np.where(gap == 0.0, np.inf, gap)
+        mixed[self._near] = 0.0
+        v = rng.choice(self.variances, p=self.chances)
+        noise = np.sqrt(v) * rng.standard_normal(self.off.shape)
+        missed = self.off - np.einsum("knb,kb->kn", self.rows, mixed) - noise
+        left = self._vectors.T @ missed.ravel()
+        left /= deviation**2 * self._values + v
+        left[self._values == 0.0] = 0.0
+        weights = (self._vectors @ left).reshape(self.off.shape)
+        moved = np.zeros_like(K)
+        moved[own] = np.einsum("knb,kn->kb", self.effects, weights)
+        E = deviation**2 * self.covariance * (moved + moved.T)
+        rigid = (self.omega == 0.0) | (self.omega[:, None] == 0.0)
+        return M + np.where(rigid, E, 0.0), K + self.omega[:, None] * E * self.omega

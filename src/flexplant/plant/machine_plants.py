@@ -16,12 +16,12 @@ from ..tolerances import INTERVAL
 from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit, with_unit
-from .machine_draws import DrawnModes, MachineFamily, StatedFamily, obstacle
+from .machine_draws import DrawnModes, MachineFamily, obstacle
 from .partitioned import MeasuredResponse
 from .ports import Ports
 from .remade import MachineParts
 from .uncertainty.delta import with_changes
-from .uncertainty.mode_delta import ModeDelta
+from .uncertainty.mode_delta import ModeDelta, StatedFamily
 from .uncertainty.parameter_amounts import ParameterDelta
 from .visibility import untouched_modes
 

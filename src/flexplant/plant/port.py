@@ -73,6 +73,8 @@ def observed(
 class ForcePort(Value):
     """A port in w or u. A new kind has a `name` and a method `push`, which says where it acts.
 
+    By default it is a force at the place `at`, along `direction`.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -93,14 +95,16 @@ class ForcePort(Value):
 
     @property
     def filter(self) -> StateSpace | None:
-        """The system between the channel and the structure."""
-        found: StateSpace | None = getattr(self, "shape", None)
+        """The system between the channel and the structure: its `shape`, or its `dynamics`."""
+        found: StateSpace | None = getattr(self, "shape", getattr(self, "dynamics", None))
         return found
 
     @property
     def unit(self) -> str | None:
-        """Unit of the channel; None if it has no unit."""
-        return None
+        """Unit of the channel, N or N m at a place; None of a sum of both, or if it has none."""
+        given = self._fields()
+        known = "at" in given and "direction" in given
+        return force_unit(given["at"], self.direction) if known else None
 
     @property
     def added_to(self) -> str | None:
@@ -112,9 +116,9 @@ class ForcePort(Value):
         """Rigid-body motion (6,) of the ground, per unit; zero except for a `BaseAcceleration`."""
         return np.zeros(6)
 
-    @abstractmethod
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) over the model's DOFs per unit of the output of the filter."""
+        return realisation.row(self._fields()["at"], self.direction)
 
     def static_push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) per unit of a constant input of the channel.

@@ -45,6 +45,19 @@ def natural(pairs: FloatArray) -> tuple[FloatArray, FloatArray]:
     return omega, np.asarray(-0.5 * trace / np.maximum(omega, TINY))
 
 
+def changed_pairs(
+    pairs: FloatArray, stiffness: FloatArray | float, damping: FloatArray | float
+) -> FloatArray:
+    """Return blocks (b, 2, 2) with omega^2 and 2 zeta omega changed by relative amounts (b,)."""
+    # the second row of a block changes, whatever its form
+    trace = np.trace(pairs, axis1=1, axis2=2)
+    changed = np.array(pairs)
+    changed[:, 1, 1] += damping * trace
+    held = stiffness * np.linalg.det(pairs) - damping * trace * pairs[:, 0, 0]
+    changed[:, 1, 0] -= held / pairs[:, 0, 1]
+    return changed
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalRealisation(Value):
     """A structure's modes as first-order blocks, with maps from and to its DOFs.
@@ -79,6 +92,17 @@ class ModalRealisation(Value):
     def elastic(self) -> range:
         """The numbers of the elastic modes, from 1, rigid-body ones included."""
         return range(self.n_rigid + 1, self.n_modes + 1)
+
+    @property
+    def uncoupled(self) -> ModalRealisation:
+        """These modes, each of which has its own frequency and damping."""
+        if self.form != MODAL:
+            raise ModelError(
+                f"the modes of this plant are coupled by damping ({self.form}): frequency and "
+                "damping of one mode are not its own, so that no Delta belongs to it. Deltas on "
+                "the parameters of a fit do: plant.uncertain(fit)."
+            )
+        return self
 
     def once(self, key: Hashable, found: Callable[[], T]) -> T:
         """Return what is known of the structure by a key, found at the first call only."""

@@ -25,8 +25,7 @@ from .partitioned import MeasuredResponse, Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .remade import check_channels, matched, own_plant, rebuilt, selected
-from .uncertainty.dampings import Dampings
-from .uncertainty.frequencies import Frequencies
+from .uncertainty.mode_delta import Dampings, Frequencies
 from .uncertainty.uncertain_plants import UncertainPlant, uncertain_plant
 
 

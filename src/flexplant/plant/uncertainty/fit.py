@@ -20,7 +20,7 @@ from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .kind import Known, Uncertainty
-from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, modal_realisation, require_elastic
+from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, require_elastic
 from .parameter_amounts import ParameterDelta
 
 #: relative distance of measured poles, typed, from those of the machine
@@ -106,9 +106,9 @@ class Fit(Uncertainty):
             if plant.form.startswith("dense"):
                 return self._of_parameters(plant, source, calibration)
             if calibration is None and not (source.discrepancy and source.fitted_poles):
-                return self._of_fit(modal_realisation(plant), source)
+                return self._of_fit(plant.assembled.realisation.uncoupled, source)
             source = source.uncertainty(calibration)
-        realisation = modal_realisation(plant)
+        realisation = plant.assembled.realisation.uncoupled
         if isinstance(source, ModalUncertainty):
             return self._of_shares(realisation, source)
         return self._of_poles(realisation, _measured_poles(source, self.modes), "measurement")

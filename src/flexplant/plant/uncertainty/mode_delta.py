@@ -1,9 +1,9 @@
-"""Deltas on the frequency and the damping of a mode."""
+"""Frequencies and dampings of modes that are known within shares: Deltas and drawn machines."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -12,27 +12,14 @@ from ...arrays import FloatArray, real_array
 from ...errors import ModelError, require_known, unknown_label
 from ...tolerances import ROUNDING, SAME, TINY
 from ...updating.matrix_parameters import MatrixParameter
+from ..machine_draws import DrawnModes, ModeSpace, small_exponential, symmetric_draw
 from ..partitioned import Partition
-from ..realisation import MODAL, ModalRealisation
+from ..realisation import ModalRealisation, changed_pairs
 from ..remade import MachineParts
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, with_changes
+from .kind import Uncertainty
 from .parameter_amounts import ParameterDelta
-
-#: relative change at which the plant's dependence on a Delta is read off
-_READ_OFF = 0.25
-
-
-def modal_realisation(plant: Partition) -> ModalRealisation:
-    """Return the modes of a plant, each of which has its own frequency and damping."""
-    realisation = plant.assembled.realisation
-    if plant.form != MODAL:
-        raise ModelError(
-            f"the modes of this plant are coupled by damping ({plant.form}): frequency and "
-            "damping of one mode are not its own, so that no Delta belongs to it. Deltas on the "
-            "parameters of a fit do: plant.uncertain(fit)."
-        )
-    return realisation
 
 
 def require_elastic(realisation: ModalRealisation, modes: Iterable[int]) -> None:
@@ -57,25 +44,27 @@ class ModeDelta(Delta):
         """Return the Delta of a mode by its number."""
         return cls(f"mode{mode}:{cls.kind}", scale, mode)
 
-    def row(self, pair: FloatArray) -> FloatArray:
-        """Return what is taken from the second row (2,) of a mode's block per amount."""
-        raise NotImplementedError
+    def pair(self, pairs: FloatArray, amount: float) -> FloatArray:
+        """Return the block (2, 2) of the mode with what is uncertain changed."""
+        stiffness, damping = (amount * (self.what == name) for name in ("stiffness", "damping"))
+        found: FloatArray = changed_pairs(pairs[self.mode - 1, None], stiffness, damping)[0]
+        return found
 
     def acts(self, realisation: ModalRealisation) -> bool:
         """Return whether a mode has what is uncertain."""
-        return bool(np.any(self.row(realisation.pairs[self.mode - 1])))
+        pairs = realisation.pairs
+        return not np.array_equal(self.pair(pairs, 1.0), pairs[self.mode - 1])
 
     def changed(self, machine: MachineParts, amount: float) -> MachineParts:
         """Return a machine with one mode changed."""
-        if machine.plant.form != MODAL:
-            modal_realisation(machine.plant)
+        _ = machine.plant.assembled.realisation.uncoupled
         if not amount > -1:
             raise ModelError(
                 f"{self.name} = {amount / self.scale:.4g} leaves mode {self.mode} with negative "
                 f"{self.what}."
             )
         pairs = np.array(machine.pairs)
-        pairs[self.mode - 1, 1] -= amount * self.row(machine.pairs[self.mode - 1])
+        pairs[self.mode - 1] = self.pair(machine.pairs, amount)
         return machine.replace(pairs=pairs)
 
     def require_in_range(self, deviations: float) -> None:
@@ -91,15 +80,11 @@ class ModeDelta(Delta):
         """Return the same Delta as a change of K by omega^2 (M phi)(M phi)', or of D."""
         realisation = plant.assembled.realisation
         push = np.asarray(plant.model.M @ realisation.inputs[:, 2 * self.mode - 1])
-        size = self._share(realisation.pairs[self.mode - 1])
-        change: dict[str, Any] = {self._part: size * np.outer(push, push)}
+        pair, force = realisation.pairs[self.mode - 1], np.outer(push, push)
+        stiff = self.what == "stiffness"
+        change = {"dK": np.linalg.det(pair) * force} if stiff else {"dD": -np.trace(pair) * force}
         parameter = MatrixParameter(self.name, **change)
         return ParameterDelta(self.name, self.scale, self.mode, parameter=parameter)
-
-    _part: ClassVar[str] = ""
-
-    def _share(self, pair: FloatArray) -> float:
-        raise NotImplementedError
 
     @classmethod
     def opened(cls, plant: Partition, opened: Opened, deltas: Sequence[Delta]) -> Opened:
@@ -115,14 +100,6 @@ class FrequencyDelta(ModeDelta):
 
     kind: ClassVar[str] = "freq"
     what: ClassVar[str] = "stiffness"
-    _part: ClassVar[str] = "dK"
-
-    def row(self, pair: FloatArray) -> FloatArray:
-        """Return what is taken from the second row of a mode's block per amount."""
-        return np.array([np.linalg.det(pair) / pair[0, 1], 0.0])
-
-    def _share(self, pair: FloatArray) -> float:
-        return float(np.linalg.det(pair))
 
     @property
     def text(self) -> str:
@@ -136,14 +113,6 @@ class DampingDelta(ModeDelta):
 
     kind: ClassVar[str] = "damping"
     what: ClassVar[str] = "damping"
-    _part: ClassVar[str] = "dD"
-
-    def row(self, pair: FloatArray) -> FloatArray:
-        """Return what is taken from the second row of a mode's block per amount."""
-        return np.asarray(-np.trace(pair) * np.array([pair[0, 0] / pair[0, 1], 1.0]))
-
-    def _share(self, pair: FloatArray) -> float:
-        return -float(np.trace(pair))
 
     def amount(self, drawn: float) -> float:
         """Return the amount of a number drawn: of the logarithm, so that damping stays positive."""
@@ -158,7 +127,7 @@ def stated_by_mode(
     factor: float = 1.0,
 ) -> list[ModeDelta]:
     """Return Deltas of stated fractions: one for all modes, an array, or {mode: fraction}."""
-    realisation, name = modal_realisation(plant), f"{kind.what} of a mode"
+    realisation, name = plant.assembled.realisation.uncoupled, f"{kind.what} of a mode"
     # modes of negative stiffness (magnets) have no frequency; they are uncertain by name only
     swing = [n for n in realisation.elastic if np.linalg.det(realisation.pairs[n - 1]) > 0]
     if isinstance(given, Mapping):
@@ -179,17 +148,6 @@ def stated_by_mode(
     return [one for one in every if one.scale > ROUNDING and one.acts(realisation)]
 
 
-def changed_pairs(
-    realisation: ModalRealisation, changes: Sequence[tuple[Delta, float]]
-) -> FloatArray:
-    """Return the blocks (b, 2, 2) of modes with stiffness or damping of some changed."""
-    pairs = np.array(realisation.pairs)
-    for delta, amount in changes:
-        if isinstance(delta, ModeDelta):
-            pairs[delta.mode - 1, 1] -= amount * delta.row(realisation.pairs[delta.mode - 1])
-    return pairs
-
-
 def _channels(plant: Partition, delta: Delta, base: FloatArray) -> list[DeltaChannel]:
     """Return the channel of a mode's stiffness or damping, two where accelerations need it."""
     # a mode's A is affine in its Deltas, `A0 + sum_j delta_j l_j R_j`, and so are displacements and
@@ -199,8 +157,8 @@ def _channels(plant: Partition, delta: Delta, base: FloatArray) -> list[DeltaCha
     # `R_j x'` makes it exact. The columns are read off the plant assembled with one mode changed,
     # so that they hold for any port
     n = plant.system.n_states
-    changed = system_matrix(with_changes(plant, [(delta, _READ_OFF)]).system)
-    change = (changed - base) / _READ_OFF
+    changed = system_matrix(with_changes(plant, [(delta, 1.0)]).system)
+    change = changed - base
     # of a mode's block the second row changes
     R = change[int(plant.modal_states[2 * delta.mode - 1])]
     R = R / np.linalg.norm(R)
@@ -215,3 +173,123 @@ def _channels(plant: Partition, delta: Delta, base: FloatArray) -> list[DeltaCha
     if not np.any(again):
         return [first]
     return [first, DeltaChannel(again / even, even * R, ":rate", even * R[:n])]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Frequencies(Uncertainty):
+    """Uncertain frequencies of modes: the relative error of each; its Delta changes omega^2.
+
+    Parameters
+    ----------
+    share : float, (m,) array or {mode: float}
+        Relative error of the frequencies at delta = 1: one number for all modes, one for each of
+        `modes`, or a mapping by mode. For modes that were not measured, updated models seldom have
+        errors below 0.005.
+    modes : sequence of int, optional
+        Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
+        elastic modes are uncertain.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        When a plant lacks a mode, its modes are coupled by damping, or a share is negative.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.three_masses().uncertain(fx.plant.Frequencies({2: 0.005}))
+    <UncertainPlant: 1 real Delta at 2 std
+      mode2:freq +- 0.5 %>
+    """
+
+    share: Any
+    modes: Sequence[int] | None = field(default=None, kw_only=True)
+
+    def deltas(self, plant: Partition) -> Sequence[Delta]:
+        """Return a Delta for the stiffness of each mode."""
+        # stiffness is omega^2
+        return stated_by_mode(FrequencyDelta, plant, self.share, self.modes, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Dampings(Uncertainty):
+    """Uncertain damping of modes: the relative error of 2 zeta omega of each mode.
+
+    Parameters
+    ----------
+    share : float, (m,) array or {mode: float}
+        Relative error of the damping at delta = 1: one number for all modes, one for each of
+        `modes`, or a mapping by mode.
+    modes : sequence of int, optional
+        Numbers of the modes, counted from 1 with the rigid-body modes included. By default all
+        elastic modes are uncertain.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        When a plant lacks a mode, its modes are coupled by damping, or a share is not between 0
+        and 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.three_masses().uncertain(fx.plant.Dampings({2: 0.3}))
+    <UncertainPlant: 1 real Delta at 2 std
+      mode2:damping +- 30 %>
+    """
+
+    share: Any
+    modes: Sequence[int] | None = field(default=None, kw_only=True)
+
+    def deltas(self, plant: Partition) -> Sequence[Delta]:
+        """Return a Delta for the damping of each mode."""
+        return stated_by_mode(DampingDelta, plant, self.share, self.modes)
+
+
+class StatedFamily:
+    """Machines whose modes are off by stated Deltas: frequencies, shapes with them, and dampings.
+
+    ``K' = Omega exp(E) Omega``, E symmetric with the drawn relative changes of stiffness on its
+    diagonal and deviations ``sqrt(2 s_i s_j)`` off it, s the deviations of the frequencies. A
+    mode that the plant leaves out is known as well as the mode that is known least.
+    """
+
+    def __init__(self, whole: ModalRealisation, uncertain: Any) -> None:
+        self.space = ModeSpace(whole)
+        std = np.sqrt(np.diag(uncertain.covariance))
+        self.scatter: dict[type[ModeDelta], FloatArray] = {}
+        for kind in (FrequencyDelta, DampingDelta):
+            known = {
+                delta.mode - 1: delta.scale * x
+                for delta, x in zip(uncertain.deltas, std, strict=True)
+                if isinstance(delta, kind)
+            }
+            size = np.zeros(whole.pairs.shape[0])
+            size[uncertain.plant.realisation.n_modes :] = max(known.values(), default=0.0)
+            size[list(known)] = list(known.values())
+            self.scatter[kind] = size
+
+    def machine(self, rng: np.random.Generator, drawn: Sequence[tuple[Delta, float]]) -> DrawnModes:
+        """Return the modes of one machine at drawn values of the Deltas."""
+        logs = {kind: size * rng.standard_normal(size.size) for kind, size in self.scatter.items()}
+        for delta, x in drawn:
+            logs[type(delta)][delta.mode - 1] = delta.scale * x  # type: ignore[index]
+        space, (stiffer, damped) = self.space, logs.values()
+        root = np.sqrt(0.5 * self.scatter[FrequencyDelta][space.own])
+        E = root[:, None] * symmetric_draw(rng, root.size) * root
+        np.fill_diagonal(E, stiffer[space.own])
+        K = space.omega[:, None] * small_exponential(E) * space.omega
+        mixed = space.mixed(np.eye(root.size), 0.5 * (K + K.T))
+        if mixed is None:
+            raise ModelError("what is stated of the frequencies leaves no stiffness.")
+        omega, V = mixed
+        # the damping force of a mode stays where its stiffness changes
+        force = space.zeta * space.omega * np.exp(damped[space.own])
+        if force.size:
+            force = force[np.argmax(np.abs(V), axis=0)]
+        zeta = np.divide(force, omega, out=np.zeros_like(omega), where=omega > 0.0)
+        rest = space.rest
+        pairs = changed_pairs(
+            space.whole.pairs[rest], np.expm1(stiffer[rest]), np.expm1(damped[rest])
+        )
+        return space.realisation(omega, zeta, V, pairs)

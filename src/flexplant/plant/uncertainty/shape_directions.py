@@ -17,7 +17,7 @@ from ..remade import MachineParts, rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta
 from .kind import Known, Uncertainty
-from .mode_delta import modal_realisation, require_elastic
+from .mode_delta import require_elastic
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
     # columns are read off the plant assembled with forces or motions changed alone, so that they
     # hold for any port and filter
     q, v = (int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1))
-    realisation = modal_realisation(plant)
+    realisation = plant.assembled.realisation.uncoupled
     driven, seen = (
         system_matrix(rebuilt(plant, realisation=one).system) - base
         for one in (
@@ -159,7 +159,7 @@ class Shapes(Uncertainty):
 
     def known(self, plant: Partition) -> Known:
         """Return a Delta for each direction of change of a mode shape."""
-        realisation = modal_realisation(plant)
+        realisation = plant.assembled.realisation.uncoupled
         require_elastic(realisation, self.modes)
         n = realisation.outputs.shape[0]
         real_array(self.directions, "directions of shapes", (len(self.modes), n, None))

@@ -32,9 +32,6 @@ from .neglected import Neglected
 from .neglected_dynamics import NeglectedModes, with_neglected
 from .parameter_amounts import ParameterDelta, require_matrices
 
-#: values of the Deltas at which the channels are compared with a plant assembled anew
-_PROBE = 0.5
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainPlant(Value, Generic[P]):
@@ -357,7 +354,7 @@ def _opened(base: Partition, deltas: Sequence[Delta]) -> Opened:
 
 def _require_exact(base: Partition, opened: Opened, deltas: Sequence[Delta]) -> None:
     """Raise ModelError unless the channels give the machine with all Deltas changed at once."""
-    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
+    values = {d.name: 0.5 if j % 2 else -0.25 for j, d in enumerate(deltas)}
 
     def lost(chosen: Sequence[Delta]) -> str:
         changes = [(one, values[one.name] * one.scale) for one in chosen]

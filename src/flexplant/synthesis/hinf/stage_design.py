@@ -21,8 +21,7 @@ from ...parallel import Progress
 from ...plant import AnyPlant, reference_errors, stage_weights, standard_plant
 from ...plant.machine_plants import PlantMachines
 from ...plant.realisation import natural
-from ...plant.uncertainty.frequencies import Frequencies
-from ...plant.uncertainty.mode_delta import DampingDelta
+from ...plant.uncertainty.mode_delta import DampingDelta, Frequencies
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...plant.visibility import untouched_modes
 from ...tolerances import SAME
