@@ -104,6 +104,7 @@ from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
 from .inverse_zeros import SlowZeros as SlowZeros
 from .machine_plants import FigureInterval as FigureInterval
+from .machine_plants import MachineParts as MachineParts
 from .machine_plants import PlantMachines as PlantMachines
 from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
@@ -119,7 +120,6 @@ from .ports import Reference as Reference
 from .ports import Sensor as Sensor
 from .realisation import FastStates as FastStates
 from .realisation import Feedthrough as Feedthrough
-from .remade import MachineParts as MachineParts
 from .scheduling import PlaceMotion as PlaceMotion
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position

@@ -23,7 +23,6 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import Structure
 from ..tolerances import NEGLIGIBLE, ROUNDING, SAME
-from ..words import instance
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
 from .partitioned import Partition, PartitionedSystem
@@ -231,6 +230,8 @@ def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str
 
 
 P = TypeVar("P", bound=Partition)
+#: what to do when something else is given as ports
+PASS_PORTS = "Pass Ports(w=[...], u=[...], z=[...], y=[...])."
 
 
 def wired(cls: type[P], origin: Assembled, evaluation: EvaluationModel | None) -> P:
@@ -266,8 +267,6 @@ def continuous_plant(
     cls: type[P], realisation: ModalRealisation, ports: Ports, evaluation: EvaluationModel | None
 ) -> P:
     """Return the continuous plant of a structure's modes with its channels."""
-    given: object = ports
-    instance(given, Ports, "ports", "Pass Ports(w=[...], u=[...], z=[...], y=[...]).")
     physical = with_filters(structure_system(realisation, ports), realisation, ports)
     return wired(cls, Assembled(ports, realisation, physical), evaluation)
 
@@ -360,6 +359,46 @@ def loud_like(plant: Partition, fresh: P) -> P:
         if name in fresh.w and fresh.asd.get(name, 0.0) == own.get(name, 0.0)
     }
     return fresh.replace(asd={**fresh.asd, **kept}) if kept else fresh
+
+
+def remade(
+    plant: P, realisation: ModalRealisation, ports: Ports, evaluation: EvaluationModel | None
+) -> P:
+    """Return a plant of other modes or with other ports, sampled and loud like the old one."""
+    own = plant.assembled
+    if ports is own.ports and _moves_alike(own, realisation):
+        before = with_modes(plant.continuous.assembled, realisation)
+        fresh = wired(type(plant), before, evaluation)
+    else:
+        fresh = continuous_plant(type(plant), realisation, ports, evaluation)
+    return sampled_like(plant, loud_like(plant, fresh))
+
+
+def _moves_alike(own: Assembled, realisation: ModalRealisation) -> bool:
+    """Return whether modes differ from a plant's in their poles alone, and its ports by them in A.
+
+    What a velocity or an acceleration shows of a mode hangs on its poles.
+    """
+    before = own.realisation
+    same = all(
+        getattr(realisation, name) is value or np.array_equal(getattr(realisation, name), value)
+        for name, value in before._fields().items()
+        if name != "pairs"
+    )
+    held = set(before.names) <= set(own.physical.states)
+    return same and held and not any(sensor.order for sensor in own.ports.y)
+
+
+def another_machine(plant: P, realisation: ModalRealisation, ports: Ports) -> P:
+    """Return the plant of another machine, of other modes, sampled like the old one."""
+    # the evaluation model does not describe it. What a reduced model left out follows a change of
+    # that model
+    judged = plant.evaluation
+    if judged is not None and judged.source is not plant.model:
+        judged = None
+    elif judged is not None and realisation.model is not plant.model:
+        judged = EvaluationModel.known_to(realisation.model)
+    return remade(plant, realisation, ports, judged)
 
 
 def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:

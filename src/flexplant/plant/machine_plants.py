@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..arrays import FloatArray, between, whole
-from ..errors import AssumptionError, ModelError, some_names
+from ..errors import AssumptionError, FlexplantWarning, ModelError, some_names
+from ..lti.statespace import as_statespace
 from ..seeds import MOST_DRAWS, Rng, generator
+from ..store import Value
 from ..tolerances import INTERVAL
 from ..updating import FrfResidual
 from ..updating.machines import COUNT, Machines
 from ..words import in_unit, with_unit
+from .building import another_machine, sampled
+from .forces import Actuator
 from .machine_draws import DrawnModes, MachineFamily, obstacle
-from .partitioned import MeasuredResponse
-from .ports import Ports
-from .remade import MachineParts
-from .uncertainty.delta import with_changes
-from .uncertainty.mode_delta import ModeDelta, StatedFamily
-from .uncertainty.parameter_amounts import ParameterDelta
+from .partitioned import MeasuredResponse, Partition
+from .port import ForcePort, SensorPort
+from .ports import Poi, Ports
+from .realisation import ModalRealisation, plant_modes
 from .visibility import untouched_modes
+
+Port: TypeAlias = ForcePort | SensorPort | Poi
 
 
 class FigureInterval(NamedTuple):
@@ -89,6 +95,85 @@ def fitted_response(plant: Any) -> MeasuredResponse | None:
     if any(quantities.get(name, measured) != measured for name in frf.outputs):
         return None
     return MeasuredResponse(frf)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MachineParts(Value):
+    """Parts of a machine from which its plant is made: modes, ports, delay.
+
+    The Deltas (normalised uncertain numbers) of a plant change these parts.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        The nominal plant.
+    realisation : ModalRealisation
+        Modes of the structure; their blocks of A are replaced by `pairs`.
+    pairs : (b, 2, 2) array [rad/s]
+        Diagonal blocks of A, one for each mode.
+    ports : Ports
+        Ports of the machine; `with_port` and `with_gain` change one of them.
+    model : FEModel or ReducedModel, optional
+        A model with other matrices, whose modes are then solved again in place of `realisation`.
+    late : float [samples]
+        Change of the delay of the actuators, relative to the nominal plant.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> machine = fx.plant.MachineParts.of(plant).with_gain("u1", 1.1)
+    >>> machine.assembled().Gyu.D.shape == plant.Gyu.D.shape
+    True
+    """
+
+    plant: Partition
+    realisation: ModalRealisation
+    pairs: FloatArray
+    ports: Ports
+    model: Any = None
+    late: float = 0.0
+
+    @classmethod
+    def of(cls, plant: Partition) -> MachineParts:
+        """Return the parts of a plant, which are those of the nominal machine."""
+        own = plant.assembled
+        return cls(plant, own.realisation, own.realisation.pairs, own.ports)
+
+    def with_port(self, port: Port) -> MachineParts:
+        """Return the machine with another port in place of the one with the same name."""
+        side = [port if one.name == port.name else one for one in getattr(self.ports, port.home)]
+        return self.replace(ports=self.ports.replace(**{port.home: side}))
+
+    def with_gain(self, name: str, gain: float) -> MachineParts:
+        """Return the machine with the gain of an actuator or sensor multiplied by a number."""
+        every: tuple[Actuator | SensorPort, ...] = (*self.ports.u, *self.ports.y)
+        port = next(one for one in every if one.name == name)
+        part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
+        # states as before: a command is scaled before the filter, a reading behind it
+        driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
+        return self.with_port(port.replace(dynamics=part.replace(D=gain * part.D, **driven)))
+
+    def changed(self, changes: Sequence[tuple[Any, float]]) -> MachineParts:
+        """Return the machine that is off by amounts of Deltas, those of lower stages first."""
+        machine = self
+        for delta, amount in sorted(changes, key=lambda one: one[0].stage):
+            machine = delta.changed(machine, amount)
+        return machine
+
+    def assembled(self) -> Any:
+        """Return the plant of the machine, with the sampling of the nominal plant."""
+        plant, realisation = self.plant, self.realisation
+        if self.model is not None:
+            with warnings.catch_warnings():  # the nominal plant has said in which form it is
+                warnings.simplefilter("ignore", FlexplantWarning)
+                realisation = plant_modes(self.model)
+        elif not np.array_equal(self.pairs, realisation.pairs):
+            realisation = realisation.replace(pairs=self.pairs)
+        if not self.late:
+            return another_machine(plant, realisation, self.ports)
+        fresh = another_machine(plant.continuous, realisation, self.ports)
+        return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
 
 
 class PlantMachines:
@@ -180,26 +265,23 @@ class PlantMachines:
         """Return one machine: its modes drawn together, then all else that is stated."""
         uncertain, (apart,) = self.plant.uncertainty, rng.spawn(1)
         drawn = [] if uncertain is None else uncertain.values(apart)
-        if self.fit is None and any(isinstance(delta, ParameterDelta) for delta, _ in drawn):
+        if self.fit is None and any(not delta.stage for delta, _ in drawn):  # of matrices
             changes = [(delta.of_matrices(self.plant), delta.amount(x)) for delta, x in drawn]
-            return with_changes(self.plant, changes)
+            return MachineParts.of(self.plant).changed(changes).assembled()
         if self.fit is None and not drawn:
             return self._base
-        of_modes = [one for one in drawn if isinstance(one[0], ModeDelta)]
-        others = [one for one in drawn if not isinstance(one[0], ModeDelta | ParameterDelta)]
+        of_modes = [one for one in drawn if one[0].of_modes]
+        others = [(one, one.amount(x)) for one, x in drawn if one.stage and not one.of_modes]
         machine = MachineParts.of(self._base)
         for port in _noisy(machine.ports):
             if off := self._unsure.get(port.name):  # log-normal
                 louder = float(np.exp(off * apart.standard_normal()))
                 machine = machine.with_port(port.replace(asd=louder * port.asd))
-        for delta, x in sorted(others, key=lambda one: one[0].stage):
-            machine = delta.changed(machine, delta.amount(x))
+        machine = machine.changed(others)
         if self.fit is not None:
             modes = self._of_fit(rng)
         elif of_modes:
-            whole = machine.realisation
-            family = whole.once(uncertain, lambda: StatedFamily(whole, uncertain))
-            modes = family.machine(rng, of_modes)
+            modes = uncertain.drawn_modes(machine.realisation, rng, of_modes)
         else:
             return machine.assembled()
         return machine.replace(realisation=modes, pairs=modes.pairs).assembled()

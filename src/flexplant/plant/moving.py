@@ -213,7 +213,7 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
 
 def _elsewhere(plant: Partition, name: str, point: FloatArray) -> Partition:
     """Return the plant with one port at a point."""
-    return rebuilt(plant, ports=moved_ports(plant.assembled.ports, {name: point.tolist()}))
+    return rebuilt(plant, moved_ports(plant.assembled.ports, {name: point.tolist()}))
 
 
 logger = logging.getLogger(__name__)

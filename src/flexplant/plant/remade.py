@@ -1,160 +1,50 @@
-"""Plants made of plants: with other ports, with some of the channels, or of other modes."""
+"""Plants made of plants: with other ports or some of the channels; a plant that judges one."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray
-from ..errors import FlexplantWarning, LabelError, ModelError, require_known, some_names
+from ..errors import LabelError, ModelError, require_known, some_names
 from ..lti.sampling import acting
-from ..lti.statespace import StateSpace, as_statespace
+from ..lti.statespace import StateSpace
 from ..store import Value
 from ..tolerances import SAME
-from ..words import name_list
+from ..words import instance, name_list
 from .building import (
+    PASS_PORTS,
     P,
     changed_densities,
-    continuous_plant,
-    loud_like,
-    sampled,
+    remade,
     sampled_like,
     warn_of_another_body,
     wired,
-    with_modes,
 )
 from .evaluation_model import EvaluationModel
-from .forces import Actuator
 from .origins import Assembled, Foreign, PlantChannel
 from .partitioned import Partition
-from .port import ForcePort, SensorPort
 from .ports import Poi, Ports
-from .realisation import ModalRealisation, plant_modes
-
-Port: TypeAlias = ForcePort | SensorPort | Poi
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MachineParts(Value):
-    """Parts of a machine from which its plant is made: modes, ports, delay.
-
-    The Deltas (normalised uncertain numbers) of a plant change these parts.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        The nominal plant.
-    realisation : ModalRealisation
-        Modes of the structure; their blocks of A are replaced by `pairs`.
-    pairs : (b, 2, 2) array [rad/s]
-        Diagonal blocks of A, one for each mode.
-    ports : Ports
-        Ports of the machine; `with_port` and `with_gain` change one of them.
-    model : FEModel or ReducedModel, optional
-        A model with other matrices, whose modes are then solved again in place of `realisation`.
-    late : float [samples]
-        Change of the delay of the actuators, relative to the nominal plant.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> machine = fx.plant.MachineParts.of(plant).with_gain("u1", 1.1)
-    >>> machine.assembled().Gyu.D.shape == plant.Gyu.D.shape
-    True
-    """
-
-    plant: Partition
-    realisation: ModalRealisation
-    pairs: FloatArray
-    ports: Ports
-    model: Any = None
-    late: float = 0.0
-
-    @classmethod
-    def of(cls, plant: Partition) -> MachineParts:
-        """Return the parts of a plant, which are those of the nominal machine."""
-        own = plant.assembled
-        return cls(plant, own.realisation, own.realisation.pairs, own.ports)
-
-    def with_port(self, port: Port) -> MachineParts:
-        """Return the machine with another port in place of the one with the same name."""
-        side = [port if one.name == port.name else one for one in getattr(self.ports, port.home)]
-        return self.replace(ports=self.ports.replace(**{port.home: side}))
-
-    def with_gain(self, name: str, gain: float) -> MachineParts:
-        """Return the machine with the gain of an actuator or sensor multiplied by a number."""
-        every: tuple[Actuator | SensorPort, ...] = (*self.ports.u, *self.ports.y)
-        port = next(one for one in every if one.name == name)
-        part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
-        # states as before: a command is scaled before the filter, a reading behind it
-        driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
-        return self.with_port(port.replace(dynamics=part.replace(D=gain * part.D, **driven)))
-
-    def assembled(self) -> Any:
-        """Return the plant of the machine, with the sampling of the nominal plant."""
-        plant, realisation = self.plant, self.realisation
-        if self.model is not None:
-            with warnings.catch_warnings():  # the nominal plant has said in which form it is
-                warnings.simplefilter("ignore", FlexplantWarning)
-                realisation = plant_modes(self.model)
-        elif not np.array_equal(self.pairs, realisation.pairs):
-            realisation = realisation.replace(pairs=self.pairs)
-        ports = None if self.ports is plant.assembled.ports else self.ports
-        if not self.late:
-            return rebuilt(plant, ports=ports, realisation=realisation)
-        fresh = rebuilt(plant.continuous, ports=ports, realisation=realisation)
-        return sampled(fresh, 1.0 / plant.dt, plant.delay + self.late)
-
-
-def rebuilt(
-    plant: P, *, ports: Ports | None = None, realisation: ModalRealisation | None = None
-) -> P:
-    """Return a plant with other ports or of other modes, sampled like the old one."""
-    if isinstance(plant.origin, Foreign) and isinstance(ports, Ports) and realisation is None:
+def rebuilt(plant: P, ports: Ports) -> P:
+    """Return a plant with other ports, sampled like the old one."""
+    instance(ports, Ports, "ports", PASS_PORTS)
+    if isinstance(plant.origin, Foreign):
         if not all(isinstance(port, PlantChannel) for port in (*ports.physical, *ports.z)):
             _ = plant.assembled  # other ports need a structure
         kept = {"u": [port.name for port in ports.u], "y": [port.name for port in ports.y]}
         return selected(plant, {"w": None, "z": None, **kept})
+    own = plant.assembled
+    judged = None if plant.evaluation is None else plant.evaluation.with_ports(ports)
     # ports that are among its own are rows and columns of it
-    own, judged = plant.assembled, _evaluation_of_rebuilt(plant, ports, realisation)
-    if isinstance(ports, Ports) and realisation is None and not changed_densities(plant):
-        found = with_ports_of(own, ports)
-        if found is not None:
-            before = own.continuous
-            whole = None if before is None else rebuilt(before, ports=ports)
-            return wired(type(plant), found.replace(continuous=whole), judged)
-    if ports is None and realisation is not None and _moves_alike(own, realisation):
-        fresh = wired(type(plant), with_modes(plant.continuous.assembled, realisation), judged)
-    else:
-        modes = own.realisation if realisation is None else realisation
-        fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports, judged)
-    return sampled_like(plant, loud_like(plant, fresh))
-
-
-def _evaluation_of_rebuilt(
-    plant: Partition, ports: object, realisation: ModalRealisation | None
-) -> EvaluationModel | None:
-    """Return the evaluation model of a plant that gets other ports or other modes."""
-    judged = plant.evaluation
-    if judged is None:
-        return None
-    if isinstance(ports, Ports):
-        judged = judged.with_ports(ports)
-    if realisation is None:
-        return judged
-    # other modes are another machine, which the evaluation model does not describe. What a reduced
-    # model left out follows a change of that model
-    if judged.source is not plant.model:
-        return None
-    return (
-        judged if realisation.model is plant.model else EvaluationModel.known_to(realisation.model)
-    )
+    found = None if changed_densities(plant) else with_ports_of(own, ports)
+    if found is None:
+        return remade(plant, own.realisation, ports, judged)
+    whole = None if own.continuous is None else rebuilt(own.continuous, ports)
+    return wired(type(plant), found.replace(continuous=whole), judged)
 
 
 def selected(plant: P, names: Mapping[str, Iterable[str] | None]) -> P:
@@ -177,7 +67,7 @@ def selected(plant: P, names: Mapping[str, Iterable[str] | None]) -> P:
     for one in own.references:
         left = [axis for poi, axis in own.followed if poi.name == one.poi and axis in axes[one.poi]]
         references += [one.replace(axes=left)] if left else []
-    return rebuilt(plant, ports=own.replace(w=w, u=u, z=z, y=y, references=references))
+    return rebuilt(plant, own.replace(w=w, u=u, z=z, y=y, references=references))
 
 
 def _axes_among(poi: Poi, names: Sequence[str]) -> list[str]:
@@ -203,21 +93,6 @@ def _with_rows(plant: P, kept: Mapping[str, Sequence[str]]) -> P:
         system=plant.system.select([*z, *y], [*w, *u]), w=w, u=u, z=z, y=y, asd=asd,
         evaluation=None if whole is None else selected(whole, kept),
     )  # fmt: skip
-
-
-def _moves_alike(own: Assembled, realisation: ModalRealisation) -> bool:
-    """Return whether modes differ from a plant's in their poles alone, and its ports by them in A.
-
-    What a velocity or an acceleration shows of a mode hangs on its poles.
-    """
-    before = own.realisation
-    same = all(
-        getattr(realisation, name) is value or np.array_equal(getattr(realisation, name), value)
-        for name, value in before._fields().items()
-        if name != "pairs"
-    )
-    held = set(before.names) <= set(own.physical.states)
-    return same and held and not any(sensor.order for sensor in own.ports.y)
 
 
 def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
@@ -303,7 +178,7 @@ def check_channels(plant: Partition, other: Partition) -> None:
 def own_plant(kind: type[P], model: EvaluationModel) -> P:
     """Return the plant that is an evaluation model, with the ports that it got since."""
     found = kind.of(model.source)
-    return found if model.ports is None else rebuilt(found, ports=model.ports)
+    return found if model.ports is None else rebuilt(found, model.ports)
 
 
 def matched(plant: P, model: EvaluationModel) -> P:

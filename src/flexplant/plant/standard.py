@@ -16,7 +16,7 @@ from ..lti.frequency import Frf
 from ..lti.statespace import System, as_statespace
 from ..words import flag, instance
 from .assumptions import AssumptionReport
-from .building import continuous_plant, evaluation_plant, sampled
+from .building import PASS_PORTS, continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
 from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
 from .machine_plants import PlantMachines, fitted_machines
@@ -176,7 +176,7 @@ class StandardPlant(Partition):
         The modes are not solved again, so that this is fast; the placement functions use it.
         ModelError when the plant was not assembled from a structure.
         """
-        return self._known(rebuilt(self, ports=ports))
+        return self._known(rebuilt(self, ports))
 
     def select(
         self,
@@ -557,6 +557,7 @@ def assemble_plant(
       y (1) y1
     """
     realisation = plant_modes(model, residual)
+    instance(ports, Ports, "ports", PASS_PORTS)
     judged = EvaluationModel.of(evaluation) or EvaluationModel.known_to(realisation.model)
     found = continuous_plant(StandardPlant, realisation, ports, judged)
     if judged is not None and not judged.is_structure:

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from ...arrays import positive
 from ...errors import ModelError
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
-from ..remade import MachineParts
 from .channels import Opened
 from .delta import Delta
 from .kind import Uncertainty

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from ...store import Value
 from ..building import P
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
-from ..remade import MachineParts
 from .channels import EvenUnits, Opened, with_parts
 
 
@@ -58,6 +58,8 @@ class Delta(Value):
     stage: ClassVar[int] = 1
     #: whether it changes the matrices or shapes of the plant's own model, not of a larger one
     of_own_model: ClassVar[bool] = False
+    #: whether it is of a mode's frequency or damping: these are drawn together
+    of_modes: ClassVar[bool] = False
     #: whether its channels act on what those of all others do, exactly: of a sampled plant too
     outermost: ClassVar[bool] = False
 
@@ -98,8 +100,5 @@ class Delta(Value):
 
 def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     """Return the machine that is off by some amounts, sampled like the nominal plant."""
-    machine = MachineParts.of(plant)
-    for delta, amount in sorted(changes, key=lambda one: one[0].stage):
-        machine = delta.changed(machine, amount)
-    found: P = machine.assembled()
+    found: P = MachineParts.of(plant).changed(changes).assembled()
     return found

@@ -11,8 +11,8 @@ import numpy as np
 from ...arrays import positive
 from ...errors import ModelError, require_known
 from ...lti.statespace import StateSpace
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
-from ..remade import MachineParts
 from .channels import Opened, with_channels
 from .delta import Delta
 from .kind import Uncertainty

@@ -13,9 +13,9 @@ from ...errors import ModelError, require_known, unknown_label
 from ...tolerances import ROUNDING, SAME, TINY
 from ...updating.matrix_parameters import MatrixParameter
 from ..machine_draws import DrawnModes, ModeSpace, small_exponential, symmetric_draw
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
 from ..realisation import ModalRealisation, changed_pairs
-from ..remade import MachineParts
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, with_changes
 from .kind import Uncertainty
@@ -38,6 +38,7 @@ class ModeDelta(Delta):
     """
 
     what: ClassVar[str] = ""
+    of_modes: ClassVar[bool] = True
 
     @classmethod
     def of(cls, mode: int, scale: float) -> Self:

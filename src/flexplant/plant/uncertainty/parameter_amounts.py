@@ -17,10 +17,10 @@ from ...tolerances import ROUNDING
 from ...updating.parameters import Parameter
 from ...words import instance
 from ..building import continuous_plant
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
-from ..remade import MachineParts
 from .channels import Opened
 from .delta import Delta
 from .kind import Uncertainty

@@ -11,9 +11,10 @@ import numpy as np
 from ...arrays import FloatArray, positive, real_array
 from ...errors import ModelError
 from ...tolerances import DEVIATIONS, SAME, TINY
+from ..building import another_machine
+from ..machine_plants import MachineParts
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
-from ..remade import MachineParts, rebuilt
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta
 from .kind import Known, Uncertainty
@@ -82,7 +83,7 @@ def _channels(plant: Partition, delta: ShapeDelta, base: FloatArray) -> list[Del
     q, v = (int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1))
     realisation = plant.assembled.realisation.uncoupled
     driven, seen = (
-        system_matrix(rebuilt(plant, realisation=one).system) - base
+        system_matrix(another_machine(plant, one, plant.ports).system) - base
         for one in (
             _reshaped(realisation, delta, 1.0, outputs=False),
             _reshaped(realisation, delta, 1.0, inputs=False),

@@ -20,14 +20,16 @@ from ...tolerances import DEVIATIONS
 from ...updating import Machines, ModalUncertainty, UpdateResult
 from ...words import mapping
 from ..building import P
+from ..machine_draws import DrawnModes
 from ..partitioned import Partition
+from ..realisation import ModalRealisation
 from .channels import Opened, missed
 from .delay import DelayDelta
 from .delta import Delta, with_changes
 from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
 from .kind import Known, Uncertainty
-from .mode_delta import DampingDelta, FrequencyDelta
+from .mode_delta import DampingDelta, FrequencyDelta, StatedFamily
 from .neglected import Neglected
 from .neglected_dynamics import NeglectedModes, with_neglected
 from .parameter_amounts import ParameterDelta, require_matrices
@@ -309,6 +311,13 @@ class UncertainPlant(Value, Generic[P]):
                 deltas, covariance = known.drawn, np.asarray(known.drawn_covariance)
             found += zip(deltas, _normal(rng, covariance).tolist(), strict=True)
         return found
+
+    def drawn_modes(
+        self, whole: ModalRealisation, rng: np.random.Generator, drawn: list[tuple[Delta, float]]
+    ) -> DrawnModes:
+        """Return the modes of one machine at random values of the Deltas of modes."""
+        family = whole.once(self, lambda: StatedFamily(whole, self))
+        return family.machine(rng, drawn)
 
     @cached_property
     def larger(self) -> Any:
