@@ -8,7 +8,7 @@ import pytest
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.estimation.error import error_variances
-from flexplant.estimation.left_out_modes import left_out
+from flexplant.estimation.filter_models import left_out
 from flexplant.lti import low_pass_filter
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant

@@ -10,7 +10,7 @@ import scipy.stats
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
-from flexplant.estimation.machine_noise import _difference, _driven_modes
+from flexplant.estimation.filter_models import _difference, _driven_modes
 from flexplant.plant.machine_draws import MachineFamily, small_exponential
 from flexplant.plant.machine_plants import interval_of, interval_text
 from flexplant.plant.realisation import realise

@@ -38,17 +38,17 @@ from .consistency_tests import consistency as consistency
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_models import FilterModel as FilterModel
+from .filter_models import LeftOut as LeftOut
 from .kalman import design_kalman as design_kalman
-from .lag_report import Filter as Filter
-from .lag_report import FixedLag as FixedLag
 from .lag_report import LagReport as LagReport
-from .lag_report import Predictor as Predictor
-from .lag_report import Smoother as Smoother
 from .lag_report import StaticEstimator as StaticEstimator
 from .lag_report import design_static as design_static
-from .left_out_modes import LeftOut as LeftOut
 from .mode_changes import MovedModes as MovedModes
 from .noise_from_records import NoiseLevels as NoiseLevels
 from .noise_from_records import estimate_noise as estimate_noise
+from .steady_filter import Filter as Filter
+from .steady_filter import FixedLag as FixedLag
+from .steady_filter import Predictor as Predictor
+from .steady_filter import Smoother as Smoother
 
 __dir__ = _public_names(__name__)

@@ -33,6 +33,7 @@ from .causes import (
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import poi_channels, row_of
+from .filter_models import left_out
 from .innovations import (
     ExcessPeak,
     InnovationLines,
@@ -47,7 +48,6 @@ from .innovations import (
     ljung_box,
 )
 from .kalman import design_kalman
-from .left_out_modes import left_out
 from .mode_changes import ModeChange, MovedModes, moved_modes
 
 #: fewest samples for a verdict

@@ -22,9 +22,9 @@ from ..store import Value
 from ..tolerances import TYPED
 from ..words import instance, known_units, sizes_of
 from .estimator_channels import ChannelError, estimates, recorded, row_of
-from .filter_models import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
-from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
+from .filter_models import FEW_DIGITS, FilterModel, innovation_root
 from .passage import STATIONARY, Moment, Start, Walk, stationary_start
+from .steady_filter import Filter, FixedLag, Lag, Predictor, Sight, Smoother, Steady
 
 #: fraction of a sensor's samples above which gated samples are not outliers
 _MOST = 0.1

@@ -19,9 +19,9 @@ from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
-from .filter_models import LEFT_OUT, FilterModel, Sight, filter_model
-from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
-from .left_out_modes import LeftOut, beyond_text, left_out
+from .filter_models import LEFT_OUT, FilterModel, LeftOut, beyond_text, filter_model, left_out
+from .lag_report import LAGS, LagReport, lag_errors
+from .steady_filter import Filter, Lag, Sight
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,9 +22,15 @@ from ..tolerances import CLOSE, RESIDUAL, TYPED
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, estimates, poi_channels, sensors
-from .filter_models import LEFT_OUT, FilterModel, filter_model, weigh
-from .left_out_modes import LeftOut, left_out
-from .machine_noise import unsure_noise
+from .filter_models import (
+    LEFT_OUT,
+    FilterModel,
+    LeftOut,
+    filter_model,
+    left_out,
+    unsure_noise,
+    weigh,
+)
 
 
 @one_thread()

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive_array, whole
+from ..arrays import FloatArray, positive_array
 from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.equations import solve_stein
 from ..lti.statespace import StateSpace, System
@@ -20,11 +20,11 @@ from ..parallel import one_thread
 from ..plant import AnyPlant, Disturbance, standard_plant
 from ..plant.partitioned import require_sampled
 from ..plant.rest_expansion import moved_at_rest
-from ..store import Value, checked
+from ..store import Value
 from ..tolerances import SAME
 from .error import PoiEstimator, error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
-from .filter_models import Sight, Steady
+from .steady_filter import Sight, Steady
 
 #: lags of the table [s]
 LAGS = (1e-4, 1e-3, 1e-2)
@@ -157,99 +157,6 @@ def lag_errors(
         note,
         {name: plant.units[name] for name in channels if name in plant.units},
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Predictor(Value):
-    """Choice of estimates that use only the measurements before each sample: x[k|k-1].
-
-    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
-
-    The notation x[k|j] means the estimate of the state at sample k from the measurements of the
-    samples 0 to j.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.estimation.Predictor()
-    Predictor()
-    """
-
-
-@dataclass(frozen=True, eq=False)
-class Filter(Value):
-    """Choice of estimates that use the measurements up to and including each sample: x[k|k].
-
-    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
-
-    The notation x[k|j] means the estimate of the state at sample k from the measurements of the
-    samples 0 to j.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.estimation.Filter()
-    Filter()
-    """
-
-
-@dataclass(frozen=True, eq=False)
-class FixedLag(Value):
-    """Choice of estimates that use the measurements up to some samples later: x[k|k+lag].
-
-    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
-
-    Each estimate is available only after this lag. The notation x[k|j] means the estimate of the
-    state at sample k from the measurements of the samples 0 to j.
-
-    Parameters
-    ----------
-    samples : int
-        Lag, at least 1; shorter at the end of a record.
-
-    References
-    ----------
-    [AndersonMoore1979]_, chapter 7.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.estimation.FixedLag(5)
-    FixedLag(samples=5)
-    """
-
-    samples: int = field(metadata=checked(whole))
-
-
-@dataclass(frozen=True, eq=False)
-class Smoother(Value):
-    """Choice of estimates that use all N samples of the record: x[k|N-1].
-
-    Pass it as the argument `lag` of `KalmanEstimator.estimate`.
-
-    This is the fixed-interval smoother. The notation x[k|j] means the estimate of the state at
-    sample k from the measurements of the samples 0 to j.
-
-    References
-    ----------
-    [AndersonMoore1979]_, chapter 7.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
-    >>> records = {"y1": np.zeros(50), "y2": np.zeros(50), "u1": np.zeros(50)}
-    >>> from flexplant.estimation import Filter, FixedLag, Predictor, Smoother
-    >>> lags = (Predictor(), Filter(), FixedLag(5), Smoother())
-    >>> found = [observer.estimate(records, lag).deviation("die:hat")[25] for lag in lags]
-    >>> found == sorted(found, reverse=True)
-    True
-    """
-
-
-#: types of estimates
-Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -21,7 +21,7 @@ from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .innovations import InnovationLines, density_of, whitening
 from .kalman import redesigned
-from .lag_report import Filter
+from .steady_filter import Filter
 
 #: largest numbers of lines of a band and of evaluations in the search for a mode's change; widths
 #: of a new mode

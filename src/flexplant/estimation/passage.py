@@ -14,7 +14,8 @@ from ..lti.discretisation import Recursion
 from ..lti.equations import solve_stein, sylvester
 from ..tolerances import FOUR_DIGITS, RESIDUAL, ROUNDING, TYPED
 from .estimator_channels import Recorded
-from .filter_models import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
+from .filter_models import FilterModel, innovation_root
+from .steady_filter import FilterGains, Sight, Steady, filter_gains
 
 #: number of samples between two tests of stationarity
 _LOOK = 16
