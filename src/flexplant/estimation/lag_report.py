@@ -18,8 +18,8 @@ from ..lti.equations import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant, Disturbance, standard_plant
+from ..plant.inverse import moved_at_rest
 from ..plant.partitioned import require_sampled
-from ..plant.rest_expansion import moved_at_rest
 from ..store import Value
 from ..tolerances import SAME
 from .error import PoiEstimator, error_variances

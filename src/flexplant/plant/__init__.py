@@ -88,10 +88,10 @@ from .assumptions import Assumption as Assumption
 from .assumptions import AssumptionReport as AssumptionReport
 from .axes import DrivenAxes as DrivenAxes
 from .axes import driven_axes as driven_axes
-from .axes_at_gravity import GravityAxes as GravityAxes
-from .axes_at_gravity import gravity_axes as gravity_axes
 from .decoupling import Decoupling as Decoupling
+from .decoupling import GravityAxes as GravityAxes
 from .decoupling import decouple as decouple
+from .decoupling import gravity_axes as gravity_axes
 from .evaluation_model import EvaluationModel as EvaluationModel
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
@@ -102,7 +102,7 @@ from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
 from .generalized import GeneralizedPlant as GeneralizedPlant
-from .inverse_zeros import SlowZeros as SlowZeros
+from .inverse import SlowZeros as SlowZeros
 from .machine_plants import FigureInterval as FigureInterval
 from .machine_plants import MachineParts as MachineParts
 from .machine_plants import PlantMachines as PlantMachines
@@ -132,12 +132,12 @@ from .structure_frf import StructureFrf as StructureFrf
 from .structure_frf import frequency_response as frequency_response
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
-from .uncertainty.delay import Delay as Delay
 from .uncertainty.delta import Delta as Delta
+from .uncertainty.delta import Known as Known
+from .uncertainty.delta import Uncertainty as Uncertainty
 from .uncertainty.fit import Fit as Fit
+from .uncertainty.gains import Delay as Delay
 from .uncertainty.gains import Gains as Gains
-from .uncertainty.kind import Known as Known
-from .uncertainty.kind import Uncertainty as Uncertainty
 from .uncertainty.mode_delta import Dampings as Dampings
 from .uncertainty.mode_delta import Frequencies as Frequencies
 from .uncertainty.neglected import Neglected as Neglected

@@ -1,4 +1,4 @@
-"""decouple: static transformations between the channels of a plant and the axes that u moves."""
+"""Static transformations between channels and axes: those that u moves, and those of the body."""
 
 from __future__ import annotations
 
@@ -8,16 +8,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray, divisor
-from ..errors import AssumptionError, counted, some_names
+from ..errors import AssumptionError, counted, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..store import Value
+from ..tolerances import TYPED
+from ..words import name_list
 from .axes import DrivenAxes, apart, driven_axes, real_gain
+from .inverse import followed_at_rest
 from .partitioned import Partition
-from .rest_expansion import followed_at_rest
+from .rigid_body import RigidBody, refuse_lost, rigid_body_of, rigid_parts
+
+#: units of displacements and rotations at the centre of gravity, by what a channel carries
+_UNITS = (
+    {"": "m", ":acceleration": "m/s^2", ":force": "N"},
+    {"": "rad", ":acceleration": "rad/s^2", ":force": "N m"},
+)
+
+
+class _StaticAxes(Value):
+    """Static systems between the channels of a plant and its axes."""
+
+    to_actuators: StateSpace
+    to_motions: StateSpace
+
+    @property
+    def T_u(self) -> FloatArray:
+        """Matrix (nu, r) from commands of the axes, or forces along them, to actuators."""
+        return self.to_actuators.D
+
+    @property
+    def T_y(self) -> FloatArray:
+        """Matrix (r, ny) from sensors to motions of the axes."""
+        return self.to_motions.D
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Decoupling(Value):
+class Decoupling(_StaticAxes):
     """Static transformations between the channels of a plant and its axes.
 
     Let G be the plant from u to y. At the real frequency s = sigma = 2 pi freq,
@@ -65,16 +91,6 @@ class Decoupling(Value):
     def accelerations(self) -> StateSpace:
         """System from commands (accelerations where the axis is a mass) to actuators."""
         return self.to_actuators
-
-    @property
-    def T_u(self) -> FloatArray:
-        """Matrix (nu, r) from commands of the axes to actuators."""
-        return self.to_actuators.D
-
-    @property
-    def T_y(self) -> FloatArray:
-        """Matrix (r, ny) from sensors to motions of the axes."""
-        return self.to_motions.D
 
 
 def decouple(
@@ -178,3 +194,153 @@ def _gain(
     return StateSpace(
         [], [], [], D, plant.dt, inputs=inputs, outputs=outputs, name="decoupling", units=units
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GravityAxes(_StaticAxes):
+    """Static transformations between the channels of a plant and its rigid body.
+
+    Let G be the rigid-body part of the plant from u to y. Then
+    ``to_motions G to_actuators = mass^-1 / s^2`` and ``to_motions G accelerations = I / s^2``. On
+    ground springs the same transformations are valid above the suspension frequencies, where the
+    inertia dominates.
+
+    Parameters
+    ----------
+    to_actuators : StateSpace
+        Static system T_u from forces at the centre of gravity `cog:z:force` [N, N m] to actuator
+        forces of least norm.
+    to_motions : StateSpace
+        Static system T_y from sensors to the least-squares estimate of the motions of the centre of
+        gravity `cog:z` [m, rad].
+    accelerations : StateSpace
+        Static system ``T_u mass`` from accelerations `cog:z:acceleration` to actuators.
+    mass : (r, r) array [kg, kg m, kg m^2]
+        Inertia about the centre of gravity; a rotational block need not be diagonal.
+    centre : (3,) array [m]
+        The centre of gravity; 0 in directions that the model's motions do not determine.
+    axes : sequence of str
+        The r axes, of x, y, z, rx, ry, rz.
+    """
+
+    to_actuators: StateSpace
+    to_motions: StateSpace
+    accelerations: StateSpace
+    mass: FloatArray
+    centre: FloatArray
+    axes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{c:.4g}" for c in self.centre)
+        return (
+            f"<GravityAxes {', '.join(self.axes)} at ({at}) m: {len(self.to_actuators.outputs)} "
+            f"actuators, {counted(len(self.to_motions.inputs), 'sensor')}>"
+        )
+
+
+def gravity_axes(plant: Partition, *, axes: Sequence[str] | None = None) -> GravityAxes:
+    """Return the static transformations to and from the centre of gravity.
+
+    They follow from the geometry of a free or suspended body. Only rigid-body motions are used and
+    no elastic mode shapes, so that a structure on weak springs is decoupled as if it were free. For
+    the axes that the actuators of any machine move, use `flexplant.decouple`.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Plant of a free or suspended structure, continuous or sampled.
+    axes : sequence of str, optional
+        Selected rigid-body axes; by default all of the structure.
+
+    Returns
+    -------
+    GravityAxes
+        The static transformations. The filters of the ports enter by their static gains. Only
+        displacement sensors are used.
+
+    Raises
+    ------
+    AssumptionError
+        When the actuators cannot move the axes independently, or the sensors cannot distinguish
+        them. Also when no axes are given, and actuators or sensors act along an axis that the mode
+        shapes of the model do not contain.
+    LabelError, ModelError
+        When an axis is not one of the structure's; when the plant was not assembled from a
+        structure, or it is held.
+
+    References
+    ----------
+    [Gawronski2004]_, chapter 3 (modes by their shapes at actuators and sensors).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.gravity_axes(fx.testbeds.three_masses()).mass.round(6)  # all three masses
+    array([[3.]])
+    """
+    plant = Partition.of(plant)
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    body = rigid_body_of(realisation)
+    sensors = [s for s in ports.y if s.order == 0]
+    seen = [s.static_row(realisation) for s in sensors]
+    pushed = [port.static_push(realisation) for port in ports.u]
+    if axes is None:
+        do = "; or name the axes that count, axes=[...]"
+        refuse_lost(body, realisation, [*seen, *pushed], do)
+    wanted = body.axes if axes is None else name_list(axes, "axes")
+    require_known("rigid-body axis", wanted, body.axes)
+    pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
+    see, push = rigid_parts(seen, body.motions), rigid_parts(pushed, body.motions).T
+    # in these units rotations and translations move the structure alike
+    length = np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
+    T_y = _left_inverse(see, length, pick)
+    T_u = _left_inverse(push.T, 1.0 / length, pick).T
+    _check_identity(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
+    _check_identity((push @ T_u).T, pick, wanted, body, 1.0 / length, "actuators", list(plant.u))
+    mass = pick @ body.mass @ pick.T
+    motions, forces, accelerations = (
+        [f"cog:{axis}{kind}" for axis in wanted] for kind in ("", ":force", ":acceleration")
+    )
+    units = plant.units
+    for axis in wanted:
+        own = _UNITS[axis.startswith("r")]
+        units |= {f"cog:{axis}{kind}": unit for kind, unit in own.items()}
+    return GravityAxes(
+        _gain(T_u, forces, plant.u, plant, units),
+        _gain(T_y, [s.name for s in sensors], motions, plant, units),
+        _gain(T_u @ mass, accelerations, plant.u, plant, units),
+        mass,
+        body.centre,
+        wanted,
+    )
+
+
+def _left_inverse(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:
+    """Return the rows `pick` of the least-squares left inverse, its columns in these units."""
+    return np.asarray(pick @ (unit[:, None] * np.linalg.pinv(matrix * unit, rcond=TYPED)))
+
+
+def _check_identity(
+    product: FloatArray,
+    pick: FloatArray,
+    wanted: tuple[str, ...],
+    body: RigidBody,
+    unit: FloatArray,
+    side: str,
+    names: list[str],
+) -> None:
+    """Raise AssumptionError unless T (a row per axis) times the geometry is the identity."""
+    own = pick @ unit
+    wrong = np.abs((product - pick) * unit / own[:, None]) > TYPED
+    if np.any(wrong):
+        i, j = (int(k) for k in np.argwhere(wrong)[0])
+        what = (
+            f"do not determine {wanted[i]!r} at all"
+            if body.axes[j] == wanted[i]
+            else f"mix {wanted[i]!r} with {body.axes[j]!r}"
+        )
+        raise AssumptionError(
+            f"the axis {wanted[i]!r} cannot be decoupled: the {side} "
+            f"({', '.join(names) or 'none'}) {what}. Add or move some, or choose fewer "
+            f"axes: plant.gravity_axes(plant, axes=...) of {', '.join(body.axes)}."
+        )

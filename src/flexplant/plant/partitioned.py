@@ -27,10 +27,9 @@ from ..store import Value
 from ..structure import FEModel
 from ..words import mapping, name_list
 from .evaluation_model import NOT_JUDGED, EvaluationModel
-from .origins import ELSEWHERE, Assembled, Foreign, Origin, PlantChannel
+from .origins import ELSEWHERE, TYPE_THIS, Assembled, Foreign, Origin, PlantChannel, sides_of
 from .ports import Ports
 from .realisation import MODAL, ModalRealisation
-from .sides import TYPE_THIS, sides_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)

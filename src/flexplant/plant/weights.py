@@ -18,8 +18,8 @@ from ..store import Value
 from ..tolerances import SAME
 from .axes import DrivenAxes, apart, driven_axes, real_gain, resting_frequency
 from .building import at_rate
+from .inverse import followed_at_rest
 from .port import DERIVATIVES
-from .rest_expansion import followed_at_rest
 from .standard import AnyPlant, StandardPlant, plant_of, standard_plant
 
 #: crossing of the weight relative to the bandwidth. |S| of the loop crosses 1 at 1 / 1.24 of it on

@@ -18,9 +18,8 @@ from ..loop.machine_figures import first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency, states_at
-from ..plant.inverse_zeros import SlowZeros, slow_zeros
+from ..plant.inverse import OfS, SlowZeros, at_rest, slow_zeros, solved
 from ..plant.port import DERIVATIVES, TERMS
-from ..plant.rest_expansion import OfS, at_rest, solved
 from ..store import Value
 from ..tolerances import SAME
 from ..words import flag, instance, name_list

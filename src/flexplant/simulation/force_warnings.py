@@ -12,7 +12,7 @@ from ..errors import AssumptionError, some_names, warn
 from ..loop import ClosedLoop
 from ..plant import StandardPlant, driven_axes
 from ..plant.axes import complex_gain, idle_forces, opposing_part, resting_frequency
-from ..plant.rest_expansion import at_rest, followed_at_rest, solved
+from ..plant.inverse import at_rest, followed_at_rest, solved
 from ..tolerances import NEGLIGIBLE
 from ..words import several
 from .motion import SetPointProfile

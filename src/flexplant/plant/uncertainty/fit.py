@@ -19,7 +19,7 @@ from ...updating.parameters import Parameter
 from ...words import members, several
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
-from .kind import Known, Uncertainty
+from .delta import Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, require_elastic
 from .parameter_amounts import ParameterDelta
 

@@ -17,8 +17,7 @@ from ..machine_plants import MachineParts
 from ..partitioned import Partition
 from ..realisation import ModalRealisation, changed_pairs
 from .channels import DeltaChannel, Opened, system_matrix, with_each
-from .delta import Delta, with_changes
-from .kind import Uncertainty
+from .delta import Delta, Uncertainty, with_changes
 from .parameter_amounts import ParameterDelta
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from ...arrays import whole
 from ...errors import ModelError
 from ..partitioned import Partition, is_plant
-from .kind import Uncertainty
+from .delta import Uncertainty
 from .neglected_dynamics import NeglectedModes, neglected_modes
 
 

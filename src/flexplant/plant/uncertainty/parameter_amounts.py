@@ -22,8 +22,7 @@ from ..partitioned import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .channels import Opened
-from .delta import Delta
-from .kind import Uncertainty
+from .delta import Delta, Uncertainty
 
 
 @dataclass(frozen=True, eq=False)

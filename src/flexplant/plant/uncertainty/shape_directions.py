@@ -16,8 +16,7 @@ from ..machine_plants import MachineParts
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .channels import DeltaChannel, Opened, system_matrix, with_each
-from .delta import Delta
-from .kind import Known, Uncertainty
+from .delta import Delta, Known, Uncertainty
 from .mode_delta import require_elastic
 
 

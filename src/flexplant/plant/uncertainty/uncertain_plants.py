@@ -24,11 +24,10 @@ from ..machine_draws import DrawnModes
 from ..partitioned import Partition
 from ..realisation import ModalRealisation
 from .channels import Opened, missed
-from .delay import DelayDelta
-from .delta import Delta, with_changes
+from .delta import Delta, Known, Uncertainty, with_changes
 from .delta_blocks import Block, delta_system, drawn_delta
 from .fit import Fit
-from .kind import Known, Uncertainty
+from .gains import DelayDelta
 from .mode_delta import DampingDelta, FrequencyDelta, StatedFamily
 from .neglected import Neglected
 from .neglected_dynamics import NeglectedModes, with_neglected

@@ -16,8 +16,8 @@ from ...lti.statespace import StateSpace, single_channel
 from ...words import name_list
 from ..building import at_rate
 from ..partitioned import Partition
+from .delta import Uncertainty
 from .delta_blocks import Block, FullBlock, channels_of
-from .kind import Uncertainty
 
 #: forms that a caller may name; the others follow from the channels
 Form = Literal["inverse", "coprime"]

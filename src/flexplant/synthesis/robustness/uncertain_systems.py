@@ -11,8 +11,8 @@ from ...lti.discretisation import bilinear
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...plant import StandardPlant
 from ...plant.partitioned import Partition
+from ...plant.uncertainty.delta import Uncertainty
 from ...plant.uncertainty.delta_blocks import Block, channels_of, filled_blocks
-from ...plant.uncertainty.kind import Uncertainty
 from ...plant.uncertainty.uncertain_plants import UncertainPlant, uncertain_plant
 from ...store import Value
 
