@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..errors import AssumptionError, ModelError, SolverError, counted, warn
 from ..lti.statespace import System
-from ..parallel import one_thread
+from ..parallel import PIECE, one_thread
 from ..plant import AnyPlant
 from ..store import Value
 from ..tolerances import CHANCE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SETTLED, SPLIT, TINY, TYPED
@@ -29,8 +29,8 @@ _PASSES = 6
 _EVALUATION = " Give the plant an evaluation model, if it lacks truncated modes."
 #: lags of the autocovariances of the start
 _LAGS = 40
-#: fewest samples, and lines of the spectrum computed at once
-_FEWEST, _LINES = 1000, 4000
+#: fewest samples
+_FEWEST = 1000
 #: least and largest ratio of a variance to the given one in one pass
 _LOW, _HIGH = TYPED, 1.0 / TYPED
 
@@ -254,8 +254,8 @@ def _level_spectrum(
     d = np.sqrt(np.maximum(observer.predicted_covariance.diagonal(), TINY))
     closed = (m.A - K @ m.C2) * d / d[:, None]
     parts = np.empty((len(sources), freq.size, ny, ny), dtype=np.complex128)
-    for start in range(0, freq.size, _LINES):
-        piece = slice(start, start + _LINES)
+    for start in range(0, freq.size, PIECE):
+        piece = slice(start, start + PIECE)
         to = seen_from_states(closed, m.C2 * d / size[:, None], freq[piece])  # C (z I - A_c)^-1
         for i, one in enumerate(sources):
             T = to @ ((one.G - K @ one.H) / d[:, None]) + one.H / size[:, None]

@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..errors import FlexplantError, ModelError, short
 from ..labels import DIRECTIONS
-from ..lti.frequency import ORDERS
+from ..lti.frequency import ORDERS, PER_TIME
 from ..structure.unit_systems import GRAVITY, POUND
 from .files import damaged, file_path, parsing, refused, unread
 from .triplets import extra_module
@@ -277,7 +277,7 @@ def rotation_units(
     """Return the units of rotations "41:rz" and moments "u 41:rz"; others are m and N."""
     if quantity is None:
         return {}
-    angle = "rad" + ("", "/s", "/s^2")[ORDERS[quantity]]
+    angle = "rad" + PER_TIME[ORDERS[quantity]]
     units = dict.fromkeys(outputs, angle) | dict.fromkeys(inputs, "N m")
     return {name: unit for name, unit in units.items() if name.endswith((":rx", ":ry", ":rz"))}
 

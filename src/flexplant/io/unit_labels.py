@@ -6,6 +6,7 @@ import re
 
 from scipy import constants
 
+from ..lti.frequency import PER_TIME
 from ..structure.unit_systems import GRAVITY, LENGTHS, POUND
 
 #: prefixes of SI are case-sensitive: mN is a millinewton and MN a meganewton
@@ -40,7 +41,6 @@ _OTHERS = {
 }
 _TIMES = prefixed("s", "mu") | prefixed("sec", "") | prefixed("seconds", "")
 _SECONDS = re.compile(r"\(?s(?:ec)?((?:\^|\*\*)?2)?\)?")
-_ORDERS = ("", "/s", "/s^2")
 
 
 def plain_label(text: str) -> str:
@@ -65,7 +65,7 @@ def unit_of(text: str) -> tuple[float, str] | None:
     order = sum(2 if match and match[1] else 1 for match in found)
     if order > 2:
         return None
-    return size, ("rad" if first in _ANGLES else "m") + _ORDERS[order]
+    return size, ("rad" if first in _ANGLES else "m") + PER_TIME[order]
 
 
 def seconds_of(text: str) -> float | None:

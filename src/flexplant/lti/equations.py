@@ -91,8 +91,6 @@ def reciprocal(size: FloatArray) -> FloatArray:
 
 
 _Schur = tuple[ComplexArray, ComplexArray]
-#: a doubled Riccati equation has converged: the next term would be the square of this
-_CONVERGED, _CONVERGED_QUICKLY = 1e-15, ROOT
 #: number of examined residuals, with a Newton correction between them, which squares the error
 _CORRECTIONS = 4
 
@@ -189,9 +187,9 @@ def doubled_riccati(
         size = float(np.linalg.norm(H))
         if not np.isfinite(size) or not np.isfinite(G).all():
             raise SolverError("the doubling overflows: no stabilising solution was found.")
-        if np.linalg.norm(step) <= _CONVERGED * size:
+        if np.linalg.norm(step) <= PRECISION * size:
             return H, k
-        if quick and np.all(step.diagonal() <= _CONVERGED_QUICKLY * H.diagonal()):
+        if quick and np.all(step.diagonal() <= ROOT * H.diagonal()):  # the next is its square
             return H, k
     raise SolverError(f"no convergence in {MOST_STEPS} doublings: no stabilising solution.")
 

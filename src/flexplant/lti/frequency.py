@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -161,10 +161,11 @@ def _line_range(frf: Any) -> str:
     return f"{counted(frf.freq.size, 'line')}{span}"
 
 
-#: time derivatives of each quantity
-ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
-#: units of a motion by the order of its time derivative
-_PER_TIME = ("", "/s", "/s^2")
+Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
+#: in the order of their time derivatives, with what these add to the unit of a motion
+QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
+PER_TIME = ("", "/s", "/s^2")
+ORDERS: dict[str, int] = {name: order for order, name in enumerate(QUANTITIES)}
 #: ends of the DOF labels of rotations
 ROTATIONS = (":rx", ":ry", ":rz")
 
@@ -296,7 +297,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         """Return the units of measured rotations and moments, which DOF labels show."""
         if self.quantity not in ORDERS:
             return {}
-        angle = "rad" + _PER_TIME[ORDERS[self.quantity]]
+        angle = "rad" + PER_TIME[ORDERS[self.quantity]]
         units = {name: "N m" for name in inputs if name.endswith(ROTATIONS)}
         return units | {name: angle for name in outputs if name.endswith(ROTATIONS)}
 
@@ -455,7 +456,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         variance = None if self.variance is None else self.variance * np.abs(factor) ** 2
         units = {name: unit for name, unit in self.units.items() if name not in self.outputs}
         for name in set(self.outputs) & set(self.units):
-            units[name] = self.units[name].partition("/")[0] + _PER_TIME[ORDERS[quantity]]
+            units[name] = self.units[name].partition("/")[0] + PER_TIME[ORDERS[quantity]]
         return self.replace(
             data=self.data * factor, quantity=quantity, variance=variance, units=units
         )
@@ -478,11 +479,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     @property
     def channel_units(self) -> dict[str, str]:
         """Units of the channels: those given, or those of the quantity per force in N."""
-        per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}.get(
-            self.quantity or ""
-        )
-        if per is None:
+        if self.quantity not in ORDERS:
             return dict(self.units)
+        per = "m" + PER_TIME[ORDERS[self.quantity]]
         return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:

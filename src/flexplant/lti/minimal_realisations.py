@@ -19,8 +19,6 @@ from .modal_map import eigenvalues_with_error
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 
-#: largest meaningful condition numbers of a pole: for a double pole, then for any multiplicity
-DEFECTIVE = (1.0 / ROOT, 1.0 / ROUNDING)
 #: distance of a point from the imaginary axis, relative to its frequency: large enough to avoid
 #: resonances and zeros
 FAR_OFF = 0.1
@@ -113,7 +111,8 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
     """Return the groups of any A; its stable part and the rest where its modes are too mixed."""
     d = state_scale(g.A, g.B, g.C)
     A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
-    for largest in DEFECTIVE:
+    # the largest meaningful condition of a pole: of a double one, then of any multiplicity
+    for largest in (1.0 / ROOT, 1.0 / ROUNDING):
         poles, vectors, error = eigenvalues_with_error(A, largest)
         same = SPLIT * np.abs(poles)
         conjugate = np.abs(poles[:, None] - poles.conj()) <= same

@@ -288,10 +288,6 @@ def _riccati_problem(
     return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening, discrete)
 
 
-#: largest number of Newton's steps, which double the digits each time
-NEWTON_STEPS = 10
-
-
 class RiccatiProblem(NamedTuple):
     """A problem with whitened outputs (R is J, a diagonal of signs) and no cross term."""
 
@@ -445,7 +441,7 @@ def _solution(
 def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
     """Correct P by Newton (Kleinman) steps until the correction is rounding."""
     last, correction = np.inf, doubled if p.discrete else lyapunov
-    for taken in range(1, NEWTON_STEPS + 1):  # noqa: B007 - its last value is returned
+    for taken in range(1, MOST_STEPS + 1):  # noqa: B007 - its last value is returned
         K = _riccati_gain(p, P)
         change = correction(p.A - K @ p.C, _residual(p, P, K)[0])
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0

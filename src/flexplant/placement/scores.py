@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray, IntArray, positive, real_array, whole
 from ..errors import LabelError, ModelError, counted, short
+from ..lti.frequency import Quantity
 from ..plant import Sensor, StandardPlant
-from ..plant.port import Quantity
 from ..store import Value
 from ..words import SHOWN, instance
 from ..work import Work

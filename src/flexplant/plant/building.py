@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import FloatArray, IntArray, positive
 from ..errors import ModelError, counted, warn
 from ..lti.discretisation import tustin
+from ..lti.frequency import QUANTITIES
 from ..lti.interconnection import among, append, series
 from ..lti.sampling import (
     check_latency,
@@ -26,7 +27,7 @@ from ..tolerances import NEGLIGIBLE, ROUNDING, SAME
 from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
 from .partitioned import Partition, PartitionedSystem
-from .port import QUANTITIES, ForcePort, MeasuredRow, SensorPort
+from .port import ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural
 

@@ -26,8 +26,94 @@ _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 _OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 
 
+class Weighable(PartitionedSystem):
+    """What can be done with a machine, and with weights and blocks around it."""
+
+    def weighted(
+        self,
+        weights: Any = None,
+        *,
+        z: Mapping[str, Any] | None = None,
+        w: Mapping[str, Any] | None = None,
+    ) -> GeneralizedPlant:
+        """Return the plant with weights on z and w. Their states are added; channel names stay.
+
+        Parameters
+        ----------
+        weights : StageWeights, optional
+            Result of `stage_weights`, with z and w; the arguments `z` and `w` replace its entries.
+        z, w : mapping {name: weight}
+            Weights by channel. A weight is a number or a system with one input and one output. A
+            continuous weight of a sampled plant is sampled at the plant's rate by Tustin. None
+            removes the channel; channels that are not named are unchanged. If the actuator u1 has
+            no noise, a weight of `u1:disturbance` in w adds this disturbance. A weight of
+            `y1:signal` in z adds the signal of the sensor y1 without its noise.
+
+        Returns
+        -------
+        GeneralizedPlant
+            `W_z P W_w`; its `unweighted` is this plant.
+
+        Raises
+        ------
+        LabelError, ModelError
+            When a name is unknown; when a weight has several inputs or outputs, or another sampling
+            time.
+        """
+        return weighted(self, *both_weights(weights, z, w))
+
+    def through(self, block: System) -> GeneralizedPlant:
+        """Return the plant whose measurements are the outputs of a block that reads y.
+
+        The controller may then read errors, decoupled motions or filtered sensors. When you close
+        the loop, put the same block before the controller.
+
+        Parameters
+        ----------
+        block : StateSpace
+            Block whose inputs are channels of y. Its outputs become y.
+
+        Raises
+        ------
+        LabelError, ModelError
+            When an input of the block is not in y; when its sampling time differs.
+        """
+        return measured_through(self, as_statespace(block))
+
+    def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
+        """Return figures over the positions: decoupling, visibility of modes, and your own ones.
+
+        Parameters
+        ----------
+        judge : callable or mapping {name: callable}, optional
+            Function of the plant at each position that returns a number: ``{"margin": lambda p:
+            fx.modulus_margin((p, controller))}``.
+        points : int or mapping {name: int or array}
+            Number of values of each position over its range, or the values [m or rad].
+
+        Raises
+        ------
+        LabelError, ModelError
+            When the plant has no positions; when it was not assembled from a structure, a value is
+            out of range, or a judge gives no number.
+        """
+        return position_map(self, judge, points)
+
+    def to_control(self) -> Any:
+        """Return the whole system as a `control.StateSpace` with the same names."""
+        return self.system.to_control()
+
+    def check(self) -> AssumptionReport:
+        """Return which standard assumptions hold, in physical terms, rigid-body modes first."""
+        return self._report
+
+    @cached_property
+    def _report(self) -> AssumptionReport:
+        return AssumptionReport(self)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class GeneralizedPlant(PartitionedSystem):
+class GeneralizedPlant(Weighable):
     """Plant for a synthesis: a machine P with weights, ``W_z P W_w``, or with blocks at y.
 
     Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Once
@@ -159,20 +245,6 @@ class GeneralizedPlant(PartitionedSystem):
         rest = {name: value for name, value in changes.items() if name not in _OF_MACHINE}
         return rest | ({"unweighted": self.unweighted.replace(**own)} if own else {})
 
-    def weighted(
-        self,
-        weights: Any = None,
-        *,
-        z: Mapping[str, Any] | None = None,
-        w: Mapping[str, Any] | None = None,
-    ) -> GeneralizedPlant:
-        """Return the plant with more weights, as `StandardPlant.weighted`."""
-        return weighted(self, *both_weights(weights, z, w))
-
-    def through(self, block: System) -> GeneralizedPlant:
-        """Return the plant whose y are the outputs of a block, as `StandardPlant.through`."""
-        return measured_through(self, as_statespace(block))
-
     def select(
         self,
         *,
@@ -219,22 +291,6 @@ class GeneralizedPlant(PartitionedSystem):
         """
         known = self.unweighted.uncertain(*given, frequency=frequency, damping=damping)
         return self.around(known.nominal)
-
-    def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
-        """Return figures of the machine over its positions, as `StandardPlant.map`."""
-        return position_map(self, judge, points)
-
-    def to_control(self) -> Any:
-        """Return the whole system as a `control.StateSpace` with the same names."""
-        return self.system.to_control()
-
-    def check(self) -> AssumptionReport:
-        """Return which standard assumptions hold, as `StandardPlant.check`."""
-        return self._report
-
-    @cached_property
-    def _report(self) -> AssumptionReport:
-        return AssumptionReport(self)
 
 
 def both_weights(

@@ -22,14 +22,13 @@ from .port import DERIVATIVES
 #: a function of s, real on the real axis, to an array of any shape
 OfS: TypeAlias = Callable[[complex], ComplexArray]
 
-#: points on a circle of Cauchy's integrals
-_SAMPLES = 16
 #: largest radius [rad/s]: 1 kHz, above the bandwidth of any motion; how often it is halved, to 5e-6
 _LARGEST, _RADII = 6e3, 30
 #: where the expansion is compared with the function, relative to the radius: in decades, so that
 #: poles far inside of the circle are noticed too
 _INSIDE = np.logspace(-1, -4, 4)
-#: terms that are compared: eight lack 0.1^8 of a function that is regular within the circle
+#: terms that are compared: eight lack 0.1^8 of a function that is regular within the circle, of
+#: as many points are taken on its upper half
 _TERMS = 8
 
 
@@ -71,12 +70,12 @@ def _is_inside(find: OfS, terms: FloatArray, radius: float) -> bool:
 
 
 def _on_circle(find: OfS, radius: float) -> FloatArray:
-    """Return k_m = sum F(s_i) s_i^-m / N over N points of a circle (the lower half conjugate)."""
-    turns = np.exp(2j * np.pi * (np.arange(_SAMPLES // 2) + 0.5) / _SAMPLES)
+    """Return k_m = Re sum F(s_i) s_i^-m / N over N points of the upper half of a circle."""
+    turns = np.exp(1j * np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
     values = np.array([find(radius * complex(turn)) for turn in turns])
     powers = turns[:, None] ** -np.arange(_TERMS)
     summed = np.einsum("t...,tm->...m", values, powers).real
-    return np.asarray(2.0 / _SAMPLES * summed / radius ** np.arange(_TERMS))
+    return np.asarray(summed / _TERMS / radius ** np.arange(_TERMS))
 
 
 def solved(G: ComplexArray, wanted: ComplexArray, axes: Sequence[str]) -> ComplexArray:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ..arrays import FloatArray, positive, real_array
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
+from ..lti.frequency import PER_TIME, QUANTITIES, Quantity
 from ..lti.statespace import StateSpace, single_channel
 from ..store import Value
 from ..tolerances import TYPED
 from ..words import check_names, flag
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
-
-Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
-#: in the order of their time derivatives
-QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
 
 #: what a set-point profile gives of a reference, by the order of the derivative
 TERMS = ("position", "velocity", "acceleration", "jerk", "snap")
@@ -236,7 +233,7 @@ def static_gain(part: StateSpace | None) -> float:
 def motion_unit(at: Place, direction: str, order: int = 0) -> str | None:
     """Return the unit of a motion; None for a sum of displacements and rotations."""
     turns = turning(at, direction)
-    return None if turns is None else ("rad" if turns else "m") + ("", "/s", "/s^2")[order]
+    return None if turns is None else ("rad" if turns else "m") + PER_TIME[order]
 
 
 def force_unit(at: Place, direction: str) -> str | None:

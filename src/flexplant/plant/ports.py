@@ -11,13 +11,14 @@ from ..arrays import FloatArray
 from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, Place
 from ..lti.filters import pade
+from ..lti.frequency import Quantity
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
 from ..store import Value
 from ..structure.rigid import place_motion
 from ..words import check_names, instance, members, name_list, several
 from .forces import Actuator
-from .port import ForcePort, MeasuredRow, Quantity, SensorPort, checked_port, motion_unit, observed
+from .port import ForcePort, MeasuredRow, SensorPort, checked_port, motion_unit, observed
 from .realisation import ModalRealisation
 from .scheduling import Position, port_at, require_positions
 

@@ -13,14 +13,13 @@ from ..arrays import positive
 from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
 from ..lti.frequency import Frf
-from ..lti.statespace import System, as_statespace
+from ..lti.statespace import System
 from ..words import flag, instance
-from .assumptions import AssumptionReport
 from .building import PASS_PORTS, continuous_plant, evaluation_plant, sampled
 from .evaluation_model import EvaluationModel
-from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
+from .generalized import GeneralizedPlant, Weighable
 from .machine_plants import PlantMachines, fitted_machines
-from .moving import PortPath, PositionMap, along, moved_ports, position_map, seen_elsewhere
+from .moving import PortPath, along, moved_ports, seen_elsewhere
 from .partitioned import MeasuredResponse, Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
@@ -30,7 +29,7 @@ from .uncertainty.uncertain_plants import UncertainPlant, uncertain_plant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StandardPlant(Partition):
+class StandardPlant(Weighable, Partition):
     """A plant with disturbances w, inputs u, performance z and measurements y.
 
     ::
@@ -118,57 +117,6 @@ class StandardPlant(Partition):
             samples: the unit is probably another one.
         """
         return self._known(sampled(self, rate, delay))
-
-    def weighted(
-        self,
-        weights: Any = None,
-        *,
-        z: Mapping[str, Any] | None = None,
-        w: Mapping[str, Any] | None = None,
-    ) -> GeneralizedPlant:
-        """Return the plant with weights on z and w. Their states are added; channel names stay.
-
-        Parameters
-        ----------
-        weights : StageWeights, optional
-            Result of `stage_weights`, with z and w; the arguments `z` and `w` replace its entries.
-        z, w : mapping {name: weight}
-            Weights by channel. A weight is a number or a system with one input and one output. A
-            continuous weight of a sampled plant is sampled at the plant's rate by Tustin. None
-            removes the channel; channels that are not named are unchanged. If the actuator u1 has
-            no noise, a weight of `u1:disturbance` in w adds this disturbance. A weight of
-            `y1:signal` in z adds the signal of the sensor y1 without its noise.
-
-        Returns
-        -------
-        GeneralizedPlant
-            `W_z P W_w`; its `unweighted` is this plant.
-
-        Raises
-        ------
-        LabelError, ModelError
-            When a name is unknown; when a weight has several inputs or outputs, or another sampling
-            time.
-        """
-        return weighted(self, *both_weights(weights, z, w))
-
-    def through(self, block: System) -> GeneralizedPlant:
-        """Return the plant whose measurements are the outputs of a block that reads y.
-
-        The controller may then read errors, decoupled motions or filtered sensors. When you close
-        the loop, put the same block before the controller.
-
-        Parameters
-        ----------
-        block : StateSpace
-            Block whose inputs are channels of y. Its outputs become y.
-
-        Raises
-        ------
-        LabelError, ModelError
-            When an input of the block is not in y; when its sampling time differs.
-        """
-        return measured_through(self, as_statespace(block))
 
     def with_ports(self, ports: Ports) -> StandardPlant:
         """Return the plant of the same structure and sampling with other ports.
@@ -289,25 +237,6 @@ class StandardPlant(Partition):
             raise ModelError("delay counts samples: sample it first, plant.discretized(rate).")
         return self.replace(measurement=MeasuredResponse(frf, flag(hold, "hold"), late))
 
-    def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
-        """Return figures over the positions: decoupling, visibility of modes, and your own ones.
-
-        Parameters
-        ----------
-        judge : callable or mapping {name: callable}, optional
-            Function of the plant at each position that returns a number: ``{"margin": lambda p:
-            fx.modulus_margin((p, controller))}``.
-        points : int or mapping {name: int or array}
-            Number of values of each position over its range, or the values [m or rad].
-
-        Raises
-        ------
-        LabelError, ModelError
-            When the plant has no positions; when it was not assembled from a structure, a value is
-            out of range, or a judge gives no number.
-        """
-        return position_map(self, judge, points)
-
     def along(self, name: str, points: npt.ArrayLike) -> PortPath:
         """Return the rows of C and D of a POI (or columns of B and D of a force) at many points.
 
@@ -405,18 +334,6 @@ class StandardPlant(Partition):
         if model is None:
             return None
         return evaluation_plant(self, model) if model.is_structure else matched(self, model)
-
-    def to_control(self) -> Any:
-        """Return the whole system as a `control.StateSpace` with the same names."""
-        return self.system.to_control()
-
-    def check(self) -> AssumptionReport:
-        """Return which standard assumptions hold, in physical terms, rigid-body modes first."""
-        return self._report
-
-    @cached_property
-    def _report(self) -> AssumptionReport:
-        return AssumptionReport(self)
 
 
 def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System) -> StandardPlant:

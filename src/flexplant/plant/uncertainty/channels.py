@@ -14,8 +14,6 @@ from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
 from ...tolerances import NEGLIGIBLE, ROUNDING, TINY, TYPED
 
-#: directions of a Delta's change below this, relative to the largest, are left out
-_RANK = 1e-5
 #: largest norm of a fraction's feedback: its pole lies well beyond the ends of the Delta
 _FEEDBACK = 0.5
 
@@ -174,7 +172,7 @@ class EvenUnits(NamedTuple):
         # half the difference of the ends is `L (1 - F^2)^-1 R`, half their sum, which is zero of
         # what is affine, `L F (1 - F^2)^-1 R`
         left, values, right = la.svd(change.matrix, full_matrices=False)
-        rank = int(np.count_nonzero(values > _RANK * values[0]))
+        rank = int(np.count_nonzero(values > TYPED * values[0]))
         left, right, root = left[:, :rank], right[:rank], np.sqrt(values[:rank])
         feed = np.zeros((rank, rank))
         bend = change.bend

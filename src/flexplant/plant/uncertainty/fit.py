@@ -11,7 +11,7 @@ import numpy as np
 from ...arrays import ComplexArray, FloatArray, positive
 from ...errors import LabelError, ModelError, require_known, short
 from ...identification import MeasuredModes
-from ...modes.matching import assigned
+from ...modes.matching import NEAR, assigned
 from ...sparse.symmetric import dense
 from ...tolerances import CLOSE, DEVIATIONS, ROUNDING, SAME, TYPED
 from ...updating import Machines, ModalUncertainty, UpdateResult, eigenvalue_sensitivities
@@ -22,9 +22,6 @@ from ..realisation import ModalRealisation
 from .delta import Known, Uncertainty
 from .mode_delta import DampingDelta, FrequencyDelta, ModeDelta, require_elastic
 from .parameter_amounts import ParameterDelta
-
-#: relative distance of measured poles, typed, from those of the machine
-_TYPED_POLES = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +142,7 @@ class Fit(Uncertainty):
 
     def _of_poles(self, realisation: ModalRealisation, poles: _Poles, name: str) -> Known:
         """Return Deltas of poles that are known, with their covariance."""
-        limit = TYPED if name == "fit" else _TYPED_POLES
+        limit = TYPED if name == "fit" else NEAR
         _check_poles(realisation, poles.modes, poles.values, limit, name)
         G = _log_derivatives(poles.values)
         covariance = G @ poles.covariance @ G.T

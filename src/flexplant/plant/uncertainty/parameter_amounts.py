@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from ...arrays import FloatArray, positive
 from ...errors import ModelError
 from ...labels import Place
+from ...lti.frequency import QUANTITIES, Quantity
 from ...sparse.symmetric import dense, orthonormalised
 from ...tolerances import ROUNDING
 from ...updating.parameters import Parameter
@@ -19,7 +20,7 @@ from ...words import instance
 from ..building import continuous_plant
 from ..machine_plants import MachineParts
 from ..partitioned import Partition
-from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
+from ..port import ForcePort, SensorPort
 from ..realisation import ModalRealisation
 from .channels import Opened
 from .delta import Delta, Uncertainty
