@@ -217,6 +217,16 @@ def block_diagonal(pairs: FloatArray) -> FloatArray:
     return matrix.reshape(2 * b, 2 * b)
 
 
+def turning_parts(pairs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return m (b,), N (b, 2, 2), q (b,) of blocks ``m I + N``, ``N^2 = q I`` (Cayley-Hamilton)."""
+    # no cancellation near a pole m +- q^(1/2), which matters for slow modes of a sampled system
+    N = pairs.copy()
+    N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
+    N[:, 1, 1] = -N[:, 0, 0]
+    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
+    return mean, N, N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+
+
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
     hint = "Pass whole numbers, or blocks=None."

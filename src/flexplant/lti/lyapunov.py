@@ -11,7 +11,7 @@ from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import SolverError
 from ..parallel import one_thread
 from ..tolerances import MOST_STEPS, SETTLED
-from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal
+from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal, turning_parts
 from .equations import compressed, solve_lyapunov, solve_stein, state_scale, symmetrised, triangular
 from .modal_map import ModalMap
 from .statespace import StateSpace, System, as_statespace
@@ -99,10 +99,10 @@ def _modal_gramian(
     pairs, slots = diagonal_blocks(A, blocks)
     real, b = slots >= 0, len(slots)
     drive = (B[slots] * real[:, :, None]).reshape(2 * b, -1)
-    gap = 0.25 * (pairs[:, 0, 0] - pairs[:, 1, 1]) ** 2
+    _, N, q = turning_parts(pairs)
     # nearly double poles have ill-conditioned eigenvectors, and real poles of different size would
     # lose digits
-    if np.all(gap + pairs[:, 0, 1] * pairs[:, 1, 0] < -_SWINGING * gap):
+    if np.all(q < -_SWINGING * N[:, 0, 0] ** 2):
         own = ModalMap.of_pairs(pairs)
         modal = own.gramian(own.driven(drive), sampled=discrete)
         padded = own.back(own.back(modal).conj().T).real

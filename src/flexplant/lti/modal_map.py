@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..tolerances import ROOT, SPLIT
-from .blocks_of_states import diagonal_blocks, is_block_diagonal
+from .blocks_of_states import diagonal_blocks, is_block_diagonal, turning_parts
 from .equations import even_scale, state_scale
 from .statespace import StateSpace
 
@@ -31,10 +31,10 @@ class ModalMap(NamedTuple):
         The poles are m +- r, m half the trace and ``r^2 I = (A - m I)^2`` (Cayley-Hamilton): their
         damping is as accurate as the block.
         """
-        (a, e), (c, g) = pairs.transpose(1, 2, 0)
-        mean, half = 0.5 * (a + g), 0.5 * (a - g)
+        mean, N, q = turning_parts(pairs)
+        half, e, c = N[:, 0, 0], N[:, 0, 1], N[:, 1, 0]
         plain = (e == 0) & (c == 0)
-        root = np.where(plain, half, np.sqrt((half**2 + e * c).astype(np.complex128)))
+        root: ComplexArray = np.where(plain, half, np.sqrt(q.astype(np.complex128)))
         first, second = root + half, root - half  # r + N_11, r - N_11; their product is e c
         T = np.where(
             np.abs(e) >= np.abs(c),

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..arrays import CACHED, COLUMNS, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import PIECE, one_thread
-from .blocks_of_states import diagonal_blocks, uncoupled_run
+from .blocks_of_states import diagonal_blocks, turning_parts, uncoupled_run
 from .equations import scaled_schur
 from .modal_map import diagonal_form
 from .statespace import StateSpace
@@ -122,16 +122,10 @@ def _solver(g: Subsystem) -> tuple[Solver, int, int]:
 
 def _modal(g: Subsystem) -> Solver:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
-    # blocks m I + N with N^2 = q I (Cayley-Hamilton), m half the trace:
-    # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`: no cancellation near s = m,
-    # which matters for slow modes of a sampled system. Complex numbers are pairs of real columns,
-    # so that no complex product is formed
+    # blocks m I + N with N^2 = q I: `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`. Complex
+    # numbers are pairs of real columns, so that no complex product is formed
     pairs, slots = diagonal_blocks(g.A, g.blocks or ())
-    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
-    N = pairs.copy()
-    N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
-    N[:, 1, 1] = -N[:, 0, 0]
-    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    mean, N, q = turning_parts(pairs)
     real = slots >= 0
     B, C = g.B[slots] * real[:, :, None], (g.C[:, slots] * real).transpose(1, 0, 2)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))

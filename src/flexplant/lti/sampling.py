@@ -16,7 +16,13 @@ from ..errors import AssumptionError, ModelError, warn
 from ..store import rebuild
 from ..tolerances import CLOSE, SAME, TINY
 from ..words import check_names
-from .blocks_of_states import block_diagonal, block_eigenvalues, diagonal_blocks, uncoupled_run
+from .blocks_of_states import (
+    block_diagonal,
+    block_eigenvalues,
+    diagonal_blocks,
+    turning_parts,
+    uncoupled_run,
+)
 from .equations import compressed, state_scale
 from .statespace import StateSpace, System, as_statespace
 
@@ -464,14 +470,9 @@ def _even_units(pairs: FloatArray) -> FloatArray:
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
-    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
-    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
-    # pair, linear in h for a rigid-body pair
-    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
-    N = pairs.copy()
-    N[:, 0, 0] -= mean
-    N[:, 1, 1] -= mean
-    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)` with A = m I + N, N^2 = q I and r^2 = q:
+    # trigonometric for an oscillating pair, linear in h for a rigid-body pair
+    mean, N, q = turning_parts(pairs)
     root, still = np.sqrt(np.abs(q)), q >= 0
     decay, turning = np.exp(mean * h), root * h
     even, odd = decay * np.cos(turning), decay * np.sin(turning) / divisor(root)

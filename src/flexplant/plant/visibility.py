@@ -111,8 +111,7 @@ def mode_visibility(plant: PartitionedSystem) -> tuple[ModeVisibility, ...]:
     g, count = plant.system, plant.assembled.realisation.n_modes
     n_rigid = plant.n_rigid + len(plant.unstable_modes)
     pairs = plant.modal_blocks[n_rigid:count]
-    omega = np.sqrt(np.abs(np.linalg.det(pairs)))
-    zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
+    omega, zeta = natural(pairs)
     swinging = pairs.copy()
     swinging[pairs[:, 0, 0] == 0.0, 1, 1] = 0.0  # damping does not bend a real mode
     # filters of ports act at the pole; one that does not swing stands for its frequency
