@@ -375,7 +375,7 @@ class PoleFit:
         return [self.own_of(place) for place in range(len(self.lines.parts))]
 
     def own_below(self, place: int, below: float) -> PoleFit | None:
-        """Return the fit of one output, or set-up, alone; None where it stays above a cost."""
+        """Return the fit of one output, or set-up, alone: a known one, or one below a cost."""
         if place not in self.alone:
             with attempted(f"a fit of {self.lines.side} {place + 1} alone", SolverError):
                 self.alone[place] = self.of_rows(self.lines.parts[place], below)

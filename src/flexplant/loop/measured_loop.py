@@ -375,8 +375,8 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         return NyquistCount(
             None,
             f"at the lowest lines, from {grid[0]:.4g} Hz, the plant has the slope {slope:.2g}, "
-            f"but rigid={rigid} was stated: a free body has slope 2, a held one slope 0. State "
-            "rigid=, or measure at lower frequencies",
+            f"but rigid is {rigid}: a free body has slope 2, a held one slope 0. State rigid=, or "
+            "measure at lower frequencies",
         )
     return nyquist_count(
         plant, parts.controller, parts.hidden,

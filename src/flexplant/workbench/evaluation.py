@@ -22,7 +22,7 @@ from ..lti.frequency_sweep import resonance_grid
 from ..lti.interconnection import loop_poles, side_by_side
 from ..lti.measured_lines import MeasuredPlant, low_slope
 from ..lti.response_solvers import Responder, remembered, responder
-from ..synthesis import LoopDesign, ShapedAxis
+from ..synthesis import LoopDesign
 from ..synthesis.laws.axis_law import MeasuredAxis
 from ..synthesis.laws.law import Axes, Law
 
@@ -185,7 +185,7 @@ class AxisLoop:
         return None if self.count.unstable is None else not self.count.unstable
 
 
-_Kept: TypeAlias = tuple[BenchMachine, tuple[ShapedAxis, ...], OthersClosed]
+_Kept: TypeAlias = tuple[BenchMachine, LoopDesign, OthersClosed]
 
 
 class Evaluator:
@@ -239,18 +239,20 @@ class Evaluator:
 
     def _with_others(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
         """Return the axis with the others closed; kept until one of them changes."""
-        others = tuple(axis for n, axis in design.axes.items() if n != name)
         key = id(machine), name
         known = self._kept.get(key)
-        if known and known[0] is machine and all(map(_same_axis, known[1], others)):
+        if known and known[0] is machine and _same_others(known[1], design, name):
             return known[2]
         found = _closed_around(machine, design, name)
-        self._kept[key] = machine, others, found
+        self._kept[key] = machine, design, found
         return found
 
 
-def _same_axis(one: ShapedAxis, other: ShapedAxis) -> bool:
-    return one is other or (not one.closed and not other.closed)
+def _same_others(one: LoopDesign, two: LoopDesign, name: str) -> bool:
+    """Return whether the loops of all axes but one are the same in two designs."""
+    pairs = [(axis, two.axes[n]) for n, axis in one.axes.items() if n != name]
+    alike = all(a is b or not (a.closed or b.closed) for a, b in pairs)
+    return alike and (one.rate, one.rigid) == (two.rate, two.rigid)
 
 
 def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
