@@ -63,6 +63,40 @@ def test_drawn_machines_have_the_measured_shapes(seed):
     assert np.mean(bound) < 0.2 * np.mean(free)
 
 
+def test_more_places_than_modes_are_noise_alone_beyond_what_modes_show():
+    """The posterior of the noise by the whole covariance of all places."""
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(30, SIZE))
+    seen = shapes_of(scatter(rng)[0], rows)
+    sizes = la.norm(rows[:, MEASURED], axis=0)
+    seen += 5e-4 * sizes * rng.normal(size=seen.shape)
+    known = MeasuredShapes(rows, seen, OMEGA, MEASURED, (), np.full((SIZE, SIZE), 2.0), S)
+    assert known.off.shape == (MEASURED.size, SIZE)
+    basis = la.qr(rows, mode="economic")[0]
+    effects = [basis @ part for part in known.effects]
+    G = np.zeros((seen.size, SIZE * SIZE))
+    for k, i in enumerate(MEASURED):
+        for j in range(SIZE):
+            for at in {(i, j), (j, i)}:
+                G[30 * k : 30 * k + 30, SIZE * at[0] + at[1]] = effects[k][:, j]
+    same = np.array([[i * SIZE + j, j * SIZE + i] for i in range(SIZE) for j in range(i)])
+    G = G[:, same[:, 0]]
+    off = []
+    for k, i in enumerate(MEASURED):
+        own = rows[:, i] / sizes[k]
+        scaled = seen[:, k] * (seen[:, k] @ rows[:, i]) / (seen[:, k] @ seen[:, k])
+        off.append((scaled - own * (own @ scaled)) / sizes[k])
+    values, V = la.eigh(2.0 * S**2 * G @ G.T)
+    free = la.null_space(la.block_diag(*(rows[:, i : i + 1] for i in MEASURED)).T)
+    inner = free.T @ (V * values) @ V.T @ free
+    values, V = la.eigh(inner)
+    misfit = (V.T @ free.T @ np.concatenate(off)) ** 2
+    of = np.maximum(values, 0.0)[:, None] + known.variances
+    log = np.log(known.variances) - np.sum(np.log(of) + misfit[:, None] / of, axis=0)
+    chance = np.exp(0.5 * (log - log.max()))
+    np.testing.assert_allclose(known.chances, chance / chance.sum(), atol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_draws_are_those_of_gaussian_conditioning(seed):

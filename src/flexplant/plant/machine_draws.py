@@ -413,20 +413,30 @@ class MeasuredShapes:
         )
         gains[:, omega == 0.0] = -1.0
         self._near = np.zeros(gains.shape, dtype=bool)
-        n, m = len(seen), len(measured)
+        places, m = len(seen), len(measured)
+        model = seen[:, measured]
+        sizes = divisor(la.norm(model, axis=0))
+        scales = np.sum(shapes.conj() * model, axis=0) / divisor(la.norm(shapes, axis=0) ** 2)
+        scaled = (scales * shapes).real
+        self._beyond = 0.0
+        if places > omega.size:  # what no mode shows is noise alone, whatever the scatter
+            basis = la.qr(seen, mode="economic")[0]
+            whole, seen, scaled = scaled, basis.T @ seen, basis.T @ scaled
+            squares = (np.sum(part**2, axis=0) @ sizes**-2.0 for part in (whole, scaled))
+            self._beyond = float(-np.diff([*squares])[0])
+        n = len(seen)
         self.rows, self.effects = np.zeros((2, m, n, omega.size))
         self.off, count = np.zeros((m, n)), 0
-        for k, i in enumerate(measured.tolist()):
+        for k in range(m):
             near = [k, *(sum(pair) - k for pair in pairs if k in pair)]
             self._near[k, measured[near]] = True
             gains[k, self._near[k]] = 0.0
             plane = la.orth(seen[:, measured[near]])
-            apart = (np.eye(n) - plane @ plane.T) / divisor(la.norm(seen[:, i]))
+            apart = (np.eye(n) - plane @ plane.T) / sizes[k]
             self.rows[k] = apart @ seen
             self.effects[k] = self.rows[k] * gains[k]
-            scale = np.vdot(shapes[:, k], seen[:, i]) / divisor(la.norm(shapes[:, k]) ** 2)
-            self.off[k] = apart @ (scale * shapes[:, k]).real
-            count += n - plane.shape[1]
+            self.off[k] = apart @ scaled[:, k]
+            count += places - plane.shape[1]
         values, self._vectors = la.eigh(self._prior())
         self._values = np.where(values > ROUNDING * values[-1], values, 0.0)
         self.variances, self.chances = self._noise(count, deviation)
@@ -448,13 +458,12 @@ class MeasuredShapes:
         Its standard deviation has a flat prior between rounding and all of the misfit.
         """
         misfit = (self._vectors.T @ self.off.ravel()) ** 2
-        most = max(float(misfit.sum()) / max(count, 1), TINY)
+        most = max((float(misfit.sum()) + self._beyond) / max(count, 1), TINY)
         v = most * np.geomspace(ROUNDING, 1.0, _VARIANCES)
         of = deviation**2 * self._values[:, None] + v
         # directions along the shapes have no misfit, because their scale was removed
-        log = (misfit.size - count + 1) * np.log(v) - np.sum(
-            np.log(of) + misfit[:, None] / of, axis=0
-        )
+        log = (misfit.size - count + 1) * np.log(v) - self._beyond / v
+        log -= np.sum(np.log(of) + misfit[:, None] / of, axis=0)
         chance = np.exp(0.5 * (log - log.max()))
         return v, chance / chance.sum()
 
