@@ -367,6 +367,7 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
     zero = np.abs(distance) <= SAME * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
     plant = parts.measured
+    taken = "was found there" if rigid is None else "was stated"
     rigid = plant.free_motions if rigid is None else rigid
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
     swing = distance[~zero] / (2j * np.pi * (parts.dt or 1.0))
@@ -375,8 +376,8 @@ def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> Nyquist
         return NyquistCount(
             None,
             f"at the lowest lines, from {grid[0]:.4g} Hz, the plant has the slope {slope:.2g}, "
-            f"but rigid is {rigid}: a free body has slope 2, a held one slope 0. State rigid=, or "
-            "measure at lower frequencies",
+            f"but rigid={rigid} {taken}: a free body has slope 2, a held one slope 0. State "
+            "rigid=, or measure at lower frequencies",
         )
     return nyquist_count(
         plant, parts.controller, parts.hidden,

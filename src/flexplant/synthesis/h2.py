@@ -10,12 +10,11 @@ from ..arrays import FloatArray
 from ..certificates import Certificate, Verified, stability_check
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.interconnection import lft
-from ..lti.norms import h2_norm
+from ..lti.norms import SAME_NORM, h2_norm
 from ..lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import AnyPlant
-from ..tolerances import FOUR_DIGITS
 from .controller import Controller, SolvedController, required_stability
 from .hinf.singular import lacking, made_regular
 from .pipeline import Design, Solution, designed, posed
@@ -180,12 +179,12 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> Certificate:
         raise CertificateError(
             f"the H2 norm of the closed loop is infinite: the controller is refused. {_UNDAMPED}"
         )
-    if not abs(norm - claim) <= FOUR_DIGITS * norm:
+    if not abs(norm - claim) <= SAME_NORM * norm:
         raise CertificateError(
             f"the H2 norm of the closed loop is {norm:.9g} by its Gramians, {claim:.9g} by the "
             "synthesis: the problem is too badly conditioned to trust. Bring the "
             "sizes of the weights closer together."
         )
-    limit = claim * (1.0 + FOUR_DIGITS)
+    limit = claim * (1.0 + SAME_NORM)
     checks = (Verified("H2 norm", norm, "Gramians of the loop", limit), Verified("claim", claim))
     return Certificate((*checks, stability_check(least, loop.dt)))
