@@ -16,7 +16,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
-from ..lti.blocks_of_states import equal_matrices
+from ..lti.blocks_of_states import ModalMap, equal_matrices
 from ..lti.equations import (
     accumulated,
     difference_of,
@@ -27,7 +27,6 @@ from ..lti.equations import (
     sylvester,
 )
 from ..lti.lyapunov import dual_variances, stein_root
-from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant

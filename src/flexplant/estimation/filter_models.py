@@ -14,8 +14,8 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..errors import AssumptionError, ModelError, SolverError, counted
+from ..lti.blocks_of_states import ModalMap
 from ..lti.equations import square_root
-from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
 from ..modes.matching import NEAR, assigned
 from ..plant import AnyPlant, StandardPlant

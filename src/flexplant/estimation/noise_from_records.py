@@ -15,7 +15,17 @@ from ..lti.statespace import System
 from ..parallel import PIECE, one_thread
 from ..plant import AnyPlant
 from ..store import Value
-from ..tolerances import CHANCE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SETTLED, SPLIT, TINY, TYPED
+from ..tolerances import (
+    CHANCE,
+    DEVIATIONS,
+    FOUR_DIGITS,
+    MOST_STEPS,
+    NEGLIGIBLE,
+    SETTLED,
+    SPLIT,
+    TINY,
+    TYPED,
+)
 from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
@@ -357,8 +367,6 @@ def _level_covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
 
 #: name of the channel for all disturbances of a plant that was not assembled
 PROCESS = "process"
-#: relative deviation of a density above which its variance minus two deviations is below 0
-_BOUND = 0.25
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -414,8 +422,9 @@ class NoiseLevels(Value):
         """Return a text of a level: a bound if it may be 0 (within two deviations)."""
         # the variance t of a ratio has the deviation 2 t times that of the density's logarithm
         ratio, off = float(self.ratios[i]), self.relative[self.channels[i]]
-        if off > _BOUND:
-            return f"at most {ratio * np.sqrt(1.0 + 4.0 * off):.2g} times the given density"
+        if 2.0 * DEVIATIONS * off > 1.0:
+            most = ratio * np.sqrt(1.0 + 2.0 * DEVIATIONS * off)
+            return f"at most {most:.2g} times the given density"
         return f"{ratio:.4g} times the given density, +- {100 * off:.2g} %"
 
     @property

@@ -14,7 +14,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import ModelError, only_one, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
-from ..lti.modal_map import Obstacle, obstacle
+from ..lti.modal import Obstacle, obstacle
 from ..lti.response_solvers import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant

@@ -14,8 +14,7 @@ from ..tolerances import RANK
 from .equations import compressed
 from .interconnection import parallel, series
 from .lyapunov import controllability_factor, observability_factor
-from .modal import StableSplit, split_stable
-from .modal_map import obstacle
+from .modal import StableSplit, obstacle, split_stable
 from .norms import axis_peak, h2_norm, peak_gain
 from .statespace import StateSpace, System, as_statespace
 

@@ -1,4 +1,4 @@
-"""Matrices and names of connected systems, and the blocks on the diagonal of their A.
+"""Matrices and names of connected systems, the blocks on the diagonal of A, and their modes.
 
 Systems are anything with A, B, C, D, dt, inputs, outputs, states and blocks: the operators of
 `StateSpace` are built upon these functions.
@@ -7,7 +7,7 @@ Systems are anything with A, B, C, D, dt, inputs, outputs, states and blocks: th
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -16,7 +16,10 @@ from ..arrays import ComplexArray, FloatArray, IntArray, whole
 from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..tolerances import ROUNDING
 from ..words import instance, name_list, several
+from .equations import state_scale
 
+#: largest condition of eigenvectors whose residues are used
+POOR = 1e5
 #: A, B, C, D
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
@@ -296,3 +299,110 @@ def pair_eigenvalues(
     # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
     root: ComplexArray = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
     return 0.5 * (a + d) + root, 0.5 * (a + d) - root
+
+
+class ModalMap(NamedTuple):
+    """Poles (n,) of A, its eigenvectors T and T^-1: full, or (b, 2, 2) of uncoupled pairs."""
+
+    poles: ComplexArray
+    T: ComplexArray
+    inverse: ComplexArray
+
+    @classmethod
+    def of_pairs(cls, pairs: FloatArray) -> ModalMap:
+        """Return the map of separate blocks (b, 2, 2); T^-1 is not finite for defective blocks.
+
+        The poles are m +- r, m half the trace and ``r^2 I = (A - m I)^2`` (Cayley-Hamilton): their
+        damping is as accurate as the block.
+        """
+        mean, N, q = turning_parts(pairs)
+        half, e, c = N[:, 0, 0], N[:, 0, 1], N[:, 1, 0]
+        plain = (e == 0) & (c == 0)
+        root: ComplexArray = np.where(plain, half, np.sqrt(q.astype(np.complex128)))
+        first, second = root + half, root - half  # r + N_11, r - N_11; their product is e c
+        T = np.where(
+            np.abs(e) >= np.abs(c),
+            np.array([[e + 0j, e + 0j], [second, -first]]),
+            np.array([[first, -second], [c + 0j, c + 0j]]),
+        ).transpose(2, 0, 1)
+        T[plain] = np.eye(2)
+        adjugate = np.stack([T[:, 1, 1], -T[:, 0, 1], -T[:, 1, 0], T[:, 0, 0]], axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = adjugate / (T[:, 0, 0] * T[:, 1, 1] - T[:, 0, 1] * T[:, 1, 0])[:, None]
+        poles = np.stack([mean + root, mean - root], axis=1).reshape(-1)
+        return cls(poles, T, inverse.reshape(-1, 2, 2))
+
+    def gramian(self, driven: ComplexArray, *, sampled: bool) -> ComplexArray:
+        """Return X of ``L X + X L* + d d* = 0``, or ``X = L X L* + d d*``: of modes driven by d."""
+        other = self.poles.conj()
+        sums = 1.0 - np.outer(self.poles, other) if sampled else -np.add.outer(self.poles, other)
+        return np.asarray(driven @ driven.conj().T / sums)
+
+    def seen(self, rows: FloatArray) -> ComplexArray:
+        """Return ``rows T``: how outputs (p, n) see the modes."""
+        if self.T.ndim == 2:
+            return np.asarray(rows @ self.T)
+        split = rows.reshape(len(rows), len(self.T), 2)
+        return np.asarray(np.einsum("pbi,bij->pbj", split, self.T).reshape(rows.shape))
+
+    def driven(self, columns: FloatArray) -> ComplexArray:
+        """Return ``T^-1 columns``: how inputs (n, m) drive the modes."""
+        return _times(self.inverse, columns)
+
+    def back(self, columns: ComplexArray) -> ComplexArray:
+        """Return ``T columns``: the states (n, m) of modes."""
+        return _times(self.T, columns)
+
+    def shapes(self, chosen: IntArray) -> ComplexArray:
+        """Return some columns of T."""
+        if self.T.ndim == 2:
+            return self.T[:, chosen]
+        found = np.zeros((len(self.T), 2, chosen.size), dtype=np.complex128)
+        found[chosen // 2, :, np.arange(chosen.size)] = self.T[chosen // 2, :, chosen % 2]
+        return np.asarray(found.reshape(2 * len(self.T), chosen.size))
+
+
+def _times(factor: ComplexArray, columns: FloatArray | ComplexArray) -> ComplexArray:
+    if factor.ndim == 2:
+        return np.asarray(factor @ columns)
+    split = columns.reshape(len(factor), 2, columns.shape[1])
+    return np.asarray((factor @ split).reshape(columns.shape))
+
+
+class Diagonal(NamedTuple):
+    """``C (s I - A)^-1 B = left (s I - diag(poles))^-1 right``; None for ill-conditioned V."""
+
+    poles: ComplexArray
+    left: ComplexArray | None = None
+    right: ComplexArray | None = None
+
+
+def diagonal_form(A: FloatArray, B: FloatArray, C: FloatArray) -> Diagonal:
+    """Return a system in the eigenvectors of A; only its poles where these are ill-conditioned."""
+    if len(A) == 1:
+        return Diagonal(*(part.astype(np.complex128) for part in (A[0], C, B)))
+    d = state_scale(A, B, C)
+    found: Any = np.linalg.eig(A * d / d[:, None])
+    poles, V = (np.asarray(part, dtype=np.complex128) for part in found)
+    try:
+        inverse = np.linalg.inv(V)
+    except np.linalg.LinAlgError:
+        return Diagonal(poles)
+    with np.errstate(over="ignore"):  # of defective poles
+        condition = np.linalg.norm(V) * np.linalg.norm(inverse)
+    if not condition < POOR:
+        return Diagonal(poles)
+    return Diagonal(poles, (C * d) @ V, inverse @ (B / d[:, None]))
+
+
+def block_form(g: Any) -> Diagonal | None:
+    """Return a system in the modes of its blocks, in closed form; None where A has others."""
+    if not is_block_diagonal(g):
+        return None
+    pairs, slots = diagonal_blocks(g.A, g.blocks or ())
+    own = ModalMap.of_pairs(pairs)
+    if not np.isfinite(own.inverse).all():
+        return Diagonal(own.poles)
+    real, n = slots >= 0, slots.size
+    B, C = g.B[slots] * real[:, :, None], g.C[:, slots] * real
+    return Diagonal(own.poles, own.seen(C.reshape(-1, n)), own.driven(B.reshape(n, -1)))

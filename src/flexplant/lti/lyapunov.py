@@ -11,9 +11,14 @@ from ..arrays import ComplexArray, FloatArray, divisor
 from ..errors import SolverError
 from ..parallel import one_thread
 from ..tolerances import MOST_STEPS, SETTLED
-from .blocks_of_states import bilinear_matrices, diagonal_blocks, is_block_diagonal, turning_parts
+from .blocks_of_states import (
+    ModalMap,
+    bilinear_matrices,
+    diagonal_blocks,
+    is_block_diagonal,
+    turning_parts,
+)
 from .equations import compressed, solve_lyapunov, solve_stein, state_scale, symmetrised, triangular
-from .modal_map import ModalMap
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -14,8 +14,7 @@ from ..tolerances import CLOSE, RANK, ROOT, ROUNDING, SAME, SPLIT, TINY, TYPED
 from .blocks_of_states import block_matrix, is_block_diagonal, joined_blocks
 from .equations import reciprocal, state_scale
 from .lyapunov import controllability_factor, observability_factor
-from .modal import modal_form, part_of, split_stable
-from .modal_map import eigenvalues_with_error
+from .modal import eigenvalues_with_error, modal_form, part_of, split_stable
 from .response_solvers import responses
 from .statespace import StateSpace, System, as_statespace
 

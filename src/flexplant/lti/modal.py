@@ -1,8 +1,9 @@
-"""The modal block form of any system: real 2 x 2 blocks where its eigenvectors allow them."""
+"""The modal block form of any system, its stable part, and how well its poles are known."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -10,11 +11,13 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray, positive
 from ..errors import SolverError, counted
 from ..store import Value
-from ..tolerances import NEGLIGIBLE, SAME, SPLIT
+from ..tolerances import NEGLIGIBLE, ROOT, SAME, SPLIT
 from .blocks_of_states import block_eigenvalues, is_block_diagonal
-from .equations import state_scale
-from .modal_map import eigenvalues_with_error, uncertain_poles
+from .equations import even_scale, state_scale
 from .statespace import StateSpace, System, as_statespace
+
+#: number of roundings of A that a pole may contain
+ROUNDINGS = 4.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -345,3 +348,81 @@ def part_of(g: StateSpace, kept: np.typing.NDArray[np.bool_]) -> StateSpace:
 
 def _part(g: StateSpace, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
     return g.replace(A=A, B=B, C=C, D=D, states=(), blocks=None)
+
+
+class Obstacle(NamedTuple):
+    """A pole that makes a norm infinite."""
+
+    reason: str
+    freq: float  # [Hz]
+
+
+def obstacle(
+    g: StateSpace, *, axis_only: bool = False, known: ComplexArray | None = None
+) -> Obstacle | None:
+    """Return the worst pole on or beyond the stability limit (or only on it), or None."""
+    # rounding moves computed poles: those of a rigid body in dense A have about 1e-4 rad/s with
+    # either sign. A pole closer to the limit than its uncertainty (rounding of A times the
+    # condition number of the eigenvalue) counts as lying on it. Known eigenvalues are not computed
+    # again
+    if not g.n_states:
+        return None
+    poles, error = uncertain_poles(g, known)
+    growth = np.abs(poles) - 1.0 if g.dt else poles.real
+    on_axis = np.abs(growth) <= error
+    beyond = (growth > 0) & ~on_axis & (not axis_only)
+    if not (beyond | on_axis).any():
+        return None
+    worst = int(np.argmax(np.where(beyond if beyond.any() else on_axis, growth, -np.inf)))
+    pole, unsure = poles[worst], float(error[worst])
+    edge = "the unit circle" if g.dt else "the imaginary axis"
+    freq = float(abs(np.angle(pole) / g.dt if g.dt else pole.imag)) / (2 * np.pi)
+    if beyond[worst]:
+        return Obstacle(
+            f"unstable: a pole at {freq:.6g} Hz lies {growth[worst]:.3g}"
+            f"{'' if g.dt else ' rad/s'} beyond {edge}",
+            freq,
+        )
+    integrates = abs(pole - 1.0 if g.dt else pole) <= unsure
+    kind = "a rigid-body mode or integrator" if integrates else f"an undamped pole at {freq:.6g} Hz"
+    rounding = f" (to within its rounding, {unsure:.1g})" if unsure else ""
+    return Obstacle(f"marginal: {kind} lies on {edge}{rounding}", 0.0 if integrates else freq)
+
+
+def uncertain_poles(
+    g: StateSpace, known: ComplexArray | None = None
+) -> tuple[ComplexArray, FloatArray]:
+    """Return the poles and the uncertainty of each by rounding."""
+    poles = g.poles() if known is None else known
+    if g.blocks is not None and max(g.blocks) <= 2:
+        return poles, np.zeros(poles.size)  # closed form: as exact as A
+    d = state_scale(g.A, g.B, g.C)
+    A = g.A * d / d[:, None]
+    gap = np.abs(np.abs(poles) - 1.0 if g.dt else poles.real)
+    size = float(np.linalg.norm(A))  # at least the norm, which costs more
+    if np.any(gap <= SPLIT * size):
+        size = float(np.linalg.norm(A, 2))
+    error = np.finfo(float).eps * size * np.ones(poles.size)
+    if not np.any(gap <= SPLIT * size):
+        return poles, error
+    poles, _, error = eigenvalues_with_error(A)
+    return poles, error
+
+
+def eigenvalues_with_error(
+    A: FloatArray, largest: float = 1.0 / ROOT
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return eigenvalues, eigenvectors and the uncertainty of each eigenvalue by rounding."""
+    # in the units of LAPACK's balancing, in which blocks of different speed do not affect each
+    # other
+    found: Any = la.eig(A, left=True, right=True)
+    values, left, right = found
+    d = even_scale(A)[:, None]
+    size = np.linalg.norm(left * d, axis=0) * np.linalg.norm(right / d, axis=0)
+    condition = size / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), size / largest)
+    rounding = ROUNDINGS * np.finfo(float).eps * float(np.linalg.norm(A * d.T / d, 2))
+    return (
+        np.asarray(values, dtype=np.complex128),
+        right.astype(np.complex128),
+        rounding * condition,
+    )

@@ -19,7 +19,7 @@ from .lyapunov import (
     observability_factor,
     observability_gramian,
 )
-from .modal_map import obstacle
+from .modal import obstacle
 from .peaks import Residues, proved_peak, residues
 from .response_solvers import Responder, points, responder
 from .statespace import StateSpace, System, as_statespace

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..arrays import CACHED, ComplexArray, FloatArray, divisor
 from ..tolerances import CLOSE, TINY, TYPED
-from .modal_map import block_form, diagonal_form
+from .blocks_of_states import block_form, diagonal_form
 from .statespace import StateSpace
 
 #: largest number of refined peaks, and their least fraction of the largest gain

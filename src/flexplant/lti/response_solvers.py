@@ -11,9 +11,8 @@ import numpy.typing as npt
 from ..arrays import CACHED, COLUMNS, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import PIECE, one_thread
-from .blocks_of_states import diagonal_blocks, turning_parts, uncoupled_run
+from .blocks_of_states import diagonal_blocks, diagonal_form, turning_parts, uncoupled_run
 from .equations import scaled_schur
-from .modal_map import diagonal_form
 from .statespace import StateSpace
 
 #: attribute with the prepared function of a system, which is often swept several times

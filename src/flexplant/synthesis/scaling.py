@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..arrays import ComplexArray, FloatArray, divisor
 from ..lti.equations import bordered_scale, state_scale
-from ..lti.modal_map import eigenvalues_with_error
+from ..lti.modal import eigenvalues_with_error
 from ..lti.response_solvers import responses
 from ..lti.statespace import StateSpace
 from ..tolerances import NEGLIGIBLE, SAME, TINY

@@ -18,8 +18,7 @@ from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.minimal_realisations import minimal
-from ...lti.modal import modal_form
-from ...lti.modal_map import eigenvalues_with_error
+from ...lti.modal import eigenvalues_with_error, modal_form
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import (
     CLOSE,

@@ -20,7 +20,7 @@ from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
 from ...lti.frequency_sweep import DRAWN, around_resonance
-from ...lti.modal_map import obstacle
+from ...lti.modal import obstacle
 from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
