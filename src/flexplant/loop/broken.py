@@ -157,10 +157,11 @@ def sensitivity_size(L: ComplexArray, inner: ComplexArray | None = None) -> Floa
     the n eigenvalues of S* S, its square lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n -
     1)`` [WolkowiczStyan1980]_.
     """
-    gain, less = (_frobenius(one) if one is not None else np.zeros(len(L)) for one in (L, inner))
+    gain, less = _frobenius(L), 0.0 if inner is None else _frobenius(inner)
     size, acts = np.maximum(1.0 - less, 0.0) / (1.0 + gain), gain >= _SMALL
     for _ in range(2):
-        size[acts] = norm_or_bound(sensitivity(L[acts], None if inner is None else inner[acts]))
+        if acts.any():
+            size[acts] = norm_or_bound(sensitivity(L[acts], None if inner is None else inner[acts]))
         acts = (gain < _SMALL) & (size.max(initial=0.0) * (1.0 - gain) < 1.0 + less)
     return np.asarray(size)
 
