@@ -69,7 +69,7 @@ def test_poles_that_nearly_coincide_keep_the_equations_of_a_step_positive():
     part = np.random.default_rng(3).normal(size=(2, 6)) + 0j
     part[:, 1] = part[:, 0] * (1 + 1e-2j)
     fit = pivoted(lines, poles, part)
-    for (Q, _), (smooth, _) in zip(fit.bases, lines.smooth_bases, strict=True):
+    for Q, (smooth, _) in zip(fit.bases, lines.smooth_bases, strict=True):
         rows = Q.T.reshape(Q.shape[1], 2, -1).swapaxes(0, 1)
         assert np.max(np.abs(rows @ smooth)) < 1e-14
     N, _ = fit.gradient()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -27,7 +26,7 @@ from ..errors import ModelError, SolverError, counted
 from ..modes.matching import assigned, in_span, mac_matrix
 from ..store import Value, checked
 from ..tolerances import NULL, SAME, TINY
-from .line_weights import PreparedLines
+from .line_weights import NEAR, PreparedLines
 
 #: flags of a pole; each includes the previous ones
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
@@ -169,8 +168,7 @@ class StabilisationDiagram(Value):
             raise SolverError(
                 f"no pole is stable {where}: use a band where resonances exceed the noise, "
                 "several resonance widths wide (few lines allow few orders), or pick poles by "
-                "hand with "
-                "diagram.select(freq=[...])."
+                "hand with diagram.select(freq=[...])."
             )
         return self._chosen(kept)
 
@@ -193,9 +191,9 @@ class StabilisationDiagram(Value):
         known = np.unique(self.tracks)
         centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
         lengths = np.array([np.sum(self.tracks == track) for track in known])
-        away: Any = np.abs(centres[None, :] / np.maximum(wanted, TINY)[:, None] - 1.0)
+        away: Any = np.abs(centres / np.maximum(wanted, TINY)[:, None] - 1.0)
         # a long track is preferred to a short one that is slightly closer
-        cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
+        cost = np.where(away < 0.03, away + 0.01 / lengths, 1e3)
         if cost.shape[1] < wanted.size:
             raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")
         columns = assigned(cost, most=1.0)
@@ -245,15 +243,16 @@ def built_diagram(
         first += fresh.size
         flags.append(flag)
         tracks.append(track)
+    sizes = [one.poles.size for one in results]
     return StabilisationDiagram(
-        np.concatenate([np.full(one.poles.size, one.order) for one in results]),
+        np.repeat([one.order for one in results], sizes),
         np.concatenate([one.poles for one in results]),
         np.concatenate(flags),
         np.concatenate(tracks),
         shapes=np.concatenate([one.shapes for one in results], axis=1),
         participation=np.concatenate([one.participation for one in results], axis=1),
         band=band,
-        highest=np.full(sum(one.poles.size for one in results), results[-1].order),
+        highest=np.full(sum(sizes), results[-1].order),
     )
 
 
@@ -284,6 +283,10 @@ def _continued_poles(
     return assigned(cost, most=100.0), flag
 
 
+#: largest damping ratio of a mode
+BROADEST = 0.2
+#: largest changes of frequency and damping of a stable pole from order to order, and its least MAC
+STEADY = (0.01, 0.05, 0.95)
 #: fraction of the unit circle that the band occupies; the rest separates its two ends
 ARC = 0.9
 
@@ -455,7 +458,9 @@ def parts_of(ready: PreparedLines, orders: list[int] | None = None) -> list[Part
     for own, seen in windows:
         freq = ready.freq[seen]
         mirrored = own.start == 0 and _last_low(ready, seen.stop) > 0
-        count = _resolved(freq) * (2 if mirrored else 1)
+        # polynomials are determined only where lines exist; single missing lines do not matter
+        gap = float(np.quantile(np.diff(freq), _WIDE))
+        count = min(freq.size, round(float(freq[-1] - freq[0]) / gap) + 1) * (1 + mirrored)
         # at least four orders are compared, for which twenty lines are enough
         top = max(6, min(HIGHEST, count // LINES_OF_ORDER - 1, max(POLES // references, 10)))
         mine = list(range(2, top + 1, step if top >= 4 * step else 1)) if orders is None else orders
@@ -469,21 +474,12 @@ def parts_of(ready: PreparedLines, orders: list[int] | None = None) -> list[Part
     return parts
 
 
-def _resolved(freq: FloatArray) -> int:
-    """Return the number of evenly spaced lines with the resolution of the widest gaps."""
-    # polynomials are determined only where lines exist; single missing lines do not matter
-    gap = float(np.quantile(np.diff(freq), _WIDE))
-    return min(freq.size, round(float(freq[-1] - freq[0]) / gap) + 1)
-
-
 #: number of lines of a part, and fraction of it that is used beyond each of its ends
 LINES, OVERLAP = 400, 0.25
 #: ratio of the frequencies at the ends of a part above which it is divided, and least number of
 #: lines that a part keeps: modes far below the top of a part lie within few lines of it, closer
 #: than its orders resolve
 WIDEST, FEWEST = 8.0, 40
-#: distance of the lowest line from zero, in lines, up to which this is so
-NEAREST = 20
 #: distance outside of the band, relative to it, within which poles are searched, since they affect
 #: the responses inside
 MARGIN = 0.04
@@ -515,7 +511,7 @@ def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
 
 def _last_low(ready: PreparedLines, last: int) -> int:
     """Return the number of lines far below the last one, zero where no line is near zero."""
-    if ready.freq[0] > NEAREST * ready.spacing:
+    if ready.freq[0] > NEAR * ready.spacing:
         return 0
     return int(np.searchsorted(ready.freq, ready.freq[last - 1] / WIDEST))
 
@@ -528,8 +524,8 @@ def _weakest(power: FloatArray, middle: int, reach: int) -> int:
 def diagram_of(
     ready: PreparedLines,
     orders: list[int] | None,
-    tolerances: tuple[float, float, float],
-    max_zeta: float,
+    tolerances: tuple[float, float, float] = STEADY,
+    max_zeta: float = BROADEST,
 ) -> StabilisationDiagram:
     """Return the diagrams of all parts as one; a track belongs to the part with its median."""
     low, high = float(ready.freq[0]), float(ready.freq[-1])
@@ -537,11 +533,9 @@ def diagram_of(
     found = []
     for part in parts_of(ready, orders):
         own, freq = part.own, ready.freq[part.seen]
-        moments = moments_in(ready, part)
-        inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
-        results = moments.solve(part.orders, inside)
         spacing = 2 * np.pi * float(np.median(np.diff(freq))) if part.mirrored else 0.0
-        diagram = built_diagram(results, band, tolerances, first=first, spacing=spacing)
+        poles = order_poles(ready, part, part.orders, max_zeta)
+        diagram = built_diagram(poles, band, tolerances, first=first, spacing=spacing)
         first += len(diagram)
         ends = (
             low - edge if own.start == 0 else ready.freq[own.start],
@@ -552,10 +546,9 @@ def diagram_of(
             mine = diagram.tracks == track
             keep[mine] = ends[0] <= np.median(diagram.freq[mine]) < ends[1]
         found.append((diagram, keep))
-    names = ("orders", "poles", "flags", "tracks", "shapes", "participation", "highest")
     parts: dict[str, Any] = {
         name: np.concatenate([getattr(one, name)[..., keep] for one, keep in found], axis=-1)
-        for name in names
+        for name in ("orders", "poles", "flags", "tracks", "shapes", "participation", "highest")
     }
     return StabilisationDiagram(**parts, band=band)
 
@@ -577,6 +570,21 @@ def weighted_by_remainder(ready: PreparedLines, orders: list[int] | None) -> Pre
     return now
 
 
+def order_poles(
+    ready: PreparedLines, part: Part, orders: list[int], max_zeta: float = BROADEST
+) -> list[OrderPoles]:
+    """Return the poles of a part of the band for some of its orders."""
+    low, high = ready.freq[part.seen][[0, -1]].tolist()
+    edge = MARGIN * (high - low)
+
+    def counted_there(poles: ComplexArray) -> BoolArray:
+        freq, zeta = np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles)
+        keep = (freq > max(low - edge, 0.5 * low)) & (freq < high + edge)
+        return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))
+
+    return moments_in(ready, part).solve(orders, counted_there)
+
+
 def moments_in(ready: PreparedLines, part: Part) -> Moments:
     """Return the normal equations of the lines of one part."""
     freq, data = ready.freq[part.seen], ready.data[:, :, part.seen]
@@ -586,11 +594,3 @@ def moments_in(ready: PreparedLines, part: Part) -> Moments:
         data = np.concatenate([data[:, :, ::-1].conj(), data], axis=2)
         weight = np.concatenate([weight[:, ::-1], weight], axis=1)
     return Moments(freq, data, weight, part.orders[-1])
-
-
-def _in_band(poles: ComplexArray, *, low: float, high: float, max_zeta: float) -> BoolArray:
-    """Return which poles are counted in a part of the band."""
-    freq = np.abs(poles) / (2 * np.pi)
-    zeta, edge = -poles.real / np.abs(poles), MARGIN * (high - low)
-    keep = (freq > max(low - edge, 0.5 * low)) & (freq < high + edge)
-    return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))

@@ -15,9 +15,10 @@ from ..modes.matching import ALIKE, mac_matrix
 from ..parallel import Progress, expect
 from ..tolerances import TINY
 from .diagram import PoleSelection, StabilisationDiagram, diagram_of, weighted_by_remainder
-from .line_weights import NARROW, PreparedLines, Rejected, mains_multiple
+from .line_weights import NARROW, NEAR, PreparedLines, Rejected, mains_multiple
 from .model_error import (
     NOISE,
+    SAME_RESONANCE,
     Disagreement,
     disagreement,
     gain_due_of_pole,
@@ -28,8 +29,6 @@ from .model_error import (
     unevenness,
 )
 from .pole_test import (
-    UPPER,
-    afforded_terms,
     dropped,
     fewer_terms,
     gain_due_of_own_poles,
@@ -46,9 +45,7 @@ from .pole_test import (
 )
 from .refine import Exhausted, Lines, PoleFit, Products, pivoted, refined, scaled_inverse
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
-
-#: distance from a pole, in half-widths, within which another one may belong to the same resonance
-SAME_RESONANCE = 3.0
+from .terms import UPPER, afforded_terms
 
 
 def gated(
@@ -196,10 +193,9 @@ RUNS = "runs"
 STAGES = 6
 #: largest number of accepted changes of one kind, and of poles of a fit
 MOST, MOST_POLES = 6, 60
-#: least distance, in lines, of poles at peaks: a peak that is not a linear resonance is explained
-#: badly, and its remainder is not another pole; and number of lines required on either side of a
-#: peak, since only one flank is visible at the edge of the band
-REGION, FLANK = 20, 5
+#: number of lines required on either side of a peak: at the edge of the band only one flank is
+#: visible
+FLANK = 5
 #: ratio of the power of the largest line to the median line above which a response counts as
 #: significant: for noise in one channel, the largest of a million lines has a ratio of 20
 STANDS_OUT = 20.0
@@ -339,7 +335,7 @@ def identified(
 
 def _begin(task: Task, ready: PreparedLines, orders: list[int] | None) -> _Begin:
     """Return the poles that are stable over the orders of the diagram, else those of the peaks."""
-    diagram = diagram_of(ready, orders, (0.01, 0.05, 0.95), 0.2)
+    diagram = diagram_of(ready, orders)
     try:
         return _Begin(diagram.automatic(), diagram, alone=True)
     except SolverError:
@@ -478,7 +474,8 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
             one
             for one in trials
             if ends[0] < one.poles[-1].imag < ends[1]
-            and np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
+            # a peak that is not a linear resonance leaves a remainder, which is not another pole
+            and np.all(np.abs(one.poles[-1] - fit.poles) > NEAR * spacing)
         ]
         best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
         if best is None or best.gain < best.least:

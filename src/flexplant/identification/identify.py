@@ -14,10 +14,12 @@ from ..parallel import one_thread
 from ..tolerances import ROUNDING
 from ..words import instance, several
 from .diagram import (
+    BROADEST,
+    STEADY,
     PoleSelection,
     StabilisationDiagram,
     diagram_of,
-    moments_in,
+    order_poles,
     parts_of,
     weighted_by_remainder,
 )
@@ -25,6 +27,7 @@ from .frf_estimation import repetitions, stacked_runs
 from .identification_stages import MOST_POLES, RUNS, Task, identified
 from .line_weights import PreparedLines, prepared_lines
 from .result import IdentifiedModes, of_segments
+from .terms import UPPER, axis, pole_terms, residual_terms
 
 #: largest number of residual terms on one side of the band: higher powers of a frequency cannot be
 #: distinguished in double precision
@@ -36,8 +39,6 @@ LOBE = 2.0
 #: ratio of the residual of stable modes for the conjugate to that for the data, below which the
 #: conjugate is used; with noise as large as the responses both are equal
 BETTER = 0.8
-#: largest damping ratio of a mode; powers of frequency for modes outside of the band
-DAMPED, POWERS = 0.2, np.arange(-2, 3)
 
 
 def stabilisation_diagram(
@@ -45,8 +46,8 @@ def stabilisation_diagram(
     *,
     band: tuple[float, float] | None = None,
     orders: Iterable[int] | None = None,
-    tolerances: tuple[float, float, float] = (0.01, 0.05, 0.95),
-    max_zeta: float = 0.2,
+    tolerances: tuple[float, float, float] = STEADY,
+    max_zeta: float = BROADEST,
 ) -> StabilisationDiagram:
     """Return the poles of matrix-fraction models of rising order, by pLSCF.
 
@@ -373,15 +374,13 @@ def _stable_misfit(ready: PreparedLines) -> float:
     left = 0.0
     for part in parts_of(ready):
         seen, freq = part.seen, ready.freq[part.seen]
-
-        def stable(poles: ComplexArray, freq: FloatArray = freq) -> Any:
-            inside = (poles.imag > 2 * np.pi * freq[0]) & (poles.imag < 2 * np.pi * freq[-1])
-            return inside & (poles.real < 0) & (poles.real > -DAMPED * np.abs(poles))
-
-        poles = moments_in(ready, part).solve(part.orders[-1:], stable)[0].poles
-        terms = [1 / (2j * np.pi * freq[:, None] - poles), (freq[:, None] / freq[-1]) ** POWERS]
+        poles = order_poles(ready, part, part.orders[-1:])[0].poles
+        outside = residual_terms(
+            axis(freq), lower=2, upper=UPPER[0], hold=None, top=2 * np.pi * freq[-1]
+        )
+        terms = np.concatenate([pole_terms(poles, axis(freq), None)[0], outside]).T
         for weight, data in zip(ready.line_weight[:, seen], ready.data[:, :, seen], strict=True):
-            columns = np.hstack(terms) * weight[:, None]
+            columns = terms * weight[:, None]
             columns = columns / np.linalg.norm(columns, axis=0)
             due = (weight * data).T
             fitted = columns @ np.linalg.lstsq(columns, due, rcond=None)[0]

@@ -20,6 +20,8 @@ from .frf_estimation import STRETCH
 MAINS = (50.0, 60.0)
 #: width of a resonance in lines below which it looks like a disturbance with a single frequency
 NARROW = 0.5
+#: number of lines around a peak, or from zero, within which others belong to it
+NEAR = 20
 #: number of lines over which windows spread a mains multiple, and of lines for the comparison
 SPREAD, COMPARED = 2, 8
 
@@ -130,8 +132,8 @@ class PreparedLines:
         return self._weighted(trend * mean, fitted_share)
 
     def _rounding(self) -> FloatArray:
-        # 1e-13 of an amplitude: data without noise only have rounding errors
-        return np.asarray(1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True))
+        # data without noise only have rounding errors
+        return np.asarray(RANK**2 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True))
 
     def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:
         variance = np.maximum(power / (1.0 - fitted_share), self._rounding())

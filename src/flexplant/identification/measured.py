@@ -335,8 +335,7 @@ def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
     if twice:
         raise LabelError(
             f"modes {twice} have more than one pole each, but a mode has one pole. Average "
-            "repeated "
-            "measurements, or give each its own MeasuredModes."
+            "repeated measurements, or give each its own MeasuredModes."
         )
     return listed
 

@@ -10,6 +10,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError
 from ..modes.matching import ALIKE, mac_matrix
 from ..tolerances import CERTAIN, CHANCE, MOST_STEPS, NEGLIGIBLE, TINY
+from .line_weights import NEAR
 from .refine import OWN, Lines, PoleFit, pivoted, refined, scaled_inverse
 
 #: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
@@ -21,13 +22,10 @@ WITHIN, BANDWIDTH = 1.5, 2.0
 MOSTLY = 0.9
 #: misfit near a pole, including its correlation over lines, up to which it counts as noise
 NOISE = 1.5
-#: number of standard deviations by which chi-square may exceed its degrees of freedom
-LIMIT = 3.0
-#: ratio of the damping of an output's own pole to the usual one above which it is a different pole:
-#: the mass of a sensor changes frequencies, but hardly the damping
-BROAD = 3.0
-#: distance from a pole, in lines and in half-widths, over which misfit is compared
-NEAR, WIDE = 20.0, 3.0
+#: distance from a pole, in half-widths, within which misfit or another pole may belong to the same
+#: resonance; a pole with a larger half-width belongs to another one, since the mass of a sensor
+#: changes frequencies, but hardly the damping
+SAME_RESONANCE = 3.0
 
 
 def own_cost(fit: PoleFit) -> float:
@@ -48,7 +46,7 @@ def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     free = max(1.0, 2 * lines.data.size - lines.inflation * count)
     if parts == 1 or fit.cost < NOISE * free:
         return False
-    noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEGLIGIBLE * (fit.cost - free)
+    noise = CERTAIN * np.sqrt(2 * free * lines.inflation) + NEGLIGIBLE * (fit.cost - free)
     limit, alone = min(least, free + noise, fit.cost / NOISE), 0.0
     for place in range(parts):
         own = fit.own_below(place, limit - alone)
@@ -72,7 +70,7 @@ def coherence(fit: PoleFit, pole: complex) -> float:
     # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over
     # neighbouring lines: misfit that is smooth over some of them counts as one error
     lines = fit.lines
-    reach = max(NEAR * 2 * np.pi * lines.spacing, WIDE * abs(pole.real))
+    reach = max(NEAR * 2 * np.pi * lines.spacing, SAME_RESONANCE * abs(pole.real))
     near = np.abs(2 * np.pi * lines.freq - pole.imag) <= reach
     error = (lines.data - fit.model)[..., near] * lines.weight[..., near]
     power = float(np.sum(np.abs(error) ** 2))
@@ -199,7 +197,7 @@ def _strayed(fit: PoleFit, own: list[PoleFit]) -> tuple[FloatArray, FloatArray]:
     away = np.abs(poles[:, :, None] - fit.poles)
     other = np.argmin(away, axis=2) != np.arange(fit.m)
     usual = np.median(poles.real, axis=0) + 1j * np.median(poles.imag, axis=0)
-    broad = -poles.real > BROAD * -usual.real
+    broad = -poles.real > SAME_RESONANCE * -usual.real
     return (
         np.where(other, np.einsum("okk->ok", away) ** 2, 0.0),
         np.where(broad, np.abs(poles - usual) ** 2, 0.0),

@@ -12,11 +12,8 @@ from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf, error_statistics
 from ..seeds import generator
 from ..store import Value, checked
-from ..tolerances import CHANCE, DEVIATIONS, NEGLIGIBLE, TINY, TYPED
+from ..tolerances import CHANCE, DEVIATIONS, NEGLIGIBLE, RANK, TINY, TYPED
 from .spectra import Records
-
-#: fraction of the power of an output that counts as rounding
-ROUNDING = 1e-28
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -141,7 +138,7 @@ def frf_of_periods(
         inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
         variance, correlation = error_statistics(left, inverse)
         power = np.mean(np.abs(Y[:, :, 0]) ** 2, axis=(0, 2))
-        if not np.all(np.einsum("foo->fo", left).real > ROUNDING * power):
+        if not np.all(np.einsum("foo->fo", left).real > RANK**2 * power):
             variance = correlation = None  # no noise at all: nothing to weight by
         else:
             # the fraction of the outputs' power in a period that is not noise
@@ -361,8 +358,7 @@ def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
         warn(
             "the inputs are pulses: segments of a fixed length cut the responses to blows "
             "anywhere, which adds to their damping. Use identification.impact_frf(force, "
-            "response, rate, "
-            "segment=...), which finds the blows."
+            "response, rate, segment=...), which finds the blows."
         )
         return
     period = _period(x)

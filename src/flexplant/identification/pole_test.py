@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from ..tolerances import CERTAIN, CHANCE, CLOSE, NULL, SAME
+from .diagram import BROADEST
 from .model_error import (
     coherence,
     corroborated,
@@ -22,6 +23,7 @@ from .model_error import (
     twin_poles,
 )
 from .refine import Lines, PoleFit, pivoted, refined
+from .terms import UPPER, afforded_terms
 
 #: probability that noise is taken for outputs that disagree; real differences are far larger
 ALARM = 1e-9
@@ -29,9 +31,6 @@ ALARM = 1e-9
 
 #: half the distance at which a pole is split, relative to its damping
 APART = 0.5
-#: numbers of residual terms of modes above the band: the first, or more if the residual exceeds
-#: noise
-UPPER, MORE = (3, 5, 7, 9), (25, 17, 13)
 #: probability that noise is taken for a residual term: a superfluous term costs almost nothing, a
 #: missing one is a bias
 FEW = 0.1
@@ -39,8 +38,8 @@ FEW = 0.1
 GAIN = 0.1
 #: ratio to the required decrease of the cost below which a pole counts as weak
 WEAK = 4.0
-#: largest damping ratio of a mode, and largest width of a new pole relative to all others
-BROADEST, BROADER = 0.2, 1.1
+#: largest width of a new pole relative to all others
+BROADER = 1.1
 #: number of rivals that are refined, and fraction of the required gain that they need before
 RIVALS, BEFORE = 3, 0.25
 
@@ -137,7 +136,7 @@ def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
     # this holds for most poles and saves the fits of the other outputs, which take most of the
     # time. Outputs that gain most by the pole come first
     before, after = (
-        [sum(float(fit.bases[o][1] @ fit.bases[o][1]) for o in rows) for rows in fit.lines.parts]
+        [sum(float(fit.errors[o] @ fit.errors[o]) for o in rows) for rows in fit.lines.parts]
         for fit in (fit, more)
     )
     gain = 0.0
@@ -207,7 +206,7 @@ def _gain_of_terms(fit: PoleFit, more: Lines) -> float:
     # the terms S are orthogonal to the present ones; with the basis Q of the shapes and the error e
     # it is `b^T (I - M^T M)^-1 b` with `M = Q^T S` and `b = S^T e`
     gain, first = 0.0, fit.lines.lower + fit.lines.upper
-    for (Q, error), (smooth, _) in zip(fit.bases, more.smooth_bases, strict=True):
+    for Q, error, (smooth, _) in zip(fit.bases, fit.errors, more.smooth_bases, strict=True):
         new, n_in = smooth[:, :, first:], len(smooth)
         b = np.concatenate([S.T @ e for S, e in zip(new, error.reshape(n_in, -1), strict=True)])
         parts = zip(Q.reshape(n_in, -1, Q.shape[1]), new, strict=True)
@@ -223,11 +222,6 @@ def fewer_terms(fit: PoleFit) -> Proposals:
     fewest = pivoted(fewer[0], fit.poles, fit.participation) if fewer else fit
     trials = (_refit_terms(fit, lines, fewest, FEW) for lines in fewer)
     yield [trial for trial in trials if trial.gain > trial.least]
-
-
-def afforded_terms(n_freq: int, lower: int) -> list[int]:
-    """Return the larger numbers of residual terms that a number of lines allows."""
-    return [upper for upper in MORE if n_freq >= 8 * (upper + lower)]
 
 
 def more_terms(fit: PoleFit) -> Proposals:
@@ -306,9 +300,6 @@ def missed_poles(fit: PoleFit) -> Proposals:
         yield [_more_poles(fit, *_pole_at(fit, peak))]
 
 
-#: distance of lines, relative to a frequency, above which they resolve no mode there: the width of
-#: a resonance of 10 % damping
-RESOLVED = 0.2
 #: lengths [lines] of the examined groups of lines
 STRETCHES = (3, 9, 27, 81)
 #: number of highest groups of each length, and number of peaks at which a pole is tried
@@ -443,7 +434,8 @@ def warned(freq: FloatArray, left: list[Peak], apart: tuple[float, str, str] | N
     """Warn of groups of lines without a pole, of single lines, or of outputs that disagree."""
     # for the last: their difference, their kind, and one that deviates far more than the others
     step = float(np.median(np.diff(freq)))
-    coarse = [peak.freq for peak in left if peak.freq * RESOLVED < step]
+    # lines farther apart than the half-width of the broadest mode resolve no mode
+    coarse = [peak.freq for peak in left if peak.freq * BROADEST < step]
     near = (
         f"The lines, {step:.3g} Hz apart, are too coarse for modes there: measure longer segments "
         f"and pass band=({min(coarse) / 2:.3g}, {2 * max(coarse):.3g}). "

@@ -14,7 +14,18 @@ from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted, counted
 from ..parallel import so_far
 from ..tolerances import RANK, TINY
-from .terms import FAR_APART, axis, orthonormal, pole_terms, qr, residual_terms, take_off
+from .terms import (
+    FAR_APART,
+    axis,
+    halves,
+    orthonormal,
+    pole_terms,
+    qr,
+    real_and_imag,
+    residual_terms,
+    take_off,
+    with_residues,
+)
 
 #: largest entry of a participation vector relative to the one held at 1
 RUNAWAY = 5.0
@@ -143,12 +154,17 @@ class Lines:
         """Per output Q (n_in, 2 n_freq, n_terms) and R of the weighted residual terms."""
         # the terms are made orthonormal with mean weights first: with others little is left to do
         mean = np.sqrt(np.mean(self.twice**2, axis=(0, 1)))
-        shared, R = qr((_real_and_imag(self.smooth) * mean).T)
+        shared, R = qr((real_and_imag(self.smooth) * mean).T)
         terms, found = shared.T / mean, []
         bases = np.empty((*self.twice.shape[:2], *terms.shape))
         for weights, Q in zip(self.twice, bases, strict=True):
-            parts = [orthonormal(terms * w, own) for w, own in zip(weights, Q, strict=True)]
-            found.append((Q.swapaxes(1, 2), np.array([(own * size) @ R for own, _, size in parts])))
+            triangles = []
+            for w, own in zip(weights, Q, strict=True):
+                np.multiply(terms, w, out=own)
+                mine, _, size, turn = orthonormal(own)
+                own[:] = turn @ own
+                triangles.append((mine * size) @ R)
+            found.append((Q.swapaxes(1, 2), np.array(triangles)))
         return found
 
     @cached_property
@@ -156,7 +172,7 @@ class Lines:
         """Per output the weighted data (n_in 2 n_freq,) without the residual terms."""
         found = []
         for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
-            goal = _real_and_imag(data * w)[:, None, :]
+            goal = real_and_imag(data * w)[:, None, :]
             found.append(take_off(Q, goal).ravel())
         return found
 
@@ -285,38 +301,51 @@ class PoleFit:
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         #: per output R and its inverse, of columns of length 1, and their lengths
         self.triangles: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        #: per output the basis of the shapes' columns, free of residual terms, and the error
-        self.bases: list[tuple[FloatArray, FloatArray]] = []
+        #: per output the rows C of the shapes' columns, free of residual terms, and T: the rows of
+        #: T C are orthonormal
+        self.columns: list[tuple[FloatArray, FloatArray]] = []
+        #: weighted errors of the outputs
+        self.errors: list[FloatArray] = []
         #: fits of single outputs made so far, by position in `lines.parts`
         self.alone: dict[int, PoleFit] = {}
         self.cost = 0.0
         columns = self._stacked(self.plus, self.minus, participation)
-        # one array for all outputs: memory that is new for each takes longer than its products
-        bases = np.empty((n_out, 2 * m, 2 * data[0].size))
-        for o, (right, stacked, rows) in enumerate(zip(lines.goals, columns, bases, strict=True)):
-            R, inverse, size = orthonormal(stacked.reshape(rows.shape), rows)
+        for o, (right, stacked) in enumerate(zip(lines.goals, columns, strict=True)):
+            rows = stacked.reshape(2 * m, right.size)
+            R, inverse, size, turn = orthonormal(rows)
             if np.min(np.abs(R.diagonal()), initial=1.0) < FAR_APART:
                 # the difference of two poles that nearly coincide holds their rounding, enlarged
-                take_off(lines.smooth_bases[o][0], rows.reshape(stacked.shape).swapaxes(0, 1))
-            due = rows @ right
+                take_off(lines.smooth_bases[o][0], stacked.swapaxes(0, 1))
+            due = turn @ (rows @ right)
             x = inverse @ due / size
             self.shapes[o] = x[:m] + 1j * x[m:]
             self.triangles.append((R, inverse, size))
-            error = right - due @ rows
+            error = right - (due @ turn) @ rows
             self.cost += float(error @ error)
-            self.bases.append((rows.T, error))
+            self.errors.append(error)
+            self.columns.append((rows, turn))
 
     def _stacked(
         self, plus: ComplexArray, minus: ComplexArray, participation: ComplexArray
     ) -> Iterator[FloatArray]:
         """Yield per output the rows (2 m, n_in, 2 n_freq) of shapes, free of residual terms."""
-        halves = _halves(plus, minus)
-        both = np.array([_turned(halves, own) for own in participation]).swapaxes(0, 1)
-        rows = np.empty(both.shape)
-        for (Q, _), w in zip(self.lines.smooth_bases, self.lines.twice, strict=True):
+        single = halves(plus, minus)
+        both = np.array([with_residues(single, own) for own in participation]).swapaxes(0, 1)
+        # one array for all outputs: memory that is new for each takes longer than its products
+        whole = np.empty((len(self.lines.data), *both.shape))
+        parts = zip(whole, self.lines.smooth_bases, self.lines.twice, strict=True)
+        for rows, (Q, _), w in parts:
             np.multiply(both, w, out=rows)
             take_off(Q, rows.swapaxes(0, 1))
             yield rows
+
+    @cached_property
+    def bases(self) -> list[FloatArray]:
+        """Per output the orthonormal basis Q (N, 2 m) of the columns, which it replaces."""
+        for rows, turn in self.columns:
+            rows[:] = turn @ rows
+            turn[:] = np.eye(len(turn))
+        return [rows.T for rows, _ in self.columns]
 
     @property
     def misfit(self) -> float:
@@ -333,7 +362,7 @@ class PoleFit:
         # the two of a pole costs `x^T V^-1 x` of their entries
         both, total = np.array([*kept, *(k + self.m for k in kept)]), np.zeros(len(kept))
         parts = zip(self.lines.goals, self.bases, self.triangles, strict=True)
-        for right, (Q, _), (R, half, _) in parts:
+        for right, Q, (R, half, _) in parts:
             x = half @ (Q.T @ right)
             if len(kept) < self.m:
                 half = np.asarray(la.pinv(la.qr(R[:, both], mode="economic")[1], rtol=0.0))
@@ -354,8 +383,8 @@ class PoleFit:
         plus, minus = (lines.pole_terms(some)[0] for some in (poles, poles.conj()))
         cost, columns = self.cost, self._stacked(plus, minus, participation)
         gone = [] if instead is None else [instead, instead + self.m]
-        for right, rows, (Q, error), (R, _, _) in zip(
-            lines.goals, columns, self.bases, self.triangles, strict=True
+        for right, rows, Q, error, (R, _, _) in zip(
+            lines.goals, columns, self.bases, self.errors, self.triangles, strict=True
         ):
             lines.work.add(rows.size * 4 * self.m)
             A = rows.reshape(len(rows), -1).T
@@ -376,28 +405,23 @@ class PoleFit:
 
     def own_below(self, place: int, below: float) -> PoleFit | None:
         """Return the fit of one output, or set-up, alone: a known one, or one below a cost."""
-        if place not in self.alone:
-            with attempted(f"a fit of {self.lines.side} {place + 1} alone", SolverError):
-                self.alone[place] = self.of_rows(self.lines.parts[place], below)
-        return self.alone.get(place)
+        with attempted(f"a fit of {self.lines.side} {place + 1} alone", SolverError):
+            return self.own_of(place, below)
+        return None
 
-    def own_of(self, place: int) -> PoleFit:
-        """Return the fit of one output, or set-up, alone, which is made once."""
+    def own_of(self, place: int, below: float = np.inf) -> PoleFit:
+        """Return the fit of one output, or set-up, alone, with the common participation."""
         if place not in self.alone:
-            self.alone[place] = self.of_rows(self.lines.parts[place])
+            first = self.at_rows(self.lines.parts[place])
+            self.alone[place] = refined(
+                *(first.lines, self.poles, self.participation),
+                steps=OWN,
+                strict=False,
+                below=below,
+                poles_only=True,
+                first=first,
+            )
         return self.alone[place]
-
-    def of_rows(self, rows: IntArray, below: float = np.inf) -> PoleFit:
-        """Return a separate fit of some outputs, with the common participation."""
-        first = self.at_rows(rows)
-        return refined(
-            *(first.lines, self.poles, self.participation),
-            steps=OWN,
-            strict=False,
-            below=below,
-            poles_only=True,
-            first=first,
-        )
 
     def at_rows(self, rows: IntArray) -> PoleFit:
         """Return the part of this fit at some outputs."""
@@ -407,10 +431,10 @@ class PoleFit:
         part.plus, part.slope = self.plus, self.slope
         part.minus, part.slope_minus = self.minus, self.slope_minus
         part.shapes = self.shapes[rows]
-        part.triangles, part.bases = (
-            [each[o] for o in rows] for each in (self.triangles, self.bases)
+        part.triangles, part.columns, part.errors = (
+            [each[o] for o in rows] for each in (self.triangles, self.columns, self.errors)
         )
-        part.cost = sum(float(error @ error) for _, error in part.bases)
+        part.cost = sum(float(error @ error) for error in part.errors)
         return part
 
     @property
@@ -418,7 +442,7 @@ class PoleFit:
         """The coefficients (n_out, n_in, n_terms) of the residual terms."""
         residues = self.shapes[:, None, :] * self.participation
         modal = residues @ self.plus + residues.conj() @ self.minus
-        left = _real_and_imag((self.lines.data - modal) * self.lines.weight)
+        left = real_and_imag((self.lines.data - modal) * self.lines.weight)
         return np.array(
             [
                 np.linalg.pinv(R) @ (Q.swapaxes(1, 2) @ rows[..., None])
@@ -429,7 +453,7 @@ class PoleFit:
     @cached_property
     def model(self) -> ComplexArray:
         """The fitted responses (n_out, n_in, n_freq)."""
-        error = np.array([own for _, own in self.bases]).reshape(self.lines.twice.shape)
+        error = np.array(self.errors).reshape(self.lines.twice.shape)
         real, imag = np.split(error, 2, axis=-1)
         return np.asarray(self.lines.data - (real + 1j * imag) / self.lines.weight)
 
@@ -437,18 +461,18 @@ class PoleFit:
     def _rows(self) -> FloatArray:
         """The rows (4 m, 2 n_freq) whose combinations are all derivatives; 2 m for one input."""
         # of the poles, then of the participation, which is held at 1 for a single input
-        of_poles = _halves(self.slope, self.slope_minus)
+        of_poles = halves(self.slope, self.slope_minus)
         if len(self.participation) == 1:
             return of_poles
-        return np.concatenate([of_poles, _halves(self.plus, self.minus)])
+        return np.concatenate([of_poles, halves(self.plus, self.minus)])
 
     def _combined(self, rows: FloatArray, shapes: ComplexArray) -> FloatArray:
         """Return derivatives (..., n_in, 4 m, n) from `_rows`, or from products of it."""
         # by Re and Im of the poles, then by those of the participation of the row's own input
         m = self.m
-        parts = [_turned(rows[..., : 2 * m, :], shapes * self.participation)]
+        parts = [with_residues(rows[..., : 2 * m, :], shapes * self.participation)]
         if rows.shape[-2] > 2 * m:
-            parts.append(_turned(rows[..., 2 * m :, :], shapes))
+            parts.append(with_residues(rows[..., 2 * m :, :], shapes))
         return np.concatenate(parts, axis=-2)
 
     @cached_property
@@ -470,7 +494,7 @@ class PoleFit:
         """Return J (n_in 2 n_freq, n_parameters) of an output."""
         # `J = D - Q Q^T D` with the derivatives D of the rows of each input and the basis Q of the
         # shapes
-        n_in, Q = self.participation.shape[0], self.bases[o][0]
+        n_in, Q = self.participation.shape[0], self.bases[o]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
         moving = self._combined(self._rows * self.lines.twice[o][:, None, :], self.shapes[o])
         take_off(self.lines.smooth_bases[o][0], moving)
@@ -499,15 +523,17 @@ class PoleFit:
         # the same memory for all outputs: new memory takes longer than its products
         known = np.empty((n_in, terms + 1, width))
         squares, right = np.empty((n_in, size, size)), np.empty((n_in, size, terms + 1 + 2 * m))
-        taken = np.zeros((len(self.bases), 2 * m, count))
+        taken = np.zeros((len(self.errors), 2 * m, count))
         N, g = np.zeros((count, count)), np.zeros(count)
-        parts = zip(self.bases, lines.twice, lines.smooth_bases, self.shapes, taken, strict=True)
-        for o, ((Q, error), weights, (smooth, _), shapes, mean) in enumerate(parts):
+        parts = zip(self.errors, self.columns, lines.twice, self.shapes, taken, strict=True)
+        for o, (error, (columns, turn), weights, shapes, mean) in enumerate(parts):
+            smooth = lines.smooth_bases[o][0]
             np.multiply(smooth.swapaxes(1, 2), weights[:, None], out=known[:, :-1])
             np.multiply(error.reshape(weights.shape), weights, out=known[:, -1])
             products = self._rows @ known.reshape(-1, width).T
             right[:, :, : terms + 1] = products.reshape(size, n_in, -1).swapaxes(0, 1)
-            for i, (w, own) in enumerate(zip(weights, Q.reshape(n_in, -1, 2 * m), strict=True)):
+            each = columns.reshape(2 * m, n_in, width).transpose(1, 2, 0)
+            for i, (w, own) in enumerate(zip(weights, each, strict=True)):
                 np.multiply(self._rows, w, out=rows)
                 np.matmul(rows, rows.T, out=squares[i])
                 np.matmul(rows, own, out=right[i, :, terms + 1 :])
@@ -521,6 +547,7 @@ class PoleFit:
                 left[at] += free[i, mine, mine]
                 mean[:, at] += seen[i, mine, terms + 1 :].T
                 g[at] += seen[i, mine, terms]
+            mean[:] = turn @ mean
             if np.any(left - np.sum(mean**2, axis=0) < OWN_SQUARE * length):
                 J = self._jacobian(o)
                 N += J.T @ J
@@ -533,23 +560,20 @@ class PoleFit:
     def jacobians(self) -> Iterator[ComplexArray]:
         """Yield J (n_in, n_freq, n_parameters) per output."""
         n_in, n_freq = self.lines.data.shape[1:]
-        for o in range(len(self.bases)):
+        for o in range(len(self.errors)):
             split = self._jacobian(o).reshape(n_in, 2, n_freq, -1)
             yield split[:, 0] + 1j * split[:, 1]
 
     def maps(self) -> list[tuple[FloatArray, FloatArray]]:
         """Return per output the derivatives of its shapes, and their map from the bases."""
         # d[Re psi; Im psi] / d(poles, participation) and, these held, by `Q^T` times the data
-        found = []
-        for (_, inverse, size), common in zip(self.triangles, self._equations[2], strict=True):
-            own = inverse / size[:, None]
-            found.append((-own @ common, own))
-        return found
+        each = (inverse / size[:, None] for _, inverse, size in self.triangles)
+        return [(-own @ mean, own) for own, mean in zip(each, self._equations[2], strict=True)]
 
     def shape_rows(self, o: int, own: FloatArray) -> ComplexArray:
         """Return the derivatives (n_in, n_freq, 2 m) of an output's shapes by its weighted data."""
         n_in, n_freq = self.lines.data.shape[1:]
-        rows = (self.bases[o][0] @ own.T).reshape(n_in, 2, n_freq, 2 * self.m)
+        rows = (self.bases[o] @ own.T).reshape(n_in, 2, n_freq, 2 * self.m)
         return np.asarray(rows[:, 0] + 1j * rows[:, 1])
 
 
@@ -574,25 +598,3 @@ def _damped_step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:
     if info:
         raise la.LinAlgError("the equations of a step are not positive.")
     return np.asarray(step)
-
-
-def _real_and_imag(values: Any) -> FloatArray:
-    return np.concatenate([values.real, values.imag], axis=-1)
-
-
-def _halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
-    """Return the rows (2 m, 2 n_freq) of terms and their conjugates for residues 1, and for j."""
-    return _real_and_imag(np.concatenate([plus + minus, 1j * (plus - minus)]))
-
-
-def _turned(rows: FloatArray, residues: ComplexArray) -> FloatArray:
-    """Return the rows (..., 2 m, n) of `_halves` for residues (..., m), and for j times these."""
-    m = residues.shape[-1]
-    first, second = rows[..., :m, :], rows[..., m:, :]
-    real, imag = residues.real[..., None], residues.imag[..., None]
-    turned = np.empty(np.broadcast_shapes(rows.shape, (*residues.shape[:-1], 1, 1)))
-    np.multiply(real, first, out=turned[..., :m, :])
-    np.multiply(real, second, out=turned[..., m:, :])
-    turned[..., :m, :] += imag * second
-    turned[..., m:, :] -= imag * first
-    return turned

@@ -13,7 +13,7 @@ from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
 from ..tolerances import TINY
 from .diagram import StabilisationDiagram
-from .line_weights import PreparedLines, Rejected
+from .line_weights import NARROW, PreparedLines, Rejected
 from .measured import MeasuredModes
 from .model_error import Disagreement
 from .refine import PoleFit, free_inputs, scaled_inverse
@@ -186,8 +186,6 @@ FEWEST = 4.0
 #: without a window, and with Hamming and Kaiser windows (6 to 2.5 %, 1.1 and 0.4 % at 2 to 16
 #: lines)
 BOXCAR, TAPERED = (1.0 / np.pi, -1.0), (0.15, -1.25)
-#: least width in lines if the fit includes the window: below it, only the main lobe is visible
-FEWEST_THROUGH = 0.5
 
 
 def hann_segment(frf: Frf) -> float | None:
@@ -208,7 +206,8 @@ def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     width = -2.0 * poles.real / (2 * np.pi)
     lines = width / frf.resolution
     if found.segment is not None:
-        added = np.where(lines < FEWEST_THROUGH, 1.0, 0.0)
+        # of a narrower resonance only the main lobe of the window is visible
+        added = np.where(lines < NARROW, 1.0, 0.0)
     else:
         factor, power = BOXCAR if frf.window == "boxcar" else TAPERED
         added = factor * lines**power
@@ -230,7 +229,7 @@ def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
         else "and splits it into several poles where it is narrower than half a line"
     )
     longer = (
-        FEWEST_THROUGH / width[worst]
+        NARROW / width[worst]
         if found.segment
         else added[worst] / (max(known[worst], TINY) * frf.resolution)
     )

@@ -288,8 +288,7 @@ class MeasuredPlaces:
         if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
             raise ModelError(
                 "the term in 1/s^2 of the measurement is not a rigid-body motion with positive "
-                "mass. "
-                "Pass rigid=False for a held structure; begin the band of a free one lower."
+                "mass. Pass rigid=False for a held structure; begin the band of a free one lower."
             )
         keep = values > NEGLIGIBLE * values[-1]
         return np.asarray(U @ (vectors[:, keep] * np.sqrt(values[keep])))

@@ -120,9 +120,42 @@ def residual_terms(
     return np.array(rows, dtype=np.complex128).reshape(lower + upper, s.size)
 
 
+#: numbers of residual terms of modes above the band: the first, or more if the residual exceeds
+#: noise
+UPPER, MORE = (3, 5, 7, 9), (25, 17, 13)
+
+
+def afforded_terms(n_freq: int, lower: int) -> list[int]:
+    """Return the larger numbers of residual terms that a number of lines allows."""
+    return [upper for upper in MORE if n_freq >= 8 * (upper + lower)]
+
+
 def axis(freq: FloatArray) -> ComplexArray:
     """Return s = 2 pi i f."""
     return np.asarray(2j * np.pi * freq)
+
+
+def real_and_imag(values: Any) -> FloatArray:
+    """Return the real parts, followed by the imaginary parts."""
+    return np.concatenate([values.real, values.imag], axis=-1)
+
+
+def halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
+    """Return the rows (2 m, 2 n_freq) of terms and their conjugates for residues 1, and for j."""
+    return real_and_imag(np.concatenate([plus + minus, 1j * (plus - minus)]))
+
+
+def with_residues(rows: FloatArray, residues: ComplexArray) -> FloatArray:
+    """Return the rows (..., 2 m, n) of `halves` for residues (..., m), and for j times these."""
+    m = residues.shape[-1]
+    first, second = rows[..., :m, :], rows[..., m:, :]
+    real, imag = residues.real[..., None], residues.imag[..., None]
+    found = np.empty(np.broadcast_shapes(rows.shape, (*residues.shape[:-1], 1, 1)))
+    np.multiply(real, first, out=found[..., :m, :])
+    np.multiply(real, second, out=found[..., m:, :])
+    found[..., :m, :] += imag * second
+    found[..., m:, :] -= imag * first
+    return found
 
 
 def qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,31 +171,36 @@ def qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 OWN_PART, FAR_APART = 1e-4, 0.1
 
 
-def orthonormal(rows: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return R of columns, given as rows, its inverse and their lengths; `basis` becomes Q^T."""
+def orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return R of columns, given as rows, its inverse, their lengths, and T: Q^T = T rows.
+
+    Where columns are close the rows are replaced by Q^T.
+    """
     # by the triangle of their products, twice where columns are close: many times faster than `qr`,
     # and equally accurate where no column is nearly a combination of the others
+    whole = inverse = kept = np.eye(len(rows))
     if not len(rows):
-        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0)
+        return whole, inverse, np.zeros(0), kept
     products = rows @ rows.T
     size = np.maximum(np.sqrt(products.diagonal()), TINY)
     now, scale, products = rows, size, products / size / size[:, None]
-    whole = inverse = np.eye(len(rows))
     for _ in range(2):
         triangle, fails = la.lapack.dpotrf(products, lower=1)
         own = np.min(triangle.diagonal())
         if fails or own < OWN_PART:
             break
         back = la.lapack.dtrtri(triangle, lower=1)[0]
-        whole, inverse = whole @ triangle, back @ inverse
+        whole, inverse, turn = whole @ triangle, back @ inverse, back / scale
         if own > FAR_APART:
-            np.matmul(back / scale, now, out=basis)
-            return whole.T, inverse.T, size
-        now, scale = (back / scale) @ now, np.ones(len(rows))
+            if now is rows:
+                return whole.T, inverse.T, size, turn
+            np.matmul(turn, now, out=rows)
+            return whole.T, inverse.T, size, kept
+        now, scale = turn @ now, np.ones(len(rows))
         products = now @ now.T
     Q, R = qr((rows / size[:, None]).T)
-    basis[:] = Q.T
-    return R, np.asarray(la.pinv(R, rtol=RANK), dtype=np.float64), size
+    rows[:] = Q.T
+    return R, np.asarray(la.pinv(R, rtol=RANK), dtype=np.float64), size, kept
 
 
 def take_off(Q: FloatArray, rows: FloatArray) -> FloatArray:
