@@ -103,7 +103,8 @@ class BrokenLoop:
 
     def _worst(self, at: Side, scaled: bool) -> tuple[float, float]:
         def size(freq: FloatArray) -> FloatArray:
-            return largest_sensitivity(self.gain(freq, at), scaled)
+            L = self.gain(freq, at)
+            return scaled_size(inverted(L)) if scaled else sensitivity_size(L)
 
         if self.measured is not None:
             return highest(size, self.followed, 0)
@@ -136,11 +137,6 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - L))
     except np.linalg.LinAlgError:  # a marginal loop at the frequency of its pole
         return np.asarray(np.linalg.inv(eye - (1.0 - RANK) * L))
-
-
-def largest_sensitivity(L: ComplexArray, scaled: bool) -> FloatArray:
-    """Return the size of ``S = (I - L)^-1``, axes scaled or not; a bound where it is small."""
-    return scaled_size(inverted(L)) if scaled else sensitivity_size(L)
 
 
 def sensitivity(L: ComplexArray, inner: ComplexArray | None = None) -> ComplexArray:

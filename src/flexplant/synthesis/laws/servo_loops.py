@@ -276,6 +276,9 @@ class ServoLoop:
     @cached_property
     def at(self) -> Callable[[ServoLaw], ComplexArray]:
         """The function of a law that gives its responses over the grid."""
+        rate = 1.0 / self.plant.dt
+        s = tustin_s(self.freq, rate)
+        notched = lru_cache(lambda notch: notch.section.at(rate).gain(s)[:, None])
 
         @lru_cache
         def found(law: ServoLaw) -> ComplexArray:
@@ -283,20 +286,9 @@ class ServoLoop:
                 return law.at(self.freq)
             *first, last = law.notches
             before = found(law._replace(notches=tuple(first)))
-            return np.asarray(before * self.changed_by(law, last))
+            return np.asarray(before * (notched(last) / law.gains(last)))
 
         return found
-
-    def changed_by(self, law: ServoLaw, notch: Notch) -> ComplexArray:
-        """Return the factors (n_freq, r) by which a further notch changes the responses."""
-        return np.asarray(self._filtered(notch)[:, None] / law.gains(notch))
-
-    @cached_property
-    def _filtered(self) -> Callable[[Notch], ComplexArray]:
-        """The function of a notch that gives its response over the grid."""
-        rate = 1.0 / self.plant.dt
-        s = tustin_s(self.freq, rate)
-        return lru_cache(lambda notch: notch.section.at(rate).gain(s))
 
     @cached_property
     def size(self) -> Callable[[ServoLaw], FloatArray]:
