@@ -22,9 +22,9 @@ from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...seeds import MOST, generator
 from ...store import Value
-from ...tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE, TYPED
+from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TYPED
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
-from .lower import ASCENTS, Destabilising, crossing_multiple, destabilising
+from .lower import Destabilising, crossing_multiple, destabilising
 from .mu_bounds import INTERVALS, SOUGHT, Cover, Covered, sought
 from .power_starts import power_iterations
 from .uncertain_loops import UncertainLoop, uncertain_loop
@@ -496,7 +496,7 @@ def _corner_gain(
     """Return the largest gain in a band, real Deltas moved one after the other to an end or 0."""
     one = one._replace(vectors=one.vectors[:-1])
     best = _perturbed_gain(gains, where, one)
-    for _ in range(ASCENTS):
+    for _ in range(MOST_STEPS):
         before = best
         for i, number in enumerate(one.scalars):
             for value in (-1.0, 1.0, 0.0):

@@ -22,8 +22,6 @@ _SIZES, _FARTHEST = 24, 100.0
 _PHASES = 25
 #: choices of signs of real Deltas that are tried: all of a few Deltas, random ones of more
 _CORNERS = 32
-#: steps towards worse signs of the real Deltas
-ASCENTS = 6
 
 
 class Destabilising(NamedTuple):
@@ -64,7 +62,7 @@ def crossing_multiple(
     Complex blocks are turned, then real Deltas moved to the ends that lower t, as long as it falls.
     """
     best: tuple[float, Perturbation] | None = None
-    for _ in range(ASCENTS):
+    for _ in range(MOST_STEPS):
         one = _crossing_multiple(M, where, found)
         if one is None or (best is not None and one[0] > best[0] * (1.0 - SPLIT)):
             break
@@ -319,7 +317,7 @@ def _worse_signs(
 ) -> Destabilising | None:
     """Return the best so far, after steps from one start to worse signs of its real Deltas."""
     candidate: Perturbation | None = start
-    for _ in range(ASCENTS):
+    for _ in range(MOST_STEPS):
         if candidate is None:
             break
         # one loop decides whether this perturbation is worse than the best
@@ -328,7 +326,8 @@ def _worse_signs(
         if one is None:
             break
         # no change of the perturbation for rounding
-        if best is None or one.size < best.size * (1 - SPLIT):
-            best = one
+        if best is not None and one.size >= best.size * (1 - SPLIT):
+            break
+        best = one
         candidate = worse_signs(M, blocks, one)
     return best
