@@ -243,21 +243,15 @@ class Placement(Value):
             proof = f"no choice below {in_words(self.bound, self.unit)}"
         else:
             proof = f"none is more than {100 * self.gap:.2g} % better"
+        own = f", without the plant's own {some_names(self.left_out)}: not among the candidates"
         return (
             f"<Placement {' '.join(self.chosen):.120}: {in_words(self.value, self.unit)} by "
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
             f"{counted(self.evaluations, 'evaluation')}"
             f"{', ' if self.stopped else ''}{self.stopped}"
-            f"{', ' if self.unjudged else ''}{self.unjudged}{self._without}"
+            f"{', ' if self.unjudged else ''}{self.unjudged}{own if self.left_out else ''}"
             f"{', over the own sensors ' if self.interval else ''}{self.interval}>"
         )
-
-    @property
-    def _without(self) -> str:
-        """Text on the sensors and actuators of the plant that were not candidates."""
-        if not self.left_out:
-            return ""
-        return f", without the plant's own {some_names(self.left_out)}: not among the candidates"
 
     @property
     def sensors(self) -> tuple[str, ...]:

@@ -151,6 +151,8 @@ class ManyScores(Scorer):
 class ConvexScores(ManyScores, Convex):
     """The worst or the mean of convex costs: it is one itself."""
 
+    bound = Convex.bound
+
     def cost(self, weights: FloatArray) -> float:
         """Return it at weights (N,)."""
         return float(over(self.measure, [part.cost(weights) for part in self.parts]))
@@ -162,10 +164,6 @@ class ConvexScores(ManyScores, Convex):
     def everything(self) -> float:
         """Return a number below the cost of all candidates together."""
         return float(over(self.measure, [part.everything() for part in self.parts]))
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the bound of the relaxation."""
-        return Convex.bound(self, count, required)
 
     @property
     def total(self) -> int:
