@@ -48,9 +48,9 @@ def _thread_pools() -> Any:
     return ThreadpoolController()
 
 
-#: how deep a thread is in `one_thread`; how many threads are in it, and what they found before
-_depth = threading.local()
-_lock, _inside = threading.Lock(), 0
+#: the threads that are in `one_thread`, and what they found before
+_lock = threading.Lock()
+_inside: set[int] = set()
 _original: Any = None
 
 
@@ -60,22 +60,21 @@ def one_thread() -> Iterator[None]:
     # for loops over small matrices: more threads wait for each other, 3 to 30 times as long on a
     # busy machine. Inside another one it costs nothing; the last of several threads restores what
     # was
-    global _inside, _original
-    if getattr(_depth, "value", 0):
+    global _original
+    own = threading.get_ident()
+    if own in _inside:
         yield
         return
     with _lock:  # the number of threads may belong to each thread, or to all
         limited = _thread_pools().limit(limits=1, user_api="blas")
-        _original = limited if _inside == 0 else _original
-        _inside += 1
-    _depth.value = 1
+        _original = _original if _inside else limited
+        _inside.add(own)
     try:
         yield
     finally:
-        _depth.value = 0
         with _lock:
-            _inside -= 1
-            if _inside == 0:
+            _inside.remove(own)
+            if not _inside:
                 _original.restore_original_limits()
 
 

@@ -14,10 +14,8 @@ from .words import several
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: number of refused draws in a row after which there is nothing to draw
 REFUSED = 200
-#: draws, runs or machines in one call
+#: draws, runs, machines or starts in one call: days on any computer, so that more is a mistake
 MOST_DRAWS = 10**7
-#: of machines or starts that are each a search: days on any computer, so that more is a mistake
-MOST = 1_000_000
 
 
 def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:

@@ -52,4 +52,4 @@ TYPED = 1e-6
 SETTLED = SAME
 #: poles closer than this, relative to their size, are one pole: eigenvalue solvers split a double
 #: pole, as of a rigid-body mode, by the root of their rounding (1.5e-8) times its condition
-SPLIT = 1e-6
+SPLIT = TYPED

@@ -21,9 +21,6 @@ from ..tolerances import FOUR_DIGITS
 from ..words import instance
 from .files import damaged, file_path, three_units, unread
 
-#: largest deviation of generalised masses from 1 that comes from few digits of mass-normalised
-#: shapes
-_ONE = 1e-5
 MISSING = (
     "no residual attachment vectors: the static motion of truncated modes is missing "
     "(write residual vectors as further modes: RESVEC)"
@@ -108,7 +105,7 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
         what = f"gives mode {mode} an impossible generalised mass of {masses[mode - 1]:g}"
         raise unread(path, what, "Was it written by a modal analysis?")
     off = float(np.max(np.abs(masses - 1)))
-    if off < _ONE:
+    if off < FOUR_DIGITS:
         note = f"mass-normalised: generalised masses of the file are 1 within {off:.1g}"
         return replace(shapes, notes=(*shapes.notes, note))
     note = f"scaled to unit mass by generalised masses of {masses.min():.3g} to {masses.max():.3g}"

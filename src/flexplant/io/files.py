@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import FlexplantError, ModelError, short
 from ..structure import FEMatrices
+from ..structure.definite import EVERY_DIGIT
 from ..words import several
 
 #: least number of characters of a number printed by a program; shorter ones may be typed by hand
@@ -24,10 +25,8 @@ _PRINTED = 12
 _ROUNDED = 6
 #: number of digits that a number in a fixed field loses to its sign and to a longer exponent
 _FIELD = 2
-#: least fraction of the numbers that have all digits; the others end in zeros by chance
-_ALIKE = 0.6
 #: a number with this number of digits shows double precision, even if all others are shorter
-_DOUBLE = 15
+_DOUBLE = np.finfo(np.float64).precision
 #: an exponent without the letter E or D: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
 _DECIMAL = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eEdDqQ]([+-]?[0-9]+)|([+-][0-9]+))?")
@@ -140,7 +139,7 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
             found.append(len(whole) + len(part if whole else part.lstrip(b"0")))
     counts = [count for count in found if count]
     most = max(counts, default=0)
-    alike = sum(count >= most - _FIELD for count in counts) >= _ALIKE * len(counts)
+    alike = sum(count >= most - _FIELD for count in counts) >= EVERY_DIGIT * len(counts)
     return most if most >= _DOUBLE or (most >= _ROUNDED and alike) else None
 
 

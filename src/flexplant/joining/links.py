@@ -17,7 +17,7 @@ from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.symmetric import DEPENDENT
 from ..structure.rigid import rigid_motions
-from ..tolerances import NEGLIGIBLE, PRECISION, ROOT, SAME, TYPED
+from ..tolerances import CLOSE, FOUR_DIGITS, NEGLIGIBLE, PRECISION, ROOT, SAME, TYPED
 from .component import Component, Model, Pose, components_of
 from .joint import Joint, JointEnd, joint_axes, joint_list
 
@@ -247,7 +247,7 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
 
 
 #: preference for later components as followers; far above rounding
-_LATER, _WITHIN = 1e-2, 1e-4
+_LATER, _WITHIN = CLOSE, FOUR_DIGITS
 #: size relative to the largest in its constraint above which a coordinate may follow without
 #: further search
 _HEAVY = 0.3

@@ -23,10 +23,6 @@ from .statics import StiffnessFactor, dissection_of, held_factor, static_respons
 
 #: number of loads above which the second static response of each load is left out
 _MANY = 30
-#: relative coupling of coordinates by damping below which it counts as zero
-_COUPLED = NULL
-#: relative rate of decay below which the response at a resonance counts as infinite
-_UNDAMPED = SAME
 #: number of frequencies solved together, and number of entries of their matrices
 _CHUNK, _ENTRIES = 256, 4_000_000
 #: fraction of the remaining loads (root of their energy) that may remain after a correction; the
@@ -92,7 +88,7 @@ class DynamicBasis:
         size = np.sqrt(np.abs(self.squares))
         rates = self._rates + self._loss / divisor(size)
         own = rates[self.n_rigid : self.n_modes]
-        return np.asarray(self.freq[own > _UNDAMPED * 2 * np.pi * self.freq])
+        return np.asarray(self.freq[own > SAME * 2 * np.pi * self.freq])
 
     def enriched(self, shapes: FloatArray) -> DynamicBasis:
         """Return the basis with more shapes (n, m), damped as it is."""
@@ -263,7 +259,7 @@ def _couples(C: FloatArray) -> bool:
     own = np.diag(C)
     # diagonal entries may be zero
     size = np.sqrt(np.abs(np.outer(own, own))) + 1e-3 * np.abs(C).max(initial=0)
-    return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
+    return bool(np.any(np.abs(C - np.diag(own)) > NULL * size))
 
 
 def static_shapes(

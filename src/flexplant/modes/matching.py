@@ -13,8 +13,6 @@ from scipy.sparse.csgraph import connected_components
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROUNDING, SAME, TINY
 
-#: shapes below this, relative to the largest one of their span, are rounding and count as zero
-_NONE = SAME
 #: MAC above which two modes count as the same
 PARTNER = 0.5
 #: relative distance of frequencies within which two modes may be the same one
@@ -36,7 +34,7 @@ def mac_matrix(X: Any, Y: Any) -> FloatArray:
 def in_span(X: Any, Y: Any) -> FloatArray:
     """Return the fraction (k,) of each column of Y in the span of X; for one column, their MAC."""
     basis, size, _ = np.linalg.svd(X, full_matrices=False)
-    inside = basis[:, size > _NONE * size[0]].conj().T @ Y
+    inside = basis[:, size > SAME * size[0]].conj().T @ Y
     return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / np.sum(np.abs(Y) ** 2, axis=0))
 
 

@@ -210,10 +210,6 @@ def _poles_near(
     return np.asarray(found[np.argmin(np.abs(found[:, None] - wanted), axis=0)])
 
 
-#: relative singular value of complex shapes below which it counts as zero
-_TRUNCATED = SAME
-
-
 def _nothing() -> FloatArray:
     return np.zeros(0)
 
@@ -565,7 +561,7 @@ class Modes(Placed, Value):
             own = Q.T @ (phi[:, pairs].real + sign * phi[:, pairs].imag)
             core = core + sign * (own * (rate / (grow - decay))) @ own.T
         values, vectors = np.linalg.eigh(0.5 * (core + core.T))
-        kept = values > _TRUNCATED * values[-1]
+        kept = values > SAME * values[-1]
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
     def inertia(self, motions: FloatArray) -> FloatArray:

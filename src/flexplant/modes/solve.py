@@ -30,7 +30,7 @@ from ..sparse.symmetric import (
 )
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
-from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, ROOT, ROUNDING, TINY
+from ..tolerances import MISSED, MOST_STEPS, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, TINY
 from ..words import instance
 from .modes import Modes
 from .normal_forms import PROPORTIONAL, NormalForm, check_drag, normal_form
@@ -343,7 +343,6 @@ def _coupled_modes(
 _ORTHONORMAL = ROUNDING
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
 _RESIDUAL = (ROOT, ROUNDING)
-_EPS = float(np.finfo(np.float64).eps)
 
 
 def check_modes(
@@ -394,7 +393,7 @@ def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple
         np.fill_diagonal(gram, gram.diagonal() - 1.0)
         error[at] = np.abs(gram, out=gram).max(axis=0)
         whole = size_of_K @ moved
-        rounding[at] = _EPS * np.einsum("ij,ij->j", moved, whole)
+        rounding[at] = PRECISION * np.einsum("ij,ij->j", moved, whole)
         # an entry of a shape has the rounding error of the largest entries, which stiff springs
         # multiply
         whole += rows * (NEGLIGIBLE * moved.max(axis=0))

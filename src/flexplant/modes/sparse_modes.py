@@ -15,7 +15,7 @@ from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
 from ..seeds import Rng
 from ..sparse.factor import LARGEST_FULL
-from ..sparse.lowest import BLOCK, STEPS, BlockLanczos, along_basis, iterated
+from ..sparse.lowest import BLOCK, EXTRA, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.other_factors import Cholmod
 from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid, check_stiffness
@@ -31,23 +31,20 @@ from .statics import (
     stiffness_factor,
 )
 
-#: number of modes above the last wanted one among which a gap is searched
-_EXTRA = 4
-#: relative distance of omega^2, and distance in roundings, below which values form one group
-_GAP, _GAP_ROUNDINGS = ROOT, 4.0
+#: relative distance of omega^2 below which values form one group
+_GAP = ROOT
 #: cost of a mode in multiplications, per DOF and per entry of the factor: measured on solids and
 #: plates of 6 615 to 22 326 DOFs, where memory access limits the speed
 _EACH_DOF, _EACH_ENTRY = 5e4, 40.0
 #: residual relative to ||K phi|| above which Lanczos continues, unless it is rounding
 _RESIDUAL = NULL
-#: residuals below this many roundings of K phi are not reduced by more steps
+#: residuals below this number of roundings of K phi are not reduced by more steps, and values
+#: within it form one group
 _ROUNDINGS = 10.0
 #: error of Ritz vectors, relative to the accepted residuals, at which Lanczos stops. The last of
 #: many copies of a mode appear late, since each search begins with the remainder of the previous
 #: one
 _PARTS = (1.0, *[0.03] * 5)
-#: number of shapes checked together, while memory use is at its peak
-_JUDGED = 8
 
 
 @one_thread()
@@ -81,7 +78,7 @@ def counted_modes(
     expect(2 * order.multiplications + count * (_EACH_DOF * n + _EACH_ENTRY * order.n_factor))
     squares, phi = np.zeros(0), np.zeros((n, 0))
     counted, sure, shift = 0, 0, 0.0
-    missing = min(count + _EXTRA, n - r)
+    missing = min(count + EXTRA, n - r)
     for search in range(MOST_STEPS):
         factor = factor or new(model, method)
         locked = np.hstack([model.rigid_body, phi])
@@ -120,7 +117,7 @@ def counted_modes(
             return squares[:count], phi[:, :count], _certificate(shift, counted + r, sure + r)
         if counted < sure:
             break
-        missing = min(counted - sure + _EXTRA, n - r - squares.size)
+        missing = min(counted - sure + EXTRA, n - r - squares.size)
     raise SolverError(
         (
             f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
@@ -185,7 +182,7 @@ def _search_once(
     block: int = BLOCK,
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes, up to `want`, of one search."""
-    extra = min(_EXTRA, want - 1)
+    extra = min(EXTRA, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
     if factor.single:
         davidson = BlockDavidson(
@@ -224,7 +221,7 @@ def _excess(
 ) -> float:
     """Return the largest residual of the first shapes, relative to its limit or `least`."""
     left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), Absolute(K)
-    for at in column_groups(squares.size, _JUDGED):
+    for at in column_groups(squares.size, BLOCK):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
         limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
         force -= (M @ phi[:, at]) * squares[at]
@@ -235,7 +232,7 @@ def _excess(
 def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
     """Return the relative error of each shape at which its residual is `part` of the limit."""
     size_of_K, limit = Absolute(K), np.zeros(phi.shape[1])
-    for at in column_groups(limit.size, _JUDGED):
+    for at in column_groups(limit.size, BLOCK):
         limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
     return limit
 
@@ -250,14 +247,14 @@ def _let_pass(K: Any, size_of_K: Absolute, phi: FloatArray) -> tuple[FloatArray,
 def _is_gap(squares: FloatArray, count: int, top: float, rounding: FloatArray) -> bool:
     """Return whether `top` is well between the last mode below it and the next."""
     near = squares[count - 1 : count + 1]
-    closest = np.maximum(_GAP * top, _GAP_ROUNDINGS * rounding[count - 1 : count + 1])
+    closest = np.maximum(_GAP * top, _ROUNDINGS * rounding[count - 1 : count + 1])
     return bool(np.all(np.abs(near - top) > closest) and near[0] < top < near[-1])
 
 
 def _widest_gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
     """Return the number of modes below the widest gap above the last wanted one, and its middle."""
     # gaps narrower than 1e-8 or than some roundings of the neighbouring modes do not count
-    above, least = squares[count - 1 :], _GAP_ROUNDINGS * rounding[count - 1 :]
+    above, least = squares[count - 1 :], _ROUNDINGS * rounding[count - 1 :]
     wide = np.diff(above)
     real = (wide > _GAP * above[1:]) & (wide > least[1:]) & (wide > least[:-1])
     if not np.any(real):
@@ -272,7 +269,7 @@ def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[i
     Copies agree to 1e-8 or to some roundings, the first with the last as well. The shift is 0 when
     the modes are not copies.
     """
-    closest = np.maximum(_GAP * squares[-1], _GAP_ROUNDINGS * float(rounding[-1]))
+    closest = np.maximum(_GAP * squares[-1], _ROUNDINGS * float(rounding[-1]))
     first = int(np.searchsorted(squares, squares[-1] - closest))
     before = max(float(squares[first - 1]), 0.0) if first else 0.0
     apart = squares[first] - before > closest and first < count

@@ -207,10 +207,6 @@ def _shift_matrix(K: Any, M: Any, square: float) -> Any:
     return sp.csc_array((K.data - square * M.data, K.indices, K.indptr), shape=K.shape)
 
 
-#: fraction of the elastic compliance of a place below which the truncated part counts as zero
-_NEGLIGIBLE = SAME
-
-
 def places(at: Place | Iterable[Place], name: str = "a place") -> tuple[Place, ...]:
     """Return one place, or several, as a tuple."""
     if isinstance(at, str | Mapping):
@@ -261,7 +257,7 @@ def attachment_vectors(
         response = response - phi @ (phi.T @ np.asarray(M @ response))
     left = np.sum(loads * response, axis=0)
     for place, part, total in zip(at, left, whole, strict=True):
-        if not part > _NEGLIGIBLE * total:
+        if not part > SAME * total:
             raise ModelError(
                 f"the {phi.shape[1]} modes already hold all of the static compliance at "
                 f"{place_of(place)} ({part:.2g} of {total:.3g} m/N is left): an attachment vector "

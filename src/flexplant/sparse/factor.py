@@ -81,16 +81,9 @@ def negative_pivots(lu: Any) -> int:
     return int(np.count_nonzero(lu.U.diagonal() < 0))
 
 
-def is_positive_definite(
-    matrix: Matrix,
-    tolerance: float = 0.0,
-    *,
-    nodes: IntArray | None = None,
-    xyz: FloatArray | None = None,
-) -> bool:
+def is_positive_definite(matrix: Matrix, tolerance: float = 0.0) -> bool:
     """Return whether ``S A S + tolerance I`` is positive definite, S scaling A's diagonal to 1."""
-    # large sparse matrices are tried by a bound on their lowest eigenvalue first, then factored;
-    # the node and coordinates of each DOF make the factorisation cheaper
+    # large sparse matrices are tried by a bound on their lowest eigenvalue first, then factored
     if np.any(diagonal(matrix) < 0) or (tolerance == 0 and np.any(diagonal(matrix) == 0)):
         return False
     scaled, _ = unit_diagonal(matrix)
@@ -100,7 +93,7 @@ def is_positive_definite(
         if n > LARGEST_FULL and lowest_eigenvalue_bound(shifted) > 0:
             return True
         try:
-            MultifrontalFactor(shifted, dissect(shifted, nodes, xyz), keep=False)
+            MultifrontalFactor(shifted, dissect(shifted), keep=False)
         except SolverError:
             return False
         return True

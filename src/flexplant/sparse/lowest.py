@@ -42,6 +42,8 @@ from .symmetric import (
 
 #: number of vectors solved together
 BLOCK = 12
+#: number of values above the last wanted one among which a gap for a count is searched
+EXTRA = 4
 #: residual below which the value is exact to rounding, since its error is the square of the
 #: residual
 VALUE = SPLIT
@@ -49,8 +51,6 @@ VALUE = SPLIT
 STEPS = "modes, steps of Lanczos"
 #: number of steps between two restarts with a large block
 _STEPS, _FEW_STEPS = 12, 6
-#: relative change of M W that the final Rayleigh-Ritz step on the modes corrects
-_STALE = NULL
 #: relative error of a Ritz pair below which its shape needs no separate tolerance
 _SURE = ROUNDING
 
@@ -237,8 +237,9 @@ class BlockLanczos:
                 along += part @ over
                 before = float(np.sqrt(np.abs(np.sum(W * loaded, axis=0)).min()))
                 taken = np.abs(part).max(initial=0.0)
-                # where almost nothing is removed, M W does not change
-                if taken > _STALE * before:
+                # where almost nothing is removed, M W does not change but for what the final
+                # Rayleigh-Ritz step on the modes corrects
+                if taken > NULL * before:
                     loaded = self._M @ W
                 if taken <= FOUR_DIGITS * before:
                     break

@@ -23,7 +23,7 @@ from ..sparse.symmetric import (
     soft_group,
     unit_diagonal,
 )
-from ..tolerances import CLOSE, PRECISION, RESIDUAL, SAME, TYPED
+from ..tolerances import CLOSE, MOST_STEPS, PRECISION, RESIDUAL, SAME, TYPED
 from .zero_energy_motions import most_moved, nonrigid
 
 #: input types that become a matrix of a structure
@@ -240,8 +240,6 @@ def refuse_unstable(model: Any, what: str) -> None:
 
 #: shift of the inverse problem in units of the rounding of K, so that K + s M is well-conditioned
 _SHIFT = 1e3
-#: number of steps of inverse iteration
-_STEPS = 5
 
 
 def elastic_modes(
@@ -383,7 +381,7 @@ def _improved(
             f"an elastic mode has a negative stiffness (K + s M is indefinite, s = {shift:.2g} "
             "1/s^2): the structure is unstable. Look for a sign in K."
         ) from None
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         before = values
         moved = scale[:, None] * la.cho_solve(factor, scale[:, None] * (M @ soft))
         for _ in range(2):
@@ -463,7 +461,7 @@ _SAMPLE = (20, 400)
 
 
 #: fraction of entries that need every digit: one in ten last digits is zero
-_EVERY_DIGIT = 0.6
+EVERY_DIGIT = 0.6
 
 
 def digits_of(given: Any) -> int | None:
@@ -494,4 +492,4 @@ def _written_digits(given: Any) -> int | None:
     chosen = some[:: max(1, some.size // _SAMPLE[1])]
     count = [len(f"{x!r}".partition("e")[0].replace(".", "").strip("0")) for x in chosen.tolist()]
     most = max(count)
-    return most if most in _WRITTEN and count.count(most) >= _EVERY_DIGIT * len(count) else None
+    return most if most in _WRITTEN and count.count(most) >= EVERY_DIGIT * len(count) else None

@@ -9,11 +9,9 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray
 from ..errors import ModelError, SolverError
-from ..sparse.lowest import lowest_modes, multifrontal_inertia
+from ..sparse.lowest import EXTRA, lowest_modes, multifrontal_inertia
 from ..tolerances import ROOT, TINY
 
-#: number of additional frequencies among which a gap for the count is searched
-_EXTRA = 4
 #: largest number of frequencies, since inverse iteration stores all shapes
 MOST = 60
 
@@ -21,7 +19,7 @@ MOST = 60
 def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> FloatArray:
     """Return the lowest frequencies [Hz], zero for motions without energy."""
     n = K.shape[0]
-    found = lowest_modes(K, M, min(count + _EXTRA, n), rounding=rounding)
+    found = lowest_modes(K, M, min(count + EXTRA, n), rounding=rounding)
     values, shapes = found.values, found.shapes
     order = np.argsort(np.where(np.arange(values.size) < found.n_zero, -np.inf, values))
     values, shapes = values[order], shapes[:, order]

@@ -15,7 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import LARGEST_FULL
 from ..sparse.lowest import Lowest, lowest_modes
 from ..sparse.symmetric import ZERO, dense, diagonal, orthonormalised
-from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, PRECISION, SAME
+from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, NULL, PRECISION, SAME
 from .rigid import bodies, farness, force_free, free_motions, rigid_motions
 
 #: motion of a DOF of a mechanism, relative to the largest one, above which it is listed
@@ -158,9 +158,9 @@ def most_moved(motion: FloatArray) -> IntArray:
     return np.asarray(order[size[order] >= _MOVES * size[order[0]]], dtype=np.int64)
 
 
-def nonrigid(zero_modes: FloatArray, rigid: FloatArray, extra: int | None = None) -> FloatArray:
-    """Return the part of a space that is not rigid-body motion, as `extra` orthonormal columns."""
-    extra = zero_modes.shape[1] - rigid.shape[1] if extra is None else extra
+def nonrigid(zero_modes: FloatArray, rigid: FloatArray) -> FloatArray:
+    """Return the part of a space that is not rigid-body motion, as orthonormal columns."""
+    extra = zero_modes.shape[1] - rigid.shape[1]
     if extra <= 0:
         return np.zeros((zero_modes.shape[0], 0))
     space = la.qr(zero_modes, mode="economic")[0]
@@ -192,14 +192,8 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
     return float(np.mean(factors))
 
 
-#: relative error of entries of K above which it is reported
-_FINE = 3e-12
 #: least number of loaded rows for a median of their forces
 _ROWS = 12
-
-
-#: number of digits with which a text represents double precision exactly
-_ALL_DIGITS = 16
 
 
 def shown_digits(K: Any, dofs: DofSet) -> int | None:
@@ -222,7 +216,7 @@ def shown_digits(K: Any, dofs: DofSet) -> int | None:
         aligned = abs(float(motion @ force)) > 0.5 * float(work.sum())
         if error < FOUR_DIGITS and not aligned:
             worst = max(worst, error)
-    return round(-float(np.log10(worst))) if worst > _FINE else None
+    return round(-float(np.log10(worst))) if worst > NULL else None
 
 
 def loss(found: Lowest, digits: int) -> float | None:
@@ -236,7 +230,7 @@ def loss(found: Lowest, digits: int) -> float | None:
 
 def endangered(K: Any, M: Any, digits: int) -> str | None:
     """Return a text when the digits of K are too few for the first elastic eigenvalue."""
-    if digits >= _ALL_DIGITS:
+    if digits > np.finfo(np.float64).precision:  # double precision
         return None
     with attempted("the check of the digits of K by its lowest modes", SolverError):
         found = lowest_modes(K, M, 8, rounding=10.0**-digits)

@@ -15,7 +15,7 @@ from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
-from ..tolerances import CLOSE, DEVIATIONS, INTERVAL, MOST_STEPS, SAME, TYPED
+from ..tolerances import CLOSE, DEVIATIONS, INTERVAL, MOST_STEPS, NEGLIGIBLE, SAME, TYPED
 from ..words import instance
 from .family import Point
 from .residuals.modal_residuals import USUAL, Eigenvalues, growth
@@ -27,8 +27,6 @@ from .sensitivities import eigenvalue_sensitivities
 #: degrees of freedom of the usual discrepancy of a kind: two measured modes outweigh it, and it
 #: holds without measured modes
 USUAL_DOF = 2.0
-#: search range of the deviations, in units of the usual ones
-_LEAST, _MOST = 1e-3, 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,7 @@ def restricted(
             slope[k] += size * (np.sum(P * part) - moved @ part @ moved)
         return 0.5 * (both + r @ moved) + known.sum(), slope
 
-    limits = [(np.log(_LEAST), np.log(_MOST))] * len(names)
+    limits = [(np.log(NEGLIGIBLE), -np.log(NEGLIGIBLE))] * len(names)
     log = minimize(cost, np.zeros(len(names)), jac=True, method="L-BFGS-B", bounds=limits).x
     V = covariance(log)
     P = projected(V)[0]
@@ -199,8 +197,6 @@ _DRIFT = (1e-3, 0.02)
 _MESH = 1.5
 #: standard deviation of the logarithm of a damping ratio without information
 _SILENT = 1e2
-#: prior uncertainty of a parameter: relative change of the pole that it changes most
-_WIDE = 1.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -362,8 +358,9 @@ def _conditioned(
     s = np.repeat([one.deviation for one in sizes], m)
     alone = all(isinstance(one, Eigenvalues) for one in fit.residuals)
     if alone or fit.covariance is None:
-        # over all modes: measured modes may not depend on a parameter that others depend on
-        wide = _WIDE * S / divisor(np.abs(S).max(axis=0))
+        # a parameter is known to the whole of the pole that it changes most, of all modes: measured
+        # ones may not depend on a parameter that others depend on
+        wide = S / divisor(np.abs(S).max(axis=0))
         parameters = wide @ wide.T
     else:
         parameters = S @ fit.covariance @ S.T

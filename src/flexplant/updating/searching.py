@@ -18,6 +18,7 @@ from ..errors import (
     attempted,
     counted,
 )
+from ..modes.matching import NEAR
 from ..seeds import Rng, generator
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, ROUNDING, TINY, TYPED
 from .family import Point, changed_model
@@ -32,9 +33,6 @@ from .update_result import Starts
 
 #: the end of a search, or the reason why it failed
 Reached: TypeAlias = SearchEnd | FlexplantError
-
-#: relative variance of each entry of a response in the first fit, in addition to its noise
-EVEN = 0.1
 
 
 def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchEnd:
@@ -86,11 +84,12 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
         return residual
     noise = 0.0 if residual.variance is None else residual.variance
     # lines that are not used may be zero
-    variance = np.maximum(EVEN * size + noise, np.finfo(float).tiny)
+    variance = np.maximum(POOR_FIT * size + noise, np.finfo(float).tiny)
     return residual.replace(magnitude=True, variance=variance)
 
 
-#: remaining fraction of the measured power above which a minimum does not explain the measurement
+#: remaining fraction of the measured power above which a minimum does not explain the measurement;
+#: the first fit of a response gives each entry this relative variance in addition to its noise
 POOR_FIT = 0.1
 #: number of additional starts that are always tried, for models up to a number of DOFs and for
 #: larger ones; near a second minimum about half of them end in the other one
@@ -447,11 +446,6 @@ def _check_inside(objective: Objective, start: FloatArray) -> None:
             raise ModelError(
                 f"start of {q.name} is {value}, outside its bounds ({low}, {high}). Begin inside."
             )
-
-
-#: largest relative deviation from 2 pi of the ratio of measured poles to those of the model, for
-#: all poles
-NEAR = 0.15
 
 
 def check_units(objective: Objective, begin: FloatArray) -> None:

@@ -20,7 +20,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
-from ...seeds import MOST, generator
+from ...seeds import MOST_DRAWS, generator
 from ...store import Value
 from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TYPED
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels
@@ -185,7 +185,7 @@ def robust_stability(
     >>> fx.synthesis.robust_stability(uncertain, lead, machines=3).is_robust
     True
     """
-    count = whole(machines, "machines", minimum=0, maximum=MOST)
+    count = whole(machines, "machines", minimum=0, maximum=MOST_DRAWS)
     hint = "A mu between 1 and it would not be decided. Pass 0.25, or less for a sharper bound."
     least = between(resolution, "resolution", 0.0, 1.0, hint)
     chance = generator(rng)

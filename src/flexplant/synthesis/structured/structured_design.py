@@ -16,7 +16,7 @@ from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...seeds import MOST, Rng, generator
+from ...seeds import MOST_DRAWS, Rng, generator
 from ...tolerances import CLOSE, NEGLIGIBLE, ROOT, SAME, TINY, TYPED
 from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange
@@ -146,7 +146,7 @@ def design_structured(
             f"{short(structure)}. Pass one of them, such as synthesis.TunedLaws(law) or "
             "synthesis.FixedOrder(2)."
         )
-    starts, random = whole(starts, "starts", maximum=MOST), generator(rng)
+    starts, random = whole(starts, "starts", maximum=MOST_DRAWS), generator(rng)
     search = starts, random, whole(evaluations, "evaluations"), progress
     design = _Structured(structure, _objectives(objective), moving, *search)
     return designed(design, plants, plants[0])
