@@ -89,8 +89,7 @@ def test_a_place_too_many_is_as_rare_as_the_page_says():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_fit_by_way_of_negative_inertia_is_polished(seed):
-    """Fits in few coordinates may pass through values at which the whole model has no modes."""
+def test_a_fit_in_few_coordinates_is_polished(seed):
     rng = np.random.default_rng(seed)
     n = 8
     model, M, K = chain(rng.uniform(1.0, 2.0, n), rng.uniform(0.5e6, 2e6, n - 1))
@@ -100,6 +99,5 @@ def test_a_fit_by_way_of_negative_inertia_is_polished(seed):
     whole = Objective(damped(model, K, M), candidates, data, prior=False)
     fits = Subsets(whole, data, n)
     fits.fit((place,))
-    fits.ways[place,] = [np.array([-2.0 * M[place, place]]), *fits.ways[place,]]
     fits.polish((place,))
     assert fits.fit((place,)).p[0] == pytest.approx(size, rel=1e-2)

@@ -50,12 +50,13 @@ def parameters(plate, rom, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "modes", "seed", "most"), [
-    pytest.param(4, 14, 0, 1200, marks=pytest.mark.long), (4, 10, 1, 600), (2, 8, 2, 600)
+    pytest.param(4, 14, 0, 1200, marks=pytest.mark.long), (4, 10, 1, 800), (2, 8, 2, 600)
 ])  # fmt: skip
 def test_data_that_do_not_fit_are_few_eigenvalue_problems(plate, solved, count, modes, seed, most):
     """1534 and 1401 of the first two when every start was searched to its end.
 
-    How many starts meet in one minimum hangs on rounding: the first takes 480 to 1080.
+    How many starts meet in one minimum hangs on rounding: the first takes 480 to 1080, the second
+    430 to 700.
     """
     rom = plate.reduced(0.01, True)
     data = scattered(rom, modes, seed, 0.003)
@@ -103,15 +104,14 @@ def test_the_answer_is_that_of_all_starts_searched_to_their_end(monkeypatch, see
         np.testing.assert_allclose(quick.values, whole.values, rtol=1e-5, atol=1e-6)
 
 
-def test_a_path_that_is_followed_again_is_not_solved_again(plate, solved):
+def test_a_point_to_which_modes_were_followed_is_not_solved_again(plate, solved):
     rom = plate.reduced(0.01, True)
     data = scattered(rom, 8, 0, 1e-3)
     objective = fx.updating.search.Objective(rom, parameters(plate, rom, 2), [fx.Eigenvalues(data)])
     path = [np.array([0.01 * i, 1e-3 * i]) for i in range(6)]
     point = objective.follow(path)
     solutions = len(solved)
-    objective.path = []
-    again = objective.follow(path)
+    again = objective.follow(path[-1:], point)
     assert isinstance(point, Point) and again is point
     assert len(solved) == solutions
 

@@ -50,7 +50,7 @@ def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchE
         prior=objective.uses_prior,
         family=objective.family,
     )
-    objective.path = []
+    objective.origin = None
     near = SearchPlan(TrustRegion(), search.most, max(search.tolerance, NEGLIGIBLE))
     before = None
     with attempted("poles first, before shapes and responses"):
@@ -63,6 +63,7 @@ def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchE
             trail.add(objective, p, 1.0 if trail.p else 0.0)
         if len(points) > 1:
             before = SearchEnd(points[-1], np.inf, trail, converged=False, reason="")
+            before.point = objective.at(points[-1], refer=True)
     return search.resumed(objective, before) if before else search.begun(objective, begin)
 
 
@@ -156,14 +157,13 @@ class _Tried:
             return False
         if end.cost >= (1 - TYPED) * best.end.cost:
             return False
-        there = self.objective.at(end.p)
+        there, same = self.objective.at(end.p), False
         line = np.linspace(best.end.p, end.p, GLANCE)[1:]
-        self.objective.path, same = [], False
         with attempted("following the modes to a better minimum", (ModelError, LabelError)):
-            followed = self.objective.follow([*best.end.trail.p, *line])
+            followed = self.objective.follow([*line], best.end.point)
             own, other = map(self.objective.values, (there, followed))
             same = float(np.linalg.norm(own - other)) <= TYPED * float(np.linalg.norm(own))
-        self.objective.follow(end.trail.p)
+        self.objective.back_to(there)
         return same
 
     @property
@@ -228,8 +228,7 @@ def from_one_start(
     if end is not tried.ends[0]:
         settled = _reached(SearchPlan.resumed, search, objective, end)
         end = settled if isinstance(settled, SearchEnd) else end
-    objective.path = []
-    objective.follow(end.trail.p)
+    objective.follow([end.p], end.point)
     return end, tried.begins, tried.ends
 
 
@@ -316,8 +315,7 @@ def from_starts(
         raise none_found(objective, begins, ends)
     best = min(reached, key=lambda found: found.cost)
     # the modes of the best end are numbered from its own start
-    if len(begins) > 1:
-        objective.follow(best.trail.p)
+    objective.follow([best.p], best.point)
     return best, ends
 
 
@@ -389,11 +387,11 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
     if least is None or not objective.noise_known or is_bad(chance(least, dof)):
         costs = np.array([max(end.cost, TINY) for end in minima])
         return np.asarray(rows * np.log(costs / max(best.cost, TINY)), dtype=np.float64)
-    found, objective.path = [], []
+    found = []
     for end in minima:
-        chi2 = noise_misfit(objective, objective.follow(end.trail.p), free)
+        chi2 = noise_misfit(objective, objective.follow([end.p], end.point), free)
         found.append((chi2 or 0.0) - least)
-    objective.follow(best.trail.p)
+    objective.follow([best.p], best.point)
     above = np.array(found, dtype=np.float64)
     return np.asarray(np.where(np.abs(above) < TYPED * least, 0.0, above), dtype=np.float64)
 
@@ -401,8 +399,7 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
 def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
     """Return starts around one, at which each parameter changes eigenvalues by up to 10 %."""
     # sizes are drawn uniformly over decades; masses, springs and dampers are added, not removed
-    objective.path = []
-    eigen = objective.begin(middle).eigen
+    eigen = objective.follow([middle]).eigen
     every = list(range(eigen.poles.size))
     moved = np.abs(objective.family.sensitivity(eigen, every)) / np.abs(eigen.poles)[:, None]
     typical = np.median(moved, axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from math import comb, expm1, log
 from typing import Any, NamedTuple
 
@@ -64,10 +65,9 @@ class Subsets:
         self.done: dict[Subset, SubsetFit | None] = {}
         #: value of each candidate alone, to first order
         self.linear: FloatArray | None = None
-        #: the points each fit went through, and the model where it ended
-        self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.nuisance]]}
         #: values near those of a set's fit, where they are known from elsewhere
         self.guesses: dict[Subset, FloatArray] = {}
+        #: the model where each fit ended
         self.ends: dict[Subset, Point] = {}
         point = whole.begin(np.where(np.arange(self.start.size) < count, 0.0, self.start))
         self.rows = whole.values(point).size
@@ -83,7 +83,7 @@ class Subsets:
         if self.nuisance:
             self.done[()] = self._fitted(())
             self.start = self.start.copy()
-            self.start[self.nuisance] = self.ways[()][-1]
+            self.start[self.nuisance] = self.ends[()].p
         else:
             self.done[()], self.ends[()] = self._left(whole, self.start[:0], point, ()), point
 
@@ -102,12 +102,10 @@ class Subsets:
         if self.fit(subset) is None or not (subset or self.nuisance):
             return
         objective = self._objective([*subset, *self.nuisance])
-        # fits in few coordinates may pass through impossible values
-        way = self.ways[subset][:-1]
-        objective.path = [p for p in way if is_physical(objective.family, p)]
-        end = self.ways[subset][-1]
-        found = TrustRegion().search(objective, end, most=50, tolerance=SETTLED)
-        self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
+        near = self._end_of(objective, range(len(objective.parameters)), subset)
+        # shapes of few coordinates are not exact
+        objective.origin = objective.place(near.continued(near.p))
+        found = TrustRegion().search(objective, near.p, most=50, tolerance=SETTLED)
         point = objective.at(found.p)
         self.done[subset] = self._left(objective, found.p, point, subset)
         self.ends[subset] = point
@@ -211,7 +209,7 @@ class Subsets:
         """Return the end of the fit of a subset as a point of `objective`."""
         # the fitted parameters are the `rows` of those of the objective, the others are zero
         end, p = self.ends[subset], np.zeros(len(objective.parameters))
-        p[list(rows)] = self.ways[subset][-1]
+        p[list(rows)] = end.p[: len(rows)]
         return objective.place(Point(objective.family, p, end.eigen, end.labels))
 
     def _joining(self, subset: Subset) -> list[int]:
@@ -295,7 +293,7 @@ class Subsets:
         B = self._coordinates(picked)
         if B is not None:
             few = self._objective(picked, B)
-            found, way = self._searched(few, subset)
+            found = self._searched(few, subset)
             made = few.at(found.p)
             point = lifted_point(exact.family, B, made, exact.numbers)
             r = exact.values(point)
@@ -305,46 +303,40 @@ class Subsets:
             # an impossible model fits better than a possible one: of interest only if it is the
             # best
             if close and (left.score > self.least or is_physical(exact.family, found.p)):
-                self.ways[subset], self.ends[subset] = way, point
+                self.ends[subset] = point
                 return left
-        found, way = self._searched(exact, subset)
-        point = exact.at(found.p)
-        self.ways[subset], self.ends[subset] = way, point
+        found = self._searched(exact, subset)
+        self.ends[subset] = point = exact.at(found.p)
         return self._left(exact, found.p, point, subset)
 
-    def _searched(self, objective: Objective, subset: Subset) -> tuple[SearchEnd, list[FloatArray]]:
-        """Return the end of the search for a subset's values, and the points on the way there."""
+    def _searched(self, objective: Objective, subset: Subset) -> SearchEnd:
+        """Return the end of the search for a subset's values."""
         picked = [*subset, *self.nuisance]
         first, guess = self.start[picked], self._guess(subset)
         method = TrustRegion()
         if guess is not None:
-            # modes keep the numbers of the start, and are followed on the way
-            objective.path = self._way(objective, first, guess)
             try:
+                # modes keep the numbers of the start, and are followed on the way
+                objective.origin = self._followed(objective, first, guess)
                 found = method.search(objective, guess, most=50, tolerance=FOUR_DIGITS)
             except (ModelError, SolverError, np.linalg.LinAlgError):
                 found = None
             if found is not None and found.trail.error[-1] < self._error(()):
-                return found, [*objective.path, *found.trail.p]
-            objective.path = []
-        found = method.search(objective, first, most=50, tolerance=FOUR_DIGITS)
-        return found, found.trail.p
+                return found
+            objective.origin = None
+        return method.search(objective, first, most=50, tolerance=FOUR_DIGITS)
 
-    def _way(self, objective: Objective, first: FloatArray, guess: FloatArray) -> list[FloatArray]:
-        """Return the points through which modes are followed from the start to a guess."""
-        try:
+    def _followed(self, objective: Objective, first: FloatArray, guess: FloatArray) -> Point:
+        """Return the point from which modes are followed to a guess: the start, or one near it."""
+        with suppress(ModelError):
             begin = objective.begin(first)
-            end = objective.at(guess)
-        except ModelError:
-            return [first + part * (guess - first) for part in WAY]
-        columns = [point.columns(objective.numbers) for point in (begin, end)]
-        X, Y = (
-            objective.family.weighted(point.eigen.X)[:, own]
-            for point, own in zip((begin, end), columns, strict=True)
-        )
-        if np.all(np.diag(mac_matrix(X, Y)) >= ALIKE):
-            return [first]
-        return [first + part * (guess - first) for part in WAY]
+            X, Y = (
+                objective.family.weighted(point.eigen.X)[:, point.columns(objective.numbers)]
+                for point in (begin, objective.at(guess))
+            )
+            if np.all(np.diag(mac_matrix(X, Y)) >= ALIKE):
+                return begin
+        return objective.follow([first + part * (guess - first) for part in WAY])
 
     def _guess(self, subset: Subset) -> FloatArray | None:
         """Return values near the fit of a subset: of the best part of it, or to first order."""

@@ -392,7 +392,7 @@ class Auto(UpdateMethod):
         tolerance: float = 1e-10,
     ) -> SearchEnd:
         """Return the end of a search from start values; see `UpdateMethod.search`."""
-        path, way, trouble = list(objective.path), [start], None
+        begin, trouble = start, None
         before: Trail | None = None
         try:
             found = Quick().search(objective, start, most=most, tolerance=tolerance)
@@ -402,10 +402,10 @@ class Auto(UpdateMethod):
             # a given limit is respected
             if found.converged or (most is not None and most <= GaussNewton.steps):
                 return found
-            before, way, reason = found.trail, found.trail.p, found.reason
-        objective.path = [*path, *way[:-1]]
+            before, begin, reason = found.trail, found.p, found.reason
+            objective.origin = objective.at(begin, refer=True)
         try:
-            found = TrustRegion().search(objective, way[-1], most=most, tolerance=tolerance)
+            found = TrustRegion().search(objective, begin, most=most, tolerance=tolerance)
         except (ModelError, SolverError) as error:
             raise trouble or error from None
         # a search that was cut short may still find a minimum
@@ -413,9 +413,9 @@ class Auto(UpdateMethod):
             raise trouble
         found.tried = (f"Gauss-Newton: {reason}", f"trust region: {found.reason}")
         found.trail = found.trail if before is None else before.joined(found.trail)
-        objective.path = [*path, *found.trail.p[:-1]]
         if not found.converged:
             return found
+        objective.origin = objective.at(found.p, refer=True)
         try:
             settled = GaussNewton().search(objective, found.p, tolerance=tolerance)
         except SolverError:

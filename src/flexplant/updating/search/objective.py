@@ -20,9 +20,6 @@ from ..residuals.modal_residuals import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
 from ..sensitivities import PoleRows, mode_columns, split_point
 
-#: largest number of entries of the stored shapes of all points: 160 MB of complex numbers
-REMEMBERED = 10_000_000
-
 
 class Defect(NamedTuple):
     """Difference of the residuals of a better model, and of their derivatives."""
@@ -85,14 +82,10 @@ class Objective:
         self.reference: Point | None = None
         self._point: Point | None = None
         self._first: Point | None = None
-        #: points through which modes are followed to the start of a search, numbered at the first
-        self.path: list[FloatArray] = []
+        #: the point from which modes are followed to the start of a search; None: numbered there
+        self.origin: Point | None = None
         #: correction of the residuals, to first order about its parameters
         self.defect: Defect | None = None
-        #: points of searches, by the previous point and the parameters: a repeated path is not
-        #: solved again
-        self._moves: dict[tuple[Point, bytes], Point] = {}
-        self._last: tuple[Point, bytes] | None = None
 
     @property
     def default_start(self) -> FloatArray:
@@ -101,24 +94,25 @@ class Objective:
         return np.asarray(middle, dtype=np.float64)
 
     def begin(self, p: FloatArray) -> Point:
-        """Return the model at a start, its modes numbered there or where `path` begins."""
-        path = [*self.path, p]
-        if self._first is None or not np.array_equal(self._first.p, path[0]):
-            point = first_point(self.family, path[0])
+        """Return the model at a start, its modes numbered there or followed from `origin`."""
+        if self.origin is not None:
+            self.back_to(self.origin)
+            return self.at(p, refer=True)
+        if self._first is None or not np.array_equal(self._first.p, p):
+            point = first_point(self.family, p)
             last = point.eigen.n_rigid + point.eigen.poles.size
-            stopped = (
-                np.any(path[0]) and last < max(self.numbers, default=0) <= self.family.massive.size
-            )
+            stopped = np.any(p) and last < max(self.numbers, default=0) <= self.family.massive.size
             if self.numbers and not stopped:
                 mode_columns(self.numbers, point.eigen)
             self._first = self._numbered(point)
-        point = self._set(self._first, refer=True)
-        for step in path[1:]:
-            point = self.at(step, refer=True)
-        return point
+        return self.back_to(self._first)
 
-    def follow(self, points: Sequence[FloatArray]) -> Point:
-        """Return the model at the last of some points, its modes followed from the first one."""
+    def follow(self, points: Sequence[FloatArray], origin: Point | None = None) -> Point:
+        """Return the model at the last of some points, its modes followed from `origin`.
+
+        None: they are numbered at the first of the points.
+        """
+        self.origin = origin
         point = self.begin(points[0])
         for p in points[1:]:
             point = self.at(p, refer=True)
@@ -126,39 +120,21 @@ class Objective:
 
     def at(self, p: FloatArray, *, refer: bool = False) -> Point:
         """Return the model at `p`, its modes paired with those of the reference point."""
-        if self._point is not None and np.array_equal(self._point.p, p):
-            if refer:
-                if self._last is not None and self._last[0] is self.reference:
-                    self._remember(self._last, self._point)
-                self.reference = self._point
-            return self._point
         if self.reference is None:
             return self.begin(p)
-        if np.array_equal(self.reference.p, p):
-            return self._set(self.reference, refer=refer)
-        move = (self.reference, p.tobytes())
-        point = self._moves.get(move)
-        if point is None:
-            point = self._numbered(self.reference.continued(np.array(p)))
-        if refer:
-            self._remember(move, point)
-        self._set(point, refer=refer)
-        self._last = move
-        return point
-
-    def _remember(self, move: tuple[Point, bytes], point: Point) -> None:
-        self._moves[move] = point
-        if len(self._moves) * point.eigen.X.size > REMEMBERED:
-            self._moves.clear()
+        if self._point is None or not np.array_equal(self._point.p, p):
+            near = self.reference
+            there = np.array_equal(near.p, p)
+            self._point = near if there else self._numbered(near.continued(np.array(p)))
+        return self.back_to(self._point) if refer else self._point
 
     def place(self, point: Point) -> Point:
         """Return a point with numbered modes as the reference."""
-        return self._set(self._numbered(point), refer=True)
+        return self.back_to(self._numbered(point))
 
-    def _set(self, point: Point, *, refer: bool) -> Point:
-        self._point, self._last = point, None
-        if refer:
-            self.reference = point
+    def back_to(self, point: Point) -> Point:
+        """Return a point whose modes have numbers, as the reference."""
+        self._point = self.reference = point
         return point
 
     def _numbered(self, point: Point) -> Point:
@@ -291,6 +267,8 @@ class SearchEnd:
     reason: str
     #: methods that were tried and their ends, if there were several
     tried: tuple[str, ...] = ()
+    #: the model at the end
+    point: Point | None = None
 
 
 class UpdateMethod(Value):
@@ -368,18 +346,20 @@ class SearchPlan(NamedTuple):
 
     def begun(self, objective: Objective, begin: FloatArray) -> SearchEnd:
         """Return the end of a search whose modes are numbered where it begins."""
-        objective.path = []
+        objective.origin = None
         return self._ended(objective, begin)
 
     def resumed(self, objective: Objective, end: SearchEnd) -> SearchEnd:
         """Return the end of a search that goes on from another's."""
-        objective.path = end.trail.p[:-1]
+        objective.origin = end.point
         found = self._ended(objective, end.p)
         found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
         return found
 
     def _ended(self, objective: Objective, begin: FloatArray) -> SearchEnd:
-        return self.method.search(objective, begin, most=self.most, tolerance=self.tolerance)
+        found = self.method.search(objective, begin, most=self.most, tolerance=self.tolerance)
+        found.point = objective.at(found.p, refer=True)
+        return found
 
 
 def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
