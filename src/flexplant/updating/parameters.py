@@ -42,8 +42,8 @@ class Parameter(Value):
 
     name: str
     unit: str
-    bounds: tuple[float, float] | None
-    prior: tuple[float, float] | None
+    bounds: tuple[float, float] | None = None
+    prior: tuple[float, float] | None = None
 
     @abstractmethod
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:

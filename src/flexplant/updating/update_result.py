@@ -273,7 +273,7 @@ class UpdateResult(Value):
             lines.append(f"  ... and {len(self.parameters) - 5} more")
         if self.at_bound:
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
-        unused = [q.name for q in self.unknowns if getattr(q, "prior", None) is not None]
+        unused = [q.name for q in self.unknowns if q.prior is not None]
         if unused and self.prior_std is None:
             lines.append(f"  unused priors: {', '.join(unused[:5])}")
         if self.determined is not None:

@@ -164,8 +164,8 @@ def update(
     rng = generator(rng)
     takes_part = flag(prior, "prior")
     rounds = whole(rounds, "rounds")
-    bounded = any(getattr(q, "bounds", None) is not None for q in listed)
-    known = any(getattr(q, "prior", None) is not None for q in listed)
+    bounded = any(q.bounds is not None for q in listed)
+    known = any(q.prior is not None for q in listed)
     # the paper's problem: only eigenvalues, no prior knowledge
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
     if method is None:
@@ -296,7 +296,7 @@ def _result(
 
 def _unused_priors(objective: Objective) -> str:
     """Return a text on unused priors, and the residuals with unknown noise."""
-    named = [q.name for q in objective.parameters if getattr(q, "prior", None) is not None]
+    named = [q.name for q in objective.parameters if q.prior is not None]
     silent = " and ".join(bound.name for bound in objective.bounds if not bound.noisy)
     return (
         f"the priors of {some_names(named)} are not used: their weight relative to {silent}, "
@@ -372,9 +372,9 @@ def corrected(
             full.values(there, prior=False) - objective.values(point, prior=False),
             full.slopes(there, prior=False) - objective.slopes(point, prior=False),
         )
-        # terms that depend on the start are set again; modes keep their numbers
-        drawn = search.method.penalised
-        end = search.begun(objective, first) if drawn else search.resumed(objective, end)
+        # the end of a penalised search depends on its start
+        again = search.method.penalised
+        end = search.begun(objective, first) if again else search.resumed(objective, end)
         estimates.append(end.p)
         if normalised_step(objective, end.p, estimates[-2]) < CLOSE:
             break

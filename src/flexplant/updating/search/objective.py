@@ -30,13 +30,6 @@ class Defect(NamedTuple):
     slopes: FloatArray
 
 
-class PriorRows(NamedTuple):
-    """Residuals ``weight (p - middle)`` in addition to those of the data: a prior, or a penalty."""
-
-    middle: FloatArray
-    weight: FloatArray  # (m, q)
-
-
 class Objective:
     """``1/2 |r(p)|^2`` with r the whitened residuals and ``(p - mean) / std`` of the priors.
 
@@ -64,17 +57,14 @@ class Objective:
         self.bounds = [residual.bound(family) for residual in self.residuals]
         self.numbers = tuple(dict.fromkeys(n for b in self.bounds for n in b.numbers))
         self.noisy = all(bound.noisy for bound in self.bounds)
-        priors = [getattr(q, "prior", None) or _from_bounds(q) for q in parameters]
+        priors = [q.prior or _from_bounds(q) for q in parameters]
         self.has_prior = np.array([known is not None for known in priors])
         self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
         self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
-        #: terms that attract the result: the priors, and terms that a search adds
-        self.drawn: list[PriorRows] = []
-        if self.uses_prior:
-            pull = -np.diag(1 / self.prior_std)[self.has_prior]
-            self.drawn.append(PriorRows(self.prior_mean, pull))
-        limits = [getattr(q, "bounds", None) or (-np.inf, np.inf) for q in parameters]
+        #: derivatives (m, q) of the residuals of the priors that are used
+        self.pull = -np.diag(1 / self.prior_std)[self.has_prior & self.uses_prior]
+        limits = [q.bounds or (-np.inf, np.inf) for q in parameters]
         self.lower = np.array([low for low, _ in limits], dtype=np.float64)
         self.upper = np.array([high for _, high in limits], dtype=np.float64)
         poles = [bound for bound in self.bounds if isinstance(bound, BoundEigenvalues)]
@@ -147,13 +137,13 @@ class Objective:
         return point
 
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
-        """Return the residuals, then those of the priors and a penalty."""
+        """Return the residuals, then those of the priors."""
         rows = [bound.values(point) for bound in self.bounds]
         if self.defect is not None:
             moved = self.defect.slopes @ (point.p - self.defect.p)
             rows = [np.concatenate(rows) + self.defect.values + moved]
         if prior:
-            rows += [one.weight @ (point.p - one.middle) for one in self.drawn]
+            rows.append(self.pull @ (point.p - self.prior_mean))
         return np.concatenate(rows)
 
     def slopes(self, point: Point, *, prior: bool = True) -> FloatArray:
@@ -162,15 +152,13 @@ class Objective:
         if self.defect is not None:
             rows = [np.vstack(rows) + self.defect.slopes]
         if prior:
-            rows += [one.weight for one in self.drawn]
+            rows.append(self.pull)
         return np.vstack(rows)
 
     def size(self, point: Point) -> FloatArray:
         """Return the measured value in units of each row of `values`."""
         rows = [np.broadcast_to(b.size, b.values(point).shape) for b in self.bounds]
-        if self.uses_prior:
-            rows.append(np.ones(int(self.has_prior.sum())))
-        return np.concatenate(rows)
+        return np.concatenate([*rows, np.ones(len(self.pull))])
 
     @property
     def noise_known(self) -> bool:
@@ -213,7 +201,7 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
 
 
 def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
-    low, high = getattr(parameter, "bounds", None) or (-np.inf, np.inf)
+    low, high = parameter.bounds or (-np.inf, np.inf)
     if not np.isfinite(high - low):
         return None
     mean = float(np.clip(0.0, low, high))
