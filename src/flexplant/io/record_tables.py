@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from ..arrays import FloatArray
 from ..errors import FlexplantError, ModelError
 from ..tolerances import NEGLIGIBLE
 from .files import damaged, decimal, numbers_of_lines, refused, text_of, unread, wrong_line_of
-from .record_channels import RecordedChannels
 from .unit_labels import plain_label, seconds_of, unit_of
 
 _TIME = {"time", "t", "zeit", "seconds", "sec", "x_value", "x-value", "timestamp", "elapsed time"}
@@ -25,6 +25,16 @@ _RATE = re.compile(
 #: ratio of a step to the usual step above which samples are missing; rounding of the times to two
 #: digits gives ratios up to 1.5
 _GAP = 1.75
+
+
+class RecordedChannels(NamedTuple):
+    """Names, labels of units and data (n, n_time) of each run; the rate where the file says it."""
+
+    names: list[str]
+    labels: list[str]
+    runs: list[FloatArray]
+    rate: float | None
+    start: float = 0.0
 
 
 def read_table_records(path: Path) -> RecordedChannels:

@@ -11,8 +11,7 @@ from ..arrays import positive
 from ..errors import FlexplantError
 from ..simulation import Response
 from .files import file_path, refused, unread
-from .record_channels import RecordedChannels
-from .record_tables import read_lvm, read_table_records
+from .record_tables import RecordedChannels, read_lvm, read_table_records
 from .uff_times import UNIVERSAL, read_uff_records
 from .unit_labels import unit_of
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import FloatArray, positive
 from ..loop import Spectrum
 from .files import file_path, refused, unread
-from .record_channels import RecordedChannels
+from .record_tables import RecordedChannels
 from .uff_records import KINDS, channel_of, channel_order, datasets, unit_text, whole_entry
 from .uff_systems import is_permutation, turning, uff_nodes
 from .unit_labels import density_of

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import ComplexArray, FloatArray, divisor
+from ..arrays import CACHED, ComplexArray, FloatArray, divisor
 from ..errors import ModelError, SolverError
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
-from ..sparse.symmetric import beyond, dense
+from ..sparse.symmetric import beyond, dense, projected
 from ..structure import Damping, FEModel, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
 from ..tolerances import CLOSE, MISSED, MOST_STEPS, NULL, SAME, SETTLED, SPLIT, TINY, TYPED
@@ -23,8 +23,6 @@ from .statics import StiffnessFactor, dissection_of, held_factor, static_respons
 
 #: number of loads above which the second static response of each load is left out
 _MANY = 30
-#: number of frequencies solved together, and number of entries of their matrices
-_CHUNK, _ENTRIES = 256, 4_000_000
 #: fraction of the remaining loads (root of their energy) that may remain after a correction; the
 #: error of a Galerkin response is its square
 _LEFT = 0.2
@@ -114,9 +112,8 @@ class DynamicBasis:
     def _answered(self, freq: FloatArray, left: FloatArray, right: FloatArray) -> ComplexArray:
         """Return responses (n_freq, p, q) of rows (p, k) to forces (k, q), all in coordinates."""
         found = np.zeros((freq.size, left.shape[0], right.shape[1]), dtype=np.complex128)
-        chunk = _CHUNK
-        if self._coupled:
-            chunk = max(1, min(chunk, _ENTRIES // self.squares.size**2))
+        k = self.squares.size
+        chunk = max(1, CACHED // (k**2 if self._coupled else k))
         for begin in range(0, freq.size, chunk):
             part = slice(begin, begin + chunk)
             omega = 2 * np.pi * freq[part, None]
@@ -132,7 +129,7 @@ class DynamicBasis:
                 found[part] = (left * (1 / main)[:, None]) @ right
                 continue
             whole = 1j * (omega[:, :, None] * self._C + np.diag(self._loss))
-            at = np.arange(self.squares.size)
+            at = np.arange(k)
             whole[:, at, at] = main
             found[part] = left @ np.linalg.solve(whole, right[None].astype(np.complex128))
         return found
@@ -189,7 +186,8 @@ class DynamicBasis:
         stiff = 1 + 1j * (law.eta + omega * law.b)
         matrix: Any = K * stiff - (omega**2 - 1j * omega * law.a) * M
         if law.D is not None:
-            matrix = matrix + 1j * omega * _as_like(law.D, matrix)
+            like = sp.issparse(matrix) == sp.issparse(law.D)
+            matrix = matrix + 1j * omega * (law.D if like else dense(law.D))
         chosen = np.flatnonzero(law.own)
         U = self._inertia[:, chosen]
         size: ComplexArray = np.asarray(1j * omega * law.own[chosen], dtype=np.complex128)
@@ -198,7 +196,8 @@ class DynamicBasis:
             order = dissection_of(model) if law.D is None else None
             solve = _with_rank(ComplexSymmetricFactor(matrix, order).solve, U, size)
         else:
-            full = _dense_complex(matrix) + (U * size) @ U.T
+            matrix = matrix.toarray() if hasattr(matrix, "toarray") else matrix
+            full = np.asarray(matrix + (U * size) @ U.T, dtype=np.complex128)
             scale = 1.0 / np.sqrt(np.abs(np.diag(full)))[:, None]
             lu = la.lu_factor(full * scale * scale.T)
             matrix, U, size = full, U[:, :0], size[:0]
@@ -295,8 +294,7 @@ def _diagonalise_shapes(model: FEModel, shapes: FloatArray) -> tuple[FloatArray,
     """Return M-orthonormal shapes that are orthogonal in K too, and their omega^2."""
     if not shapes.shape[1]:
         return shapes, np.zeros(0)
-    inner = shapes.T @ np.asarray(model.K @ shapes)
-    squares, mix = la.eigh((inner + inner.T) / 2)
+    squares, mix = la.eigh(projected(model.K, shapes))
     return shapes @ mix, squares
 
 
@@ -312,15 +310,6 @@ def _with_rank(solve: Any, U: FloatArray, size: ComplexArray) -> Any:
         return found - moved @ la.lu_solve(small, U.T @ found)
 
     return both
-
-
-def _as_like(D: Any, matrix: Any) -> Any:
-    return D if sp.issparse(matrix) == sp.issparse(D) else dense(D)
-
-
-def _dense_complex(matrix: Any) -> ComplexArray:
-    full: Any = matrix.toarray() if hasattr(matrix, "toarray") else matrix
-    return np.asarray(full, dtype=np.complex128)
 
 
 #: fraction of the responses of its places to their own forces below which the peak of a channel

@@ -135,7 +135,10 @@ def pair_modes(
     for members in spans:
         if members.size > 1:
             found = np.sort(partner[members][partner[members] >= 0])
-            holders = _holders(alike[np.ix_(members, found)])
+            # all by rising frequency, else by MAC
+            holders = np.arange(members.size)
+            if found.size < members.size:
+                holders = assigned(-alike[np.ix_(members, found)].T)
             partner[members], mac[members] = -1, 0.0
             partner[members[holders]] = found
             mac[members[holders]] = _cosines(
@@ -164,13 +167,6 @@ def _orthonormal_map(gram: Any) -> Any:
     values, vectors = la.eigh(gram)
     kept = values > ROUNDING * values[-1]
     return vectors[:, kept] / np.sqrt(values[kept])
-
-
-def _holders(alike: FloatArray) -> IntArray:
-    """Return which members of a cluster hold its partners: all by rising frequency, else by MAC."""
-    if alike.shape[0] == alike.shape[1]:
-        return np.arange(alike.shape[0])
-    return assigned(-alike.T)
 
 
 def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:

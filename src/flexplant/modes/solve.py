@@ -25,6 +25,7 @@ from ..sparse.symmetric import (
     column_groups,
     dense,
     diagonal,
+    projected,
     rounding_of,
     width_of,
 )
@@ -482,18 +483,13 @@ def damped_modes(
 def _ritz(
     model: FEModel, V: FloatArray, r: int, count: int, top: float
 ) -> tuple[NormalForm, np.ndarray]:
-    M, D, K = (_projected(part, V) for part in (model.M, model.D, model.K))
+    M, D, K = (projected(part, V) for part in (model.M, model.D, model.K))
     # rounding of stiff shapes would act as a spring on rigid-body motions
     K[:r], K[:, :r] = 0.0, 0.0
     rigid = np.eye(V.shape[1], r)
     body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
     form = normal_form(M, D, K, rigid, lambda: body, lowest=max(count - r, 0))
     return form, np.flatnonzero(signed_square(form.omega) <= top)[:count]
-
-
-def _projected(matrix: Any, V: FloatArray) -> FloatArray:
-    product = V.T @ np.asarray(matrix @ V)
-    return np.asarray(0.5 * (product + product.T))
 
 
 def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> Modes:

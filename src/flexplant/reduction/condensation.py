@@ -13,7 +13,7 @@ from ..arrays import FloatArray, IntArray, positive, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
-from ..sparse.symmetric import dense, unit_diagonal
+from ..sparse.symmetric import dense, projected, unit_diagonal
 from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
@@ -23,7 +23,6 @@ from .methods import (
     Solver,
     block,
     fe_model,
-    inner,
     labels_given,
     projected_model,
     refused_partition,
@@ -202,7 +201,7 @@ class Irs(ReductionMethod):
         done = 0
         while done < self.iterations:
             done += 1
-            M, K = inner(model.M, T), inner(model.K, T)
+            M, K = projected(model.M, T), projected(model.K, T)
             rates, squares = _rates(M, K)
             inertia = np.asarray(model.M @ T)[part.others] @ rates
             # rigid-body motions have zero frequency, without rounding of K
@@ -425,7 +424,7 @@ class _FreeInterface(ReductionMethod):
         elif model.D is None:
             D = np.zeros_like(M)
         else:
-            D = inner(model.D, np.real(modes.basis)) * np.outer(light, light)
+            D = projected(model.D, np.real(modes.basis)) * np.outer(light, light)
             D = back.T @ D @ back
         rigid = np.zeros((light.size, r))
         rigid[:b], rigid[b : b + r] = np.real(modes.phi)[model.dofs.indices(labels), :r], np.eye(r)

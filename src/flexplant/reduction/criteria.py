@@ -74,10 +74,7 @@ class PivotedQr(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
-
-        Positions count from 0. The rows of the array `required` are chosen already.
-        """
+        """Return the positions of the chosen rows; see `SelectionCriterion.chosen`."""
         if not count:
             return []
         if required.shape[0]:
@@ -117,10 +114,7 @@ class EffectiveIndependence(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
-
-        Positions count from 0. The rows of the array `required` are chosen already.
-        """
+        """Return the positions of the chosen rows; see `SelectionCriterion.chosen`."""
         if not count:
             return []
         fixed, p = required.shape[0], pool.shape[0]
@@ -181,10 +175,7 @@ class Greedy(SelectionCriterion):
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
-        """Return the positions of `count` rows of the array `pool` that this criterion chooses.
-
-        Positions count from 0. The rows of the array `required` are chosen already.
-        """
+        """Return the positions of the chosen rows; see `SelectionCriterion.chosen`."""
         taken: Any = np.array(required)
         free = np.ones(pool.shape[0], dtype=bool)
         found: list[int] = []

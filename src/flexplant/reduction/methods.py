@@ -19,7 +19,7 @@ from ..modes.solve import solve_modes
 from ..modes.statics import places
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
-from ..sparse.symmetric import dense, unit_diagonal
+from ..sparse.symmetric import dense, projected, unit_diagonal
 from ..store import Value, checked
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
@@ -94,12 +94,6 @@ def block(matrix: Matrix, rows: Any, columns: Any) -> Any:
     return np.asarray(matrix)[np.ix_(rows, columns)]
 
 
-def inner(matrix: Matrix, T: FloatArray) -> FloatArray:
-    """Return ``T^T A T``, exactly symmetric."""
-    product = T.T @ np.asarray(matrix @ T)
-    return np.asarray(0.5 * (product + product.T), dtype=np.float64)
-
-
 def projected_model(
     model: FEModel,
     T: FloatArray,
@@ -161,7 +155,7 @@ def projected_model(
     >>> fx.reduction.projected_model(model, np.eye(3), dofs=model.dofs, method="none").M.diagonal()
     array([1., 1., 1.])
     """
-    M, K = inner(model.M, T), inner(model.K, T)
+    M, K = projected(model.M, T), projected(model.K, T)
     scaled, scale = unit_diagonal(M)
     values = la.eigvalsh(dense(scaled))
     if not values[0] > RANK * values[-1]:
@@ -184,9 +178,9 @@ def projected_model(
         omega, phi = elastic_modes(M, K, rigid)
         omega, phi = np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
         zeta = damping.zeta(omega)
-        D = inner(np.diag(2 * zeta * omega), (M @ phi).T)
+        D = projected(np.diag(2 * zeta * omega), (M @ phi).T)
     else:
-        D = np.zeros_like(M) if model.D is None else inner(model.D, T)
+        D = np.zeros_like(M) if model.D is None else projected(model.D, T)
     return ReducedModel(
         M=M,
         D=D,

@@ -18,7 +18,7 @@ from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_re
 from ..modes.normal_forms import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
-from ..sparse.symmetric import orthonormalised
+from ..sparse.symmetric import orthonormalised, projected
 from ..store import Value, checked
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
@@ -444,5 +444,4 @@ def static_followers(
     flexibility, follow = np.zeros((k, k)), np.eye(k)[:, heavy]
     flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
     follow[light] = -inverse @ K[np.ix_(light, heavy)]
-    left = follow.T @ K @ follow
-    return heavy, follow, flexibility, np.asarray(0.5 * (left + left.T), dtype=np.float64)
+    return heavy, follow, flexibility, projected(K, follow)

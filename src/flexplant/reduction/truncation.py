@@ -15,11 +15,12 @@ from ..labels import Place
 from ..modes.modes import Modes, require_real
 from ..modes.solve import solve_modes
 from ..modes.statics import attachment_vectors, labels_of, places, static_response
+from ..sparse.symmetric import projected
 from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
 from .condensation import kept_columns, mode_numbers
-from .methods import ReductionMethod, inner
+from .methods import ReductionMethod
 from .ranking import ErrorBound, modal_channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
@@ -125,7 +126,7 @@ class ModalTruncation(ReductionMethod):
         bound = self._bound(model, kept) if self.inputs else None
         found = _modal_model(kept, numbers, "modal truncation", bound)
         if law is None and model.D is not None:
-            found = found.replace(D=inner(model.D, found.T))
+            found = found.replace(D=projected(model.D, found.T))
         return found
 
     def _bound(self, model: FEModel, kept: Modes) -> ErrorBound | None:

@@ -87,7 +87,7 @@ class BlockLanczos:
         self._T = np.zeros((0, 0))
         self.steps = 0
         known = np.zeros((n, 0)) if start is None else start[:, : self._block // 2]
-        first = np.hstack([known, self._random(self._block - known.shape[1])])
+        first = np.hstack([known, self._rng.standard_normal((n, self._block - known.shape[1]))])
         self._next, self._loaded, _ = self._orthonormal(first)
         self._over = np.zeros((self._next.shape[1], 0))
 
@@ -161,9 +161,6 @@ class BlockLanczos:
             f"Lanczos did not converge for {counted(count, 'mode')} in {self.steps} steps: M and K "
             "are badly conditioned. Look for DOFs with next to no mass, or request fewer modes."
         )
-
-    def _random(self, columns: int) -> FloatArray:
-        return self._rng.standard_normal((self._V.shape[1], columns))
 
     def _shapes(self, mix: FloatArray) -> FloatArray:
         return self._V[self._r : self._r + self._m].T @ mix

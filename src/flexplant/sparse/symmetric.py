@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, divisor
+from ..arrays import COLUMNS, FloatArray, Matrix, divisor
 from ..errors import ModelError
 from ..tolerances import NEGLIGIBLE, NULL, PRECISION, RANK, SAME, SPLIT
 
@@ -49,11 +49,12 @@ def by_rows(matrix: Any) -> Any:
 def same_pattern(given: Any, other: Any) -> bool:
     """Return whether the same entries of two sparse matrices are stored."""
     pairs = ((given.indptr, other.indptr), (given.indices, other.indices))
-    return all(a.size == b.size and (_same_memory(a, b) or np.array_equal(a, b)) for a, b in pairs)
-
-
-def _same_memory(a: IntArray, b: IntArray) -> bool:
-    return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
+    # arrays in one place in memory need no comparison
+    return all(
+        a.size == b.size
+        and ((a.dtype == b.dtype and a.ctypes.data == b.ctypes.data) or np.array_equal(a, b))
+        for a, b in pairs
+    )
 
 
 def with_pattern_of(given: Any, other: Matrix) -> Any:
@@ -82,6 +83,12 @@ def matrix_sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
     if sp.issparse(matrix):
         return sp.csc_array(matrix + sp.csc_array(change))
     return np.asarray(matrix + change, dtype=np.float64)
+
+
+def projected(matrix: Any, V: FloatArray) -> FloatArray:
+    """Return ``V^T A V``, exactly symmetric."""
+    product = V.T @ np.asarray(matrix @ V)
+    return np.asarray(0.5 * (product + product.T), dtype=np.float64)
 
 
 def diagonal(matrix: Matrix) -> FloatArray:

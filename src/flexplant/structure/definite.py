@@ -18,6 +18,7 @@ from ..sparse.symmetric import (
     by_rows,
     dense,
     diagonal,
+    projected,
     rayleigh_ritz,
     rounding_of,
     soft_group,
@@ -222,8 +223,7 @@ def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:
     # motion; they lie above them (Rayleigh, Courant)
     if not motions.shape[1]:
         return np.zeros(0)
-    energy = motions.T @ np.asarray(by_rows(K) @ motions)
-    values = np.linalg.eigvalsh(0.5 * (energy + energy.T))
+    values = np.linalg.eigvalsh(projected(by_rows(K), motions))
     return np.asarray(values[values < -10.0 * rounding_of(K, motions).max()])
 
 

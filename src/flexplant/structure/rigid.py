@@ -23,6 +23,7 @@ from ..sparse.symmetric import (
     dense,
     diagonal,
     orthonormalised,
+    projected,
     unit_diagonal,
 )
 from ..tolerances import CLOSE, NEGLIGIBLE, NULL, PRECISION, RESIDUAL, ROUNDING, TYPED
@@ -368,8 +369,7 @@ def _null_vectors(
             found = orthonormalised(M, np.asarray(solve(np.asarray(M @ found))))
     except SolverError:
         return basis  # K is indefinite, which the mode solver reports
-    energy = np.asarray(found.T @ np.asarray(K @ found))
-    values, mix = la.eigh(0.5 * (energy + energy.T))
+    values, mix = la.eigh(projected(K, found))
     null = found @ mix[:, np.abs(values) < rounding * spread]
     # the geometry's own motions, seen in the null space: what turns stays a turn about its axis
     for candidates in (motions, nearly):

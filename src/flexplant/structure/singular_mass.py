@@ -13,7 +13,7 @@ import scipy.sparse.csgraph as csgraph
 from ..arrays import COLUMNS, FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import LARGEST_FULL, is_positive_definite, symmetric_lu
-from ..sparse.symmetric import dense, diagonal, unit_diagonal
+from ..sparse.symmetric import dense, diagonal, projected, unit_diagonal
 from ..tolerances import NULL, ROUNDING
 
 
@@ -92,11 +92,7 @@ def condense_massless(
     T[m, np.arange(m.size)] = 1.0
     T[s] = -np.linalg.solve(pivot, forces[:, m]) / weight[:, None]
 
-    def reduced(A: Any) -> FloatArray:
-        part = T.T @ np.asarray(A @ T)
-        return np.asarray(0.5 * (part + part.T))
-
-    return reduced(K), reduced(M), None if D is None else reduced(D), m
+    return projected(K, T), projected(M, T), None if D is None else projected(D, T), m
 
 
 class Inertial(NamedTuple):

@@ -14,7 +14,7 @@ from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
 from ..modes.matching import pair
 from ..reduction import ReducedModel
-from ..sparse.symmetric import beyond
+from ..sparse.symmetric import beyond, projected
 from ..structure.model import FEModel
 from .family import Point, changed_matrices
 from .parameters import Parameter, PointParameter
@@ -73,18 +73,17 @@ class FullBasis:
     def at(self, p: FloatArray) -> ReducedModel:
         """Return the full model with zero parameters, in the basis that is accurate at `p`."""
         full, V = self.full, self._basis(p)
-        M, K = (np.asarray(V.T @ (part @ V)) for part in (full.M, full.K))
-        D = np.zeros_like(M)
+        D = np.zeros((V.shape[1], V.shape[1]))
         if full.D is not None:
-            D = np.asarray(V.T @ (full.D @ V))
+            D = projected(full.D, V)
         elif self.reduced is not None:
             known = la.lstsq(self.reduced.M, self.reduced.T.T @ np.asarray(full.M @ V))[0]
-            D = known.T @ self.reduced.D @ known
+            D = projected(self.reduced.D, known)
         rigid = V.T @ np.asarray(full.M @ full.rigid_body)
         return ReducedModel(
-            M=(M + M.T) / 2,
-            D=(D + D.T) / 2,
-            K=(K + K.T) / 2,
+            M=projected(full.M, V),
+            D=D,
+            K=projected(full.K, V),
             T=V,
             dofs=full.dofs.select(()),
             full_dofs=full.dofs,

@@ -17,7 +17,7 @@ from ..errors import LabelError, ModelError, ShapeError, short
 from ..modes import solve_modes
 from ..reduction import ReducedModel
 from ..sparse.factor import DENSE_LIMIT, LARGEST_FULL
-from ..sparse.symmetric import dense
+from ..sparse.symmetric import dense, projected
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
 from ..tolerances import SAME, TYPED
@@ -315,8 +315,7 @@ def _projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | No
             f"{name} has matrices of {part.shape[0]} DOFs; the model has {k}, its full "
             f"structure {n}."
         )
-    product = np.asarray(model.T.T @ (part @ model.T), dtype=np.float64)
-    return (product + product.T) / 2
+    return projected(part, model.T)
 
 
 def _check_comparable(models: Sequence[Any], name: str) -> None:

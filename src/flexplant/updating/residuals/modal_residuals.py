@@ -148,11 +148,7 @@ class Eigenvalues(_ModalResidual):
         return self.replace(measured=chosen, weights=weights)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters.
-
-        The argument `family` is this model with its parameters. The result computes the values of
-        the residual and their derivatives; see `Bound`.
-        """
+        """Return the residual as `update` uses it; see `Residual.bound`."""
         return BoundEigenvalues(self)
 
 
@@ -324,11 +320,7 @@ class ModeShapes(_ModalResidual):
         return self.replace(measured=chosen, shapes=shapes, std=std, covariance=covariance)
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters.
-
-        The argument `family` is this model with its parameters. The result computes the values of
-        the residual and their derivatives; see `Bound`.
-        """
+        """Return the residual as `update` uses it; see `Residual.bound`."""
         return BoundShapes(self, family)
 
 
@@ -525,11 +517,7 @@ class ShapeCorrelation(ModeShapes):
     """
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters.
-
-        The argument `family` is this model with its parameters. The result computes the values of
-        the residual and their derivatives; see `Bound`.
-        """
+        """Return the residual as `update` uses it; see `Residual.bound`."""
         return _BoundMac(self, family)
 
 

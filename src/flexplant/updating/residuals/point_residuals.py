@@ -116,11 +116,7 @@ class Antiresonances(_PointResidual):
         return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters.
-
-        The argument `family` is this model with its parameters. The result computes the values of
-        the residual and their derivatives; see `Bound`.
-        """
+        """Return the residual as `update` uses it; see `Residual.bound`."""
         return _BoundZeros(self, family)
 
 
@@ -242,11 +238,7 @@ class StaticCompliance(_PointResidual):
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
 
     def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it, for one model with its parameters.
-
-        The argument `family` is this model with its parameters. The result computes the values of
-        the residual and their derivatives; see `Bound`.
-        """
+        """Return the residual as `update` uses it; see `Residual.bound`."""
         return _BoundStatic(self, family)
 
 
