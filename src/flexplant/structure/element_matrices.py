@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
+from .grids import corners
 
 # the plate's twelve terms x^p y^q, in coordinates from 0 to 1 over the element: the full cubic, and
 # x^3 y, x y^3
 _TERMS = [(n - q, q) for n in range(4) for q in range(n + 1)] + [(3, 1), (1, 3)]
 _P, _Q = np.transpose(_TERMS)
-#: corners of a plate element and of a brick, x fastest
-PLATE_CORNERS = np.fliplr(list(np.ndindex(2, 2)))
-BRICK_CORNERS = np.fliplr(list(np.ndindex(2, 2, 2)))
 
 
 def beam_stiffness(length: float) -> FloatArray:
@@ -95,7 +93,7 @@ def _monomials(power: IntArray, x: Any, order: int) -> FloatArray:
 def _unit_coefficients() -> FloatArray:
     """Return the polynomial coefficients (12, 12) of unit DOFs z, dz/dt, -dz/ds at the corners."""
     rows = []
-    for s, t in PLATE_CORNERS.astype(float):
+    for s, t in corners(2).astype(float):
         rows += [thin_terms(s, t, 0, 0), thin_terms(s, t, 0, 1), -thin_terms(s, t, 1, 0)]
     return np.round(np.linalg.inv(np.array(rows)), 6)  # small integers
 
@@ -142,15 +140,15 @@ def plate_stiffness(a: float, b: float) -> tuple[FloatArray, FloatArray]:
 def brick_shape(points: FloatArray) -> FloatArray:
     """Return the weights (..., 11) of corners and parabolas at points (..., 3) of the unit cube."""
     place = points[..., None, :]
-    corners = np.prod(np.where(BRICK_CORNERS, place, 1 - place), axis=-1)
-    return np.concatenate([corners, 4 * points * (1 - points)], axis=-1)
+    weights = np.prod(np.where(corners(3), place, 1 - place), axis=-1)
+    return np.concatenate([weights, 4 * points * (1 - points)], axis=-1)
 
 
 def brick_slopes(points: FloatArray) -> FloatArray:
     """Return the derivatives (..., 11, 3) of these weights along the three unit coordinates."""
     place = points[..., None, :]
-    parts = np.where(BRICK_CORNERS, place, 1 - place)
-    signs = np.where(BRICK_CORNERS, 1.0, -1.0)
+    parts = np.where(corners(3), place, 1 - place)
+    signs = np.where(corners(3), 1.0, -1.0)
     found = [signs[:, k] * np.delete(parts, k, -1).prod(axis=-1) for k in range(3)]
     return np.concatenate([np.stack(found, axis=-1), (4 - 8 * place) * np.eye(3)], axis=-2)
 

@@ -6,7 +6,7 @@ import functools
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
 from typing import Any, ClassVar, TypeAlias
 
@@ -24,6 +24,12 @@ Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]
 
 #: largest number of elements along one axis that a machine model may have
 MOST = 10**6
+
+
+@cache
+def corners(ndim: int) -> IntArray:
+    """Return the corners (2^d, d) of an element, x fastest."""
+    return np.fliplr(list(np.ndindex((2,) * ndim)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +81,12 @@ class Grid:
         """Number of DOFs."""
         return self.per_node * self.nodes.size
 
-    @cached_property
-    def corners(self) -> IntArray:
-        """The corners (2^d, d) of an element, x fastest."""
-        return np.array([c[::-1] for c in product((0, 1), repeat=self._ndim)])
-
     def _corner_values(self, values: Any) -> Any:
         """Return (n_grid, 2^d): the value of the element in which a node is corner c; 0 outside."""
         padded = np.pad(np.asarray(values), 1)
         shape = tuple(n + 1 for n in self.counts[::-1])
         found = np.empty((self.n_grid, 2**self._ndim), dtype=padded.dtype)
-        for c, corner in enumerate(self.corners):
+        for c, corner in enumerate(corners(self._ndim)):
             window = tuple(
                 slice(1 - o, 1 - o + n) for o, n in zip(corner[::-1], shape, strict=True)
             )
@@ -95,7 +96,7 @@ class Grid:
     @cached_property
     def _offsets(self) -> IntArray:
         """Which neighbour (2^d, 2^d) corner e of an element is, seen from its corner c."""
-        steps = self.corners[None, :] - self.corners[:, None] + 1
+        steps = corners(self._ndim)[None, :] - corners(self._ndim)[:, None] + 1
         return np.asarray(steps @ 3 ** np.arange(self._ndim))
 
     @cached_property
@@ -236,7 +237,7 @@ class Grid:
     def rows(self, element: IntArray, weights: FloatArray) -> FloatArray:
         """Return the rows (p, n) of the weights of elements (p, d), corners in order."""
         f = self.per_node
-        nodes = self.rank[(element[:, None] + self.corners) @ self._strides]
+        nodes = self.rank[(element[:, None] + corners(self._ndim)) @ self._strides]
         found = np.zeros((len(element), self.n_dof))
         columns = (f * nodes[:, :, None] + np.arange(f)).reshape(weights.shape)
         found[np.arange(len(element))[:, None], columns] = weights

@@ -12,15 +12,8 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive
 from ..errors import LabelError
-from .element_matrices import (
-    PLATE_CORNERS,
-    POINTS,
-    plate_mass,
-    plate_stiffness,
-    thin_coefficients,
-    thin_terms,
-)
-from .grids import Field, Grid, GridShape, grid_of
+from .element_matrices import POINTS, plate_mass, plate_stiffness, thin_coefficients, thin_terms
+from .grids import Field, Grid, GridShape, corners, grid_of
 from .model import FEModel
 
 # The shear of an edge is constant and the slope of the section along it quadratic: between ends
@@ -74,7 +67,7 @@ def plate_parts(s: Any, t: Any, a: float, b: float) -> PlateParts:
     slopes, bends, shears = [], [], []
     for axis in range(2):
         # the two edges along an axis, by their corners; the DOF of their slope and its sign
-        edges = [(i, i + 1 + axis) for i in np.flatnonzero(PLATE_CORNERS[:, axis] == 0).tolist()]
+        edges = [(i, i + 1 + axis) for i in np.flatnonzero(corners(2)[:, axis] == 0).tolist()]
         column, sign = 2 - axis, 2.0 * axis - 1.0
         x, length, other, blend = place[axis], lengths[axis], 1 - axis, across[axis]
         excess, turn = _edge_rows(edges, column, sign, length)
