@@ -225,7 +225,7 @@ def _broken(path: str, at: int, name: str) -> FlexplantError:
 
 
 #: number of digits of single precision (types 1 and 3), even if more are printed
-_SINGLE = 7
+_SINGLE: Any = digits_of(np.float32())
 _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
 

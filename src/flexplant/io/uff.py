@@ -31,7 +31,6 @@ from .uff_records import (
     paired_records,
     record_scale,
     record_sides,
-    rotation_units,
     whole_entry,
 )
 from .uff_systems import is_permutation, turning, uff_nodes
@@ -184,7 +183,7 @@ def _in_global_directions(frf: Frf, path: str | Path) -> Frf:
         data=np.einsum("ab,bcf,dc->adf", left, frf.data, right)[pick],
         outputs=outputs,
         inputs=inputs,
-        units=rotation_units(outputs, inputs, frf.quantity),
+        units={},
         coherence=None if coherence is None else coherence[pick],
     )
 

@@ -14,7 +14,7 @@ from ..labels import DIRECTIONS
 from ..lti.frequency import Frf
 from .coordinate_systems import turned_motions
 from .files import ONCE, damaged, refused, spaced_numbers, unread
-from .uff_records import KINDS, datasets, derivative, rotation_units, whole_entry
+from .uff_records import KINDS, datasets, derivative, whole_entry
 from .uff_systems import UffNodes
 
 #: number of lines of records 1 to 13 in dataset 2414
@@ -26,7 +26,7 @@ _COMPLEX = (5, 6)
 #: codes of analysis types
 NORMAL_MODE, COMPLEX_MODES, FREQUENCY_RESPONSE = 2, (3, 7), 5
 #: code of the result type
-DISPLACEMENT = 8
+DISPLACEMENT = next(code for code, kind in KINDS.items() if kind == "displacement")
 
 
 class AnalysisData(NamedTuple):
@@ -218,7 +218,6 @@ def responses_of_model(
         inputs=[f"load {number}" for number in sets],
         outputs=outputs,
         quantity=quantity or kind,
-        units=rotation_units(outputs, (), quantity or kind),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray
 from ..errors import FlexplantError, ModelError, short
 from ..labels import DIRECTIONS
-from ..lti.frequency import ORDERS, PER_TIME
+from ..lti.frequency import ORDERS
 from ..structure.unit_systems import GRAVITY, POUND
 from .files import damaged, file_path, parsing, refused, unread
 from .triplets import extra_module
@@ -269,17 +269,6 @@ def record_scale(
             "contradict each other. Give the factor to SI: scale=..."
         )
     return to_length / to_force
-
-
-def rotation_units(
-    outputs: Sequence[str], inputs: Sequence[str], quantity: str | None
-) -> dict[str, str]:
-    """Return the units of rotations "41:rz" and moments "u 41:rz"; others are m and N."""
-    if quantity is None:
-        return {}
-    angle = "rad" + PER_TIME[ORDERS[quantity]]
-    units = dict.fromkeys(outputs, angle) | dict.fromkeys(inputs, "N m")
-    return {name: unit for name, unit in units.items() if name.endswith((":rx", ":ry", ":rz"))}
 
 
 def unit_text(part: dict[str, Any], name: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import FloatArray, positive
 from ..loop import Spectrum
+from ..lti.frequency import ORDERS, PER_TIME
 from .files import file_path, refused, unread
 from .record_tables import RecordedChannels
 from .uff_records import KINDS, channel_of, channel_order, datasets, unit_text, whole_entry
@@ -155,7 +156,7 @@ def _label(part: dict[str, Any], path: Path) -> str:
     if float(factors["length"]) != 1.0 or float(factors["force"]) != 1.0:
         what = "holds channels without units, and numbers that are not SI by dataset 164"
         raise unread(path, what, "Export the labels of the units with them.")
-    return {8: "m", 11: "m/s", 12: "m/s^2", _FORCE: "N"}[kind]
+    return "N" if kind == _FORCE else "m" + PER_TIME[ORDERS[KINDS[kind]]]
 
 
 def _even(parts: list[dict[str, Any]], path: Path) -> tuple[float, float, int]:

@@ -63,7 +63,7 @@ def unit_of(text: str) -> tuple[float, str] | None:
     if size is None or not all(found):
         return None
     order = sum(2 if match and match[1] else 1 for match in found)
-    if order > 2:
+    if order >= len(PER_TIME):
         return None
     return size, ("rad" if first in _ANGLES else "m") + PER_TIME[order]
 

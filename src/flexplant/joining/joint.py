@@ -14,7 +14,7 @@ from ..errors import LabelError, ModelError, require_known, short
 from ..labels import DIRECTIONS, DofSet
 from ..store import Value
 from ..structure.rigid import rigid_motions
-from ..tolerances import ROOT, SAME
+from ..tolerances import FOUR_DIGITS, ROOT, SAME
 from ..words import instance, name_list
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
@@ -295,7 +295,7 @@ def mean_motions(
 
 #: largest lever arm, relative to the size, at which a node without rotations uses that of its
 #: neighbours
-_SHORT_ARM, _NEIGHBOURS = 1e-4, 12
+_SHORT_ARM, _NEIGHBOURS = FOUR_DIGITS, 12
 
 
 class JointEnd:

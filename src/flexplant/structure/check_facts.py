@@ -10,8 +10,9 @@ import scipy.sparse as sp
 
 from ..arrays import FloatArray, IntArray, divisor
 from ..errors import ModelError, SolverError
+from ..labels import DIRECTIONS
 from ..sparse.factor import is_positive_definite
-from ..sparse.lowest import MOST_ZEROS, Lowest, lowest_modes
+from ..sparse.lowest import EXTRA, MOST_ZEROS, Lowest, lowest_modes
 from ..sparse.symmetric import ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
 from ..tolerances import NEGLIGIBLE, PRECISION, RESIDUAL, SAME
 from .definite import are_rigid, are_swapped, unstable_stiffness
@@ -20,9 +21,6 @@ from .model import FEModel
 from .rigid import RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy_motions import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
-
-#: number of modes requested from the solver: six rigid-body motions and some elastic modes
-_MODES, _FEW = 10, 4
 
 
 @dataclass(frozen=True)
@@ -276,13 +274,14 @@ def _try_lowest_modes(
     if not whole:
         kept_K, kept_M = (A[there][:, there] for A in (kept_K, kept_M))
     try:
-        known = None
+        known, rigid = None, len(DIRECTIONS)
         if motions is not None:
             known = orthonormalised(kept_M, motions.rigid[there], dependent="drop")
+            rigid = max(rigid - known.shape[1], 0)
         found = lowest_modes(
             kept_K,
             kept_M,
-            min(_MODES if known is None else max(_MODES - known.shape[1], _FEW), there.size),
+            min(rigid + EXTRA, there.size),
             known=known,
             rounding=rounding,
             nodes=None if given.dofs is None else given.dofs.nodes[there],
