@@ -415,9 +415,10 @@ class FEMatrices(Value):
             held = None if free else ready._held_by_rounding(model)
             if held and model.n_unstable and not is_positive_definite(model.K, SAME):
                 raise ModelError(f"K is not positive semi-definite. {held[0].upper()}{held[1:]}")
-            for said in (endangered(ready.K, ready.M, self.digits), held):
-                if said:
-                    warn(f"{self.source or 'K'}: {said}")
+            # where the entries show their digits, the model has said so
+            found = (endangered(ready.K, ready.M, self.digits), held) if not digits_of(K) else ()
+            for said in filter(None, found):
+                warn(f"{self.source or 'K'}: {said}")
         return model
 
     def freed(self) -> FEMatrices:
