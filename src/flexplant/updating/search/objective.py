@@ -58,7 +58,7 @@ class Objective:
         self.numbers = tuple(dict.fromkeys(n for b in self.bounds for n in b.numbers))
         self.noisy = all(bound.noisy for bound in self.bounds)
         priors = [q.prior or _from_bounds(q) for q in parameters]
-        self.has_prior = np.array([known is not None for known in priors])
+        self.has_prior = np.array([known is not None for known in priors], dtype=bool)
         self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
         self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
