@@ -215,6 +215,8 @@
 .. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
    generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.
 .. [Smith1968] Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
+.. [Smith1970] Smith, Error bounds for zeros of a polynomial based upon Gerschgorin's theorem, J.
+   ACM 17, 1970.
 .. [Stetter1978] Stetter, The defect correction principle and discretization methods, Numer. Math.
    29, 1978.
 .. [Stoorvogel1992] Stoorvogel, The H-infinity Control Problem: A State Space Approach, Prentice

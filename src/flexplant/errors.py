@@ -117,6 +117,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
+def named_modes(numbers: Iterable[int | str]) -> str:
+    """Return modes with their noun: `mode 7`, `modes 7, 8`."""
+    names = [*map(str, numbers)]
+    return f"mode{'s' * (len(names) > 1)} {some_names(names, total=False)}"
+
+
 def some_names(names: Sequence[str], most: int = 6, *, total: bool = True) -> str:
     """Return the first names as text, and, if there are more, the number of all."""
     more = f", ...{f' ({len(names)} in all)' if total else ''}" if len(names) > most else ""

@@ -133,7 +133,7 @@ def as_list(items: Any, name: str, form: str) -> list[Any]:
 
 def name_list(names: Any, name: str) -> tuple[str, ...]:
     """Return names as a tuple of str; one str is one name."""
-    if type(names) is tuple and all(type(one) is str for one in names):
+    if type(names) is tuple and set(map(type, names)) <= {str}:
         return names
     if isinstance(names, str):
         return (names,)

@@ -14,6 +14,7 @@ from flexplant import load
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
 from flexplant.loop import ClosedLoop, bandwidth, close_loop
+from flexplant.loop.broken import moved_poles
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
 from flexplant.synthesis import design_servo
@@ -346,3 +347,23 @@ def test_a_reference_that_nothing_follows_is_named():
     assert "\n  references that no block reads: die:ref" in repr(loop)
     followed = fx.close_loop(plant, fx.design_h2(plant.weighted(z={"u1:effort": 1e-6})))
     assert "no block reads" not in repr(followed)
+
+
+@pytest.mark.filterwarnings("ignore:the closed loop is unstable")
+@pytest.mark.parametrize("dt", [0.0, fx.testbeds.three_masses().dt])
+def test_poles_on_machines_follow_from_those_of_the_loop(dt):
+    """As the eigenvalues, also where a machine is unstable; none is followed to another plant."""
+    plant = fx.testbeds.three_masses()
+    plant = plant if dt else plant.continuous
+    pole = np.exp(-500.0 * dt) if dt else -500.0
+    lead = StateSpace([[pole]], [[1.0]], [[900.0]], [[-2.0]], dt, inputs=["y1"], outputs=["u1"])
+    machines = plant.uncertain(frequency=0.05, damping=0.3).machines.drawn(3, rng=1)
+    for gain in (1e2, 1e6):
+        loop = close_loop(plant, lead.replace(C=gain * lead.C, D=gain * lead.D))
+        for machine in machines:
+            other = loop.around(machine)
+            found, wanted = moved_poles(loop, other), other.poles()
+            apart = np.abs(found[:, None] - wanted) / np.abs(wanted).max()
+            assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-6
+    later = plant.continuous.discretized(1e3, delay=3.0)
+    assert moved_poles(loop, ClosedLoop(later, loop.blocks, loop.controller)) is None

@@ -1,6 +1,7 @@
 """Controllers that tolerate errors of modes, on machines whose modes are off."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import flexplant as fx
 from flexplant.errors import InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
+from flexplant.synthesis.hinf import stage_design
 from flexplant.synthesis.robustness.guarantees import _quick
 from judge import judged
 from plates import make_plate
@@ -132,8 +134,31 @@ def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
     far = small.uncertain(frequency=0.1).machines.drawn(20, rng=1)
     task = "flexplant.synthesis.hinf.stage_design._StageTask.machines"
     monkeypatch.setattr(task, getattr(far, "plants", far))
-    with pytest.raises(InfeasibleError, match="on a machine drawn"):
+    with pytest.raises(InfeasibleError, match=r"on \d+ (of \d+ )?machines drawn"):
         fx.design_stage(uncertain, bandwidth=60.0)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "margin", "those"),
+    [
+        ([0.5] * 100, 0.5, "20 machines"),
+        ([0.5] * 7 + [0.3] + [0.5] * 92, 0.5, "39 of 40 machines"),
+        ([0.3] + [0.5] * 19 + [0.2] + [0.4] * 79, 0.4, "58 of 60 machines"),
+        ([0.5] * 10 + [0.3] * 4 + [0.29] + [0.5] * 85, 0.3, "11 of 15 machines"),
+        ([0.5] * 10 + [0.0] + [0.5] * 89, 0.0, "11 machines"),
+        (([0.3] + [0.5] * 19) * 4 + [0.5] * 20, 0.5, "96 of 100 machines"),
+    ],
+)
+def test_a_machine_that_fails_has_more_drawn(monkeypatch, sizes, margin, those):
+    """One in twenty may keep less than 0.35, and none may be unstable."""
+
+    def looped(known, machine):
+        return SimpleNamespace(broken=SimpleNamespace(margin=lambda scaled: machine))
+
+    monkeypatch.setattr(stage_design, "loop_beside", looped)
+    loop = SimpleNamespace(broken=SimpleNamespace(mixed=tuple))
+    found = stage_design._margins(loop, sizes, 0.35)
+    assert (found.margin, found.those) == (margin, those)
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from ..lti.frequency_sweep import crossings
 from ..plant.machine_plants import FigureInterval, PlantMachines, interval, interval_text
 from ..tolerances import INTERVAL
 from ..words import one_of
-from .broken import axis_sensitivities
+from .broken import axis_sensitivities, moved_poles
 
 #: figures that have an interval in the repr of a loop
 MARGIN, BANDWIDTH, RADIUS = FIGURES = ("modulus margin", "bandwidth", "spectral radius")
@@ -24,7 +24,8 @@ class MachineLoops:
 
     def __init__(self, loop: Any, machines: PlantMachines) -> None:
         self.machines = machines
-        self.loops = [loop.around(loop.plant.around(plant)) for plant in machines.plants]
+        near = loop.completed or loop
+        self.loops = [loop_beside(near, loop.plant.around(plant)) for plant in machines.plants]
         self._found: dict[Any, FloatArray] = {}
 
     @property
@@ -37,6 +38,15 @@ class MachineLoops:
         if figure not in self._found:
             self._found[figure] = np.array([_figure(loop, figure) for loop in self.loops])
         return self._found[figure]
+
+
+def loop_beside(known: Any, plant: Any) -> Any:
+    """Return the loop of a controller around a machine, its poles from a like one's if proven."""
+    loop = known.around(plant)
+    poles = moved_poles(known, loop)
+    if poles is not None:
+        loop.__dict__["_poles"] = poles
+    return loop
 
 
 def first_crossing(

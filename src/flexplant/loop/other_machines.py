@@ -14,7 +14,7 @@ import scipy.linalg as la
 
 from ..arrays import FloatArray, IntArray, positive, real_array
 from ..certificates import Certificate, Verified, one_line, stability_check, stability_name
-from ..errors import AssumptionError, ModelError, aligned, counted, warn
+from ..errors import AssumptionError, ModelError, aligned, counted, named_modes, warn
 from ..lti.statespace import StateSpace
 from ..plant import AnyPlant, standard_plant
 from ..plant.realisation import natural
@@ -143,9 +143,7 @@ def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
     pairs = list(zip(modes, freq, strict=True))
     listed = []
     for pole, sharing in groupby(pairs[:SHOWN], key=itemgetter(1)):
-        numbers = [str(number) for number, _ in sharing]
-        several = "s" if len(numbers) > 1 else ""
-        listed.append(f"mode{several} {', '.join(numbers)} (at {pole:.4g} Hz)")
+        listed.append(f"{named_modes(number for number, _ in sharing)} (at {pole:.4g} Hz)")
     more = len(pairs) - SHOWN
     return (", ".join(listed) or "no mode named") + (f" and {more} more" if more > 0 else "")
 

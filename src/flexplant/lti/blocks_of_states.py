@@ -235,7 +235,7 @@ def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     hint = "Pass whole numbers, or blocks=None."
     given = instance(blocks, Sequence | np.ndarray, "blocks", hint)
     sizes = tuple(given) if several(given) else ()
-    if not all(type(size) is int and size >= 0 for size in sizes):
+    if not set(map(type, sizes)) <= {int} or min(sizes, default=0) < 0:
         sizes = tuple(whole(size, "a block", minimum=0) for size in sizes)
     if 0 in sizes or sum(sizes) != A.shape[0]:
         raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")

@@ -267,7 +267,11 @@ def largest_gains(H: ComplexArray, most: float = 0.0) -> FloatArray:
         return np.asarray(size)
     near = size * root >= size.max(initial=most) * (1.0 - ROUNDING)
     size[~near] /= root
-    size[near] = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
+    part = np.ascontiguousarray(np.moveaxis(H[:, :, near], 2, 0))
+    if H.shape[0] > H.shape[1]:
+        part = part.swapaxes(1, 2)
+    square = part @ part.conj().swapaxes(1, 2)
+    size[near] = np.sqrt(np.maximum(np.linalg.eigvalsh(square)[:, -1], 0.0))
     return np.asarray(size)
 
 

@@ -139,7 +139,7 @@ def _modal(g: Subsystem) -> Solver:
     def add(s: ComplexArray, out: ComplexArray) -> bool:
         y = s.imag
         # on the imaginary axis x of a mode is one number; arrays (b, 1) cost nothing
-        x = s.real - mean[:, None] if g.dt else -mean[:, None]
+        x = s.real - mean[:, None] if g.dt or s.real.any() else -mean[:, None]
         functions = np.empty((residues.shape[1], s.size, 2))
         real_part = (swing[:, None] - y) * (swing[:, None] + y)
         real_part += (x - split[:, None]) * (x + split[:, None])
@@ -257,14 +257,15 @@ def dense_solver(g: Subsystem) -> tuple[Solver, int, int]:
             key = tuple(side.tobytes() for pair in channels for side in pair)
             known.setdefault(key, (channels, []))[1].append(found)
     solvers += [(_pole_gains(every, channels), channels) for channels, every in known.values()]
+    placed = [(gains, [np.ix_(i, j) for i, j in channels]) for gains, channels in solvers]
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
-        for gains, channels in solvers:
-            for (i, j), gain in zip(channels, gains(s), strict=True):
+        for gains, places in placed:
+            for place, gain in zip(places, gains(s), strict=True):
                 if gain.shape == out.shape:
                     out += gain
                 else:
-                    out[np.ix_(i, j)] += gain
+                    out[place] += gain
         return False
 
     return add, *sizes

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, between, whole
-from ..errors import AssumptionError, FlexplantWarning, ModelError, some_names
+from ..errors import AssumptionError, FlexplantWarning, ModelError, named_modes
 from ..lti.statespace import as_statespace
 from ..seeds import MOST_DRAWS, Rng, generator
 from ..store import Value
@@ -216,9 +216,8 @@ class PlantMachines:
     @property
     def left_out(self) -> str:
         """Remark for an interval that is of some modes only; otherwise empty."""
-        numbers = [] if self.fit is None else [*map(str, self.fit.left_out)]
-        named = f"mode{'s' * (len(numbers) > 1)} {some_names(numbers, total=False)}"
-        return f" (without {named}, which the channels do not touch)" if numbers else ""
+        left = () if self.fit is None else self.fit.left_out
+        return f" (without {named_modes(left)}, which the channels do not touch)" if left else ""
 
     @cached_property
     def plants(self) -> list[Any]:

@@ -225,13 +225,15 @@ class TolerantDesign(Design):
     design: HinfDesign
     uncertain: UncertainPlant[Any]
     damped_below: float = 0.0
+    #: what the scales are evened out by, if it is not the design itself
+    first: HinfDesign | None = None
 
     def prepare(self, plant: AnyPlant) -> _WithDeltas:
         """Return the plant with channels, their scales evened out in closed loop."""
         channels = mode_channels(plant, self.uncertain, self.damped_below)
         opened = with_mode_channels(plant, channels)
         # by a whole search: scales of a quick one jump with the weights, and designs with them
-        first = solved(self.design, opened)
+        first = solved(self.first or self.design, opened)
         channels = rebalanced(channels, opened, first.K)
         return _WithDeltas(with_mode_channels(plant, channels), channels, first.found.gamma)
 

@@ -43,6 +43,8 @@ _LEAST = (
 #: a search in a regular problem, scaled by the norm of its loop of least quadratic cost, and by
 #: which: the smallest gamma that is reached, and the largest that is refuted
 Search: TypeAlias = Callable[[Prepared, float], tuple[float, float]]
+#: what solves a regular problem by a search, with a back-off
+Solve: TypeAlias = Callable[[Prepared, Search, float | None], SolvedController]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,23 +119,37 @@ class Riccati(Value):
         # reached: what the equations promise of a step is seen at the resonances of its loop
         bracket = _Bracket(min(1.0, pointwise_bound(problem)), self.tolerance)
         with Progress(MOST_STEPS, "steps of the search", progress=self.progress, even=False) as bar:
-            for _ in range(MOST_STEPS):
-                if bracket.is_closed:
-                    break
-                gamma = bracket.next_gamma()
-                attempt = _attempt(problem, gamma)
-                bar.advance()
-                K = attempt.controller
-                bracket.narrow(gamma, attempt, np.inf if K is None else resonance_gain(problem, K))
+            bracket.close(problem, bar, resonance_gain)
         return bracket.high, bracket.low
+
+
+@dataclass(frozen=True, eq=False)
+class UncheckedRiccati(Riccati):
+    """The same by what the equations promise: for designs of which only the crossing is needed."""
+
+    def solve(self, problem: Prepared) -> SolvedController:
+        """Return the controller, without a norm of its loop."""
+        return back_off_controller(problem, self._searched, self.back_off, self._promised)
+
+    def _promised(
+        self, problem: Prepared, search: Search, back_off: float | None
+    ) -> SolvedController:
+        """Return the controller at a distance from the smallest gamma that has one."""
+        bracket = _Bracket(pointwise_bound(problem, coarse=True), self.tolerance, np.inf)
+        bracket.close(problem, Progress(0, "", progress=False), lambda *_: 0.0)
+        gamma = bracket.high * (1.0 + (_REGULAR if back_off is None else back_off))
+        K = _attempt(problem, gamma).controller if gamma < np.inf else None
+        if K is None:
+            return regular_controller(problem, search, back_off)
+        return SolvedController(K.A, K.B, K.C, K.D, gamma, bracket.low)
 
 
 class _Bracket:
     """The smallest gamma reached below 1, the largest one that failed, and what is between them."""
 
-    def __init__(self, low: float, tolerance: float) -> None:
+    def __init__(self, low: float, tolerance: float, high: float = 1.0) -> None:
         #: the largest gamma refuted, the largest one that failed, and the smallest one reached
-        self.low, self.failed, self.high = low, low, 1.0
+        self.low, self.failed, self.high = low, low, high
         self.tolerance, self.step = tolerance, 0.5 * tolerance
         #: the last two gammas, with their rooms where these are known
         self.known: list[tuple[float, FloatArray]] = []
@@ -144,11 +160,28 @@ class _Bracket:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the bracket is narrow enough, or gamma as good as zero."""
+        """Whether the bracket is narrow enough, gamma as good as zero, or nothing is reached."""
+        if self.high == np.inf and self.step > 1.0 / NEGLIGIBLE:
+            return True
         return self.high <= self.failed * (1.0 + self.tolerance) or self.high < SETTLED
+
+    def close(
+        self, problem: Prepared, bar: Progress, gain: Callable[[Prepared, StateSpace], float]
+    ) -> None:
+        """Try gammas until the bracket is closed, by the gain of the loop of each controller."""
+        for _ in range(MOST_STEPS):
+            if self.is_closed:
+                break
+            gamma = self.next_gamma()
+            attempt = _attempt(problem, gamma)
+            bar.advance()
+            K = attempt.controller
+            self.narrow(gamma, attempt, np.inf if K is None else gain(problem, K))
 
     def next_gamma(self) -> float:
         """Return the gamma to try next."""
+        if self.high == np.inf:
+            return self.failed * (1.0 + self.step)
         low = max(self.failed, 1e-2 * self.high)
         middle = float(np.sqrt(low * self.high))
         if self.blind:  # the limit is often next to the bound: steps that become wider
@@ -180,7 +213,7 @@ class _Bracket:
         self.blind = self.blind and attempt.rooms is None
         self.known = [*self.known[-1:], (gamma, attempt.rooms)] if attempt.rooms is not None else []
         # rounding costs some of what is promised
-        if gain <= max(gamma * (1.0 + TYPED), np.sqrt(gamma * self.high)):
+        if gain < np.inf and gain <= max(gamma * (1.0 + TYPED), np.sqrt(gamma * self.high)):
             self.high = max(gamma, gain)
             return
         self.high, self.failed = min(self.high, gain), gamma
@@ -191,14 +224,14 @@ class _Bracket:
 
 
 def back_off_controller(
-    problem: Prepared, search: Search, back_off: float | None
+    problem: Prepared, search: Search, back_off: float | None, solve: Solve | None = None
 ) -> SolvedController:
     """Return the controller at a distance from the smallest gamma, regularised where needed."""
-    lack = lacking(problem)
+    lack, solve = lacking(problem), solve or regular_controller
     if not lack.words:
-        return regular_controller(problem, search, back_off)
+        return solve(problem, search, back_off)
     step = (_ADDED if lack.is_full else _SINGULAR) if back_off is None else back_off
-    return made_regular(problem, lambda regular: regular_controller(regular, search, step), lack)
+    return made_regular(problem, lambda regular: solve(regular, search, step), lack)
 
 
 def regular_controller(

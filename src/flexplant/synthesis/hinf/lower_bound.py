@@ -11,7 +11,15 @@ import scipy.linalg as la
 from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
-from ...lti.frequency_sweep import POINTS, ROUNDS, highest, resonance_grid
+from ...lti.frequency_sweep import (
+    DRAWN,
+    POINTS,
+    ROUNDS,
+    SOUGHT,
+    highest,
+    largest_gains,
+    resonance_grid,
+)
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...lti.zeros import axis_zeros
@@ -34,7 +42,7 @@ def raised_bound(problem: Prepared, gamma: float, known: float, close: float = _
     return min(known, gamma)
 
 
-def pointwise_bound(problem: Prepared) -> float:
+def pointwise_bound(problem: Prepared, coarse: bool = False) -> float:
     """Return what no controller undercuts at some frequency, nor by the feedthrough."""
     # Parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
     # reach, `N_z' Pzw` with N_z' Pzu = 0, and on the inputs which y does not show, `Pzw N_w` with
@@ -42,13 +50,14 @@ def pointwise_bound(problem: Prepared) -> float:
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     system = problem.system
     poles = system.poles()
-    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=POINTS)])
+    around, points = (SOUGHT, POINTS // 2) if coarse else (DRAWN, POINTS)
+    grid = np.append(0.0, resonance_grid(poles, 0.0, points=points, around=around))
     undamped = poles[np.abs(poles.real) <= SPLIT * np.max(np.abs(poles), initial=1.0)]
     apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))
     grid = grid[np.all(apart > SPLIT * (1.0 + np.abs(undamped.imag)), axis=1)]
 
     def bounds(freq: FloatArray) -> FloatArray:
-        P = np.moveaxis(responses(system, freq), 2, 0)
+        P = np.ascontiguousarray(np.moveaxis(responses(system, freq), 2, 0))
         Pzw, seen = P[:, :p1, :m1], _adjoint(P[:, p1:, :m1])
         return np.maximum(_perp_norms(P[:, :p1, m1:], Pzw), _perp_norms(seen, _adjoint(Pzw)))
 
@@ -85,13 +94,13 @@ def _bound_at_zeros(side: FullInformation) -> float:
     return found
 
 
-def _perp_norms(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:
-    """Return the norms of Pzw on what is perpendicular to the columns of M."""
+def _perp_norms(M: ComplexArray, Pzw: ComplexArray) -> FloatArray:
+    """Return the norms of Pzw on what is perpendicular to the columns of M; bounds off the peak."""
     # its dimension is that of M of full rank: more would hang on rounding
     if M.shape[1] <= M.shape[2]:
         return np.zeros(M.shape[0])
-    part = _adjoint(np.linalg.svd(M)[0][:, :, M.shape[2] :]) @ Pzw
-    return np.asarray(np.linalg.svd(part, compute_uv=False)[:, 0])
+    Q = np.linalg.qr(M)[0]
+    return largest_gains(np.moveaxis(Pzw - Q @ (_adjoint(Q) @ Pzw), 0, 2))
 
 
 def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
