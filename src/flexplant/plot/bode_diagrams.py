@@ -357,7 +357,7 @@ def _within_band(curve: Curve, band: tuple[float, float] | None) -> Curve:
         )
     parts = {
         kind: values[:, :, inside]
-        for kind in ("data", "coherence", "variance")
+        for kind in ("data", "coherence", "variance", "correlation")
         if (values := getattr(curve.response, kind)) is not None
     }
     return curve._replace(response=curve.response.replace(freq=freq[inside], **parts))
