@@ -99,8 +99,9 @@ def _perp_norms(M: ComplexArray, Pzw: ComplexArray) -> FloatArray:
     # its dimension is that of M of full rank: more would hang on rounding
     if M.shape[1] <= M.shape[2]:
         return np.zeros(M.shape[0])
-    Q = np.linalg.qr(M)[0]
-    return largest_gains(np.moveaxis(Pzw - Q @ (_adjoint(Q) @ Pzw), 0, 2))
+    # a basis of the rest: Pzw minus its part along M cancels where an undamped mode makes it large
+    rest = np.linalg.qr(M, mode="complete")[0][:, :, M.shape[2] :]
+    return largest_gains(np.moveaxis(_adjoint(rest) @ Pzw, 0, 2))
 
 
 def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
