@@ -212,7 +212,7 @@ def test_close_pairs_turn_to_their_measured_shapes(case, angle):
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.03])
-def test_thesmall_exponential_is_that_of_scipy(size):
+def test_the_small_exponential_is_that_of_scipy(size):
     E = size * np.random.default_rng(2).normal(size=(30, 30))
     E = E + E.T
     np.testing.assert_allclose(small_exponential(E), la.expm(E), rtol=1e-12, atol=1e-13)

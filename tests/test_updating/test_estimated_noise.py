@@ -5,6 +5,7 @@ import pytest
 import scipy.stats as stats
 
 import noisy_plate
+from flexplant.errors import FlexplantWarning
 from flexplant.identification import average_frfs
 from flexplant.lti import Frf
 from flexplant.updating import AddedDamping, AddedMass, FrfResidual, update
@@ -67,3 +68,37 @@ def test_covariance_of_correlated_outputs(campaign, magnitude):
     N = C.real if magnitude else np.block([[C.real, -C.imag], [C.imag, C.real]])
     np.testing.assert_allclose(bound.noise_times(np.eye(len(N))), N, atol=1e-9)
     np.testing.assert_allclose(np.diag(N), 1.0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("runs", "magnitude"), [(8, False), (300, True)])
+def test_a_model_that_is_wrong_widens_the_covariance_by_its_residual(campaign, runs, magnitude):
+    """Responses 5 % too large: as wide as by the mean square of the residual."""
+    campaign.variance = campaign.variance / 100.0
+    frf = averaged(campaign, np.random.default_rng(2), runs, 0.0)
+    wrong = frf.replace(data=1.05 * frf.data, correlation=None)
+    parameters = [AddedMass(campaign.at), AddedDamping(campaign.at)]
+    options = {"start": [0.4, 0.0], "starts": 1}
+    found, plain = [], []
+    for given in (
+        wrong,
+        wrong.replace(freedom=None, variance=(runs - 1) / (runs - 2) * wrong.variance),
+    ):
+        with pytest.warns(FlexplantWarning, match="leaves more than noise"):
+            data = FrfResidual(given, magnitude=magnitude)
+            fit = update(campaign.rom, parameters, [data], **options)
+        found.append(fit.std)
+        plain.append(fit.chi2 / fit.dof)
+    np.testing.assert_allclose(*found, rtol=0.02)
+    np.testing.assert_allclose(*plain, rtol=0.02)
+
+
+def test_independent_outputs_count_whole_whoever_gives_the_variance(campaign):
+    """Four runs show correlations of one third by chance."""
+    frf = averaged(campaign, np.random.default_rng(1), 4, 0.0)
+    own, given = (
+        FrfResidual(frf, variance=variance).bound(Family(campaign.rom, [])).independent
+        for variance in (None, campaign.variance)
+    )
+    assert given > 0.9
+    assert own == pytest.approx(given / 3.0)  # (nu - 2) / nu of three degrees of freedom

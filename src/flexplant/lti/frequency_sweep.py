@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
+from ..arrays import ComplexArray, FloatArray, IntArray, divisor, positive, positive_array, whole
 from ..errors import ModelError
 from ..tolerances import ROOT, ROUNDING, SETTLED, SPLIT, TINY, TYPED
 from .response_solvers import Responder, continuous_poles, responder
@@ -267,11 +267,12 @@ def largest_gains(H: ComplexArray, most: float = 0.0) -> FloatArray:
         return np.asarray(size)
     near = size * root >= size.max(initial=most) * (1.0 - ROUNDING)
     size[~near] /= root
-    part = np.ascontiguousarray(np.moveaxis(H[:, :, near], 2, 0))
+    # of the size 1, since squares of the smallest and largest sizes are out of range
+    part = np.ascontiguousarray(np.moveaxis(H[:, :, near] / divisor(size[near]), 2, 0))
     if H.shape[0] > H.shape[1]:
         part = part.swapaxes(1, 2)
     square = part @ part.conj().swapaxes(1, 2)
-    size[near] = np.sqrt(np.maximum(np.linalg.eigvalsh(square)[:, -1], 0.0))
+    size[near] *= np.sqrt(np.maximum(np.linalg.eigvalsh(square)[:, -1], 0.0))
     return np.asarray(size)
 
 

@@ -422,8 +422,7 @@ class MeasuredShapes:
         if places > omega.size:  # what no mode shows is noise alone, whatever the scatter
             basis = la.qr(seen, mode="economic")[0]
             whole, seen, scaled = scaled, basis.T @ seen, basis.T @ scaled
-            squares = (np.sum(part**2, axis=0) @ sizes**-2.0 for part in (whole, scaled))
-            self._beyond = float(-np.diff([*squares])[0])
+            self._beyond = float(np.sum(((whole - basis @ scaled) / sizes) ** 2))
         n = len(seen)
         self.rows, self.effects = np.zeros((2, m, n, omega.size))
         self.off, count = np.zeros((m, n)), 0

@@ -115,7 +115,13 @@ class ForcePort(Value):
 
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) over the model's DOFs per unit of the output of the filter."""
-        return realisation.row(self._fields()["at"], self.direction)
+        at = self._fields().get("at")
+        if at is None:
+            raise ModelError(
+                f"{type(self).__name__} has no place `at`: define `push`, which returns its load "
+                "over the DOFs of the model."
+            )
+        return realisation.row(at, self.direction)
 
     def static_push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) per unit of a constant input of the channel.

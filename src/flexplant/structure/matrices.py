@@ -415,8 +415,10 @@ class FEMatrices(Value):
             held = None if free else ready._held_by_rounding(model)
             if held and model.n_unstable and not is_positive_definite(model.K, SAME):
                 raise ModelError(f"K is not positive semi-definite. {held[0].upper()}{held[1:]}")
-            # where the entries show their digits, the model has said so
-            found = (endangered(ready.K, ready.M, self.digits), held) if not digits_of(K) else ()
+            # where the entries show no more digits than are stated, the model has said so
+            shown = digits_of(K)
+            said_already = shown is not None and shown <= self.digits
+            found = () if said_already else (endangered(ready.K, ready.M, self.digits), held)
             for said in filter(None, found):
                 warn(f"{self.source or 'K'}: {said}")
         return model

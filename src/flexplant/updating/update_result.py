@@ -113,7 +113,7 @@ class Starts(Value):
         """Other minima that the data hardly distinguish from the best, with their `above`.
 
         A minimum is included if noise alone could cause its value of `above` with a probability of
-        at least 1e-4, by the chi-square distribution with one degree of freedom.
+        at least 1e-3, by the chi-square distribution with one degree of freedom.
         """
         return [
             (p, float(more))
@@ -152,7 +152,7 @@ class UpdateResult(Value):
         is not known, the result is ``s^2 (J^T W J)^-1``. The residual variance
         ``s^2 = e / (2 m - q)``, with the weighted sum of squares e, then includes the model error.
         If C is known for some residuals only, s^2 is the variance of the others. If the residual
-        exceeds noise (`p_value` below 1e-4), C includes the model error (see `discrepancy`). If
+        exceeds noise (`p_value` below 1e-3), C includes the model error (see `discrepancy`). If
         responses are fitted, C is multiplied by ``chi2 / dof`` instead. None: the data do not
         determine all parameters, the result depends on the start values, or ``2 m = q``, so that
         s^2 is not known.
@@ -177,9 +177,10 @@ class UpdateResult(Value):
     chi2 : float or None
         Smallest sum of squares of the residuals (and priors), each divided by the standard
         deviation of its noise. It is about `dof` if the model explains the measurement. Only
-        residuals with known noise count. Where responses have correlated errors, or a variance that
-        was estimated from few runs, the sum is scaled so that it is distributed as chi-square with
-        `dof` degrees of freedom. None: all noise is unknown.
+        residuals with known noise count. Where responses have correlated errors, or a variance
+        that was estimated from few runs, the sum and `dof` are multiplied by the same factor. Mean
+        and variance are then those of chi-square with `dof` degrees of freedom. None: all noise is
+        unknown.
     dof : int
         Degrees of freedom: number of residuals and priors that count in `chi2`, minus the number of
         parameters that they determine. Parameters at a bound are not subtracted.
@@ -232,7 +233,7 @@ class UpdateResult(Value):
     def p_value(self) -> float | None:
         """Probability that noise alone causes a larger `chi2`, None if it is not known.
 
-        If it is below 1e-4, the model has another error, or the stated noise is too small.
+        If it is below 1e-3, the model has another error, or the stated noise is too small.
         """
         return chance(self.chi2, self.dof)
 

@@ -123,7 +123,7 @@ def update(
         determine the parameters (the warning names the determined combinations). When a solution is
         found, but not from the given `start`. When the last round of defect correction changed the
         estimate by more than half a standard deviation. When the residual exceeds known noise with
-        a p-value below 1e-4. The model error of each kind of residual is then estimated together
+        a p-value below 1e-3. The model error of each kind of residual is then estimated together
         with the parameters (`UpdateResult.discrepancy`). If responses are fitted, the covariance is
         instead multiplied by chi-square over its degrees of freedom, and no standard deviations are
         printed.

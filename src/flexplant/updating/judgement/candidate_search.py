@@ -77,7 +77,7 @@ def localise(
     Warns
     -----
     FlexplantWarning
-        When the residual of the chosen subset exceeds noise with a p-value below 1e-4 (`p_value`).
+        When the residual of the chosen subset exceeds noise with a p-value below 1e-3 (`p_value`).
 
     Raises
     ------

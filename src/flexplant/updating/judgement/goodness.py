@@ -61,7 +61,7 @@ def noise_misfit(objective: Objective, point: Point, free: FloatArray) -> float 
     Q = _orthonormal(J)
     r -= Q @ (Q.T @ r)
     data = objective.rows(point)
-    found = sum(bound.independent * bound.misfit(r[at]) for bound, at in data)
+    found = sum(bound.independent * np.sum(r[at] ** 2) for bound, at in data)
     return float(found + np.sum(r[data[-1][1].stop :] ** 2))
 
 

@@ -131,7 +131,8 @@ class Subsets:
         free = np.full(point.p.size, bool(values.size))
         chi2 = noise_misfit(objective, point, free) if objective.noise_known else None
         misfit = error if chi2 is None else chi2
-        score = bic(misfit, self.rows, k + len(self.nuisance), chi2 is not None)
+        rows = self.rows if chi2 is None else max(round(self.share * self.rows), 1)
+        score = bic(misfit, rows, k + len(self.nuisance), chi2 is not None)
         return SubsetFit(values, error, chi2, score + 2 * log(comb(self.count, k)))
 
     def chi2(self, subset: Subset) -> tuple[float | None, int]:

@@ -294,7 +294,7 @@ class Validation(Value):
         data the sum of squares is divided by the degrees of freedom.
     p_value : float or None
         Probability that noise and parameter uncertainty alone cause a larger residual of unused
-        data. None: the noise is not known. If the probability is below 1e-4, a change is missing or
+        data. None: the noise is not known. If the probability is below 1e-3, a change is missing or
         in the wrong place.
     before, after : Correlation
         Correlation of the unused data with the model before and after the update.
@@ -312,7 +312,7 @@ class Validation(Value):
         """Whether the updated model predicts data that were not fitted.
 
         The residual of unused data must decrease. With known noise it must also agree with noise
-        and parameter uncertainty (`p_value` of at least 1e-4). With unknown noise it must decrease
+        and parameter uncertainty (`p_value` of at least 1e-3). With unknown noise it must decrease
         to less than half. A decrease alone is not enough, because a mass in the wrong place may
         also reduce the residual, although it does not predict the data.
         """

@@ -181,17 +181,17 @@ class _BoundFrf(Bound):
             one = sp.kron(R, sp.eye_array(self.data[0].size))
             self.noise = sp.csc_array(one if self.magnitude else sp.block_diag([one, one]))
         self.lines = R
-        fair = _fair(frf)
-        self.freedom: float | None = None
-        if frf.freedom is not None and fair is not None and np.all(residual.variance == fair):
-            self.freedom = max(frf.freedom, LEAST)
+        nu = None if frf.freedom is None else max(frf.freedom, LEAST)
         self.root: ComplexArray | None = None
         if self.noisy and frf.correlation is not None:
             C = np.moveaxis(frf.correlation[:, :, lines], 2, 0)
-            self.root, self.independent = _root(C), _independent_share(C, self.freedom)
-        if self.freedom is not None:
-            # rows of all inputs share the estimated noise of their output
-            self.independent /= 1.0 + (len(frf.inputs) - 1) / self.freedom
+            self.root, self.independent = _root(C), _independent_share(C, nu)
+        fair = _fair(frf)
+        if nu is not None and fair is not None and np.all(residual.variance == fair):
+            # |error|^2 over an estimated variance has Fisher's distribution: its variance, over
+            # that of chi-square, for rows of all inputs, which share the noise of their output
+            shared = len(frf.inputs) / (2.0 if self.magnitude else 1.0)
+            self.independent *= max(nu - 2.0, LEAST - 1.0) / (nu - 1.0 + shared)
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma
@@ -223,25 +223,6 @@ class _BoundFrf(Bound):
         z = turn.conj() * np.einsum("lab,lbic->laic", self.root, z)
         z = z.reshape(self.data.size, -1)
         return np.asarray(z.real) if self.magnitude else split_parts(z)
-
-    def misfit(self, rows: FloatArray) -> float:
-        """Return chi-square of rows whose variance was estimated with few degrees of freedom.
-
-        The ratio x of ``|error|^2`` and its estimated variance exceeds a value with probability
-        ``(1 + x/nu)^-nu``: ``2 nu ln(1 + x/nu)`` is distributed as chi-square with two degrees of
-        freedom. A magnitude, divided by its deviation, follows Student's distribution.
-        """
-        nu = self.freedom
-        if nu is None:
-            return super().misfit(rows)
-        # rows are divided by the deviation that is larger by the root of nu / (nu - 1)
-        if self.magnitude:
-            from scipy.special import ndtri, stdtr  # slow import
-
-            t = np.abs(rows) * np.sqrt(nu / (nu - 1))
-            return float(np.sum(ndtri(stdtr(2 * nu, -t)) ** 2))
-        x = np.sum(rows.reshape(2, -1) ** 2, axis=0) / 2 / (nu - 1)
-        return float(2 * nu * np.sum(np.log1p(x)))
 
     def kinds(self) -> list[Kind]:
         """Return no discrepancy, since model errors are correlated over lines."""

@@ -104,10 +104,6 @@ class Bound(ABC):
         """Return ``N columns`` with the best known covariance N of the rows."""
         return columns if self.noise is None else np.asarray(self.noise @ columns)
 
-    def misfit(self, rows: FloatArray) -> float:
-        """Return chi-square of rows that are whitened by `noise`."""
-        return float(rows @ rows)
-
     def kinds(self) -> list[Kind]:
         """Return the kinds of model error that are assumed when noise does not explain the rows.
 
