@@ -367,3 +367,29 @@ def test_poles_on_machines_follow_from_those_of_the_loop(dt):
             assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-6
     later = plant.continuous.discretized(1e3, delay=3.0)
     assert moved_poles(loop, ClosedLoop(later, loop.blocks, loop.controller)) is None
+
+
+@pytest.mark.filterwarnings("ignore:the closed loop is unstable")
+@pytest.mark.parametrize(("law", "omega"), [
+    ((-50.0, -20.0, 0.999), 120.0), ((-364.5, 1.98898, 0.999558729), 96.55),
+    ((-50.0, -20.0, -3.0), 120.0),
+])  # fmt: skip
+def test_poles_on_machines_with_feedthrough_of_plant_and_law(law, omega):
+    """An accelerometer and a law whose D cancel nearly: the eigenvalues, or no proof."""
+
+    def machine(omega):
+        A = np.array([[0.0, 1.0], [-(omega**2), -0.02 * omega]])
+        B, C, D = [[0.0, 0.0], [1.0, 1.0]], np.vstack([[1.0, 0.0], A[1]]), [[0, 0], [1.0, 1.0]]
+        g = StateSpace(A, B, C, D, inputs=["w", "u"], outputs=["z", "y"])
+        return StandardPlant.from_statespace(g, u=["u"], y=["y"])
+
+    a, c, d = law
+    loop = close_loop(
+        machine(100.0), StateSpace([[a]], [[1.0]], [[c]], [[d]], inputs=["y"], outputs=["u"])
+    )
+    other = loop.around(machine(omega))
+    found, wanted = moved_poles(loop, other), other.poles()
+    if found is not None:
+        apart = np.abs(found[:, None] - wanted)
+        assert np.all(apart.min(axis=0) <= 0.01 * np.abs(wanted.real))
+    assert found is not None or d > 0

@@ -181,8 +181,9 @@ def norm_or_bound(S: ComplexArray) -> FloatArray:
 def moved_poles(known: Any, loop: Any) -> ComplexArray | None:
     """Return the poles of a loop from those of a like one; None where they are not proven.
 
-    Both have one controller and plants of the same states in one order. With F = det(I - K P) and
-    the n poles p of K and P, the differences x of two neighbours are improved by ``x_j - w_j`` with
+    Both have one controller and plants of the same states in one order. With
+    ``F = det(I - K P) / det(I - D_K D_P)``, which is 1 at infinity, and the n poles p of K and P,
+    the differences x of two neighbours are improved by ``x_j - w_j`` with
     ``w_j = F(x_j) prod_i (x_j - p_i) / prod_(k != j) (x_j - x_k)``. The discs of radius n |w_j| at
     x_j contain all poles, a group of m that overlap contains m [Smith1970]_. They are proven where
     no disc is larger than 1 % of the distance of its centre to the stability boundary.
@@ -192,6 +193,8 @@ def moved_poles(known: Any, loop: Any) -> ComplexArray | None:
     x = known.poles()
     if x.size != now.size:
         return None
+    one = np.eye(len(loop.driven))
+    direct = np.linalg.det(one - loop._command.D @ loop._path.system.D)
     x = x[x.imag >= 0.0]
     swings = x.imag > 0.0
     moved = (now - before)[np.argmin(np.abs(x[:, None] - before), axis=1)]
@@ -203,7 +206,7 @@ def moved_poles(known: Any, loop: Any) -> ComplexArray | None:
         x[rows] += NULL * np.where(x[rows] == 0.0, 1.0, x[rows])
         turn = np.log(x[rows]) / dt if dt else x[rows]
         K, P = loop.broken.respond(turn / (2j * np.pi))
-        F[rows] = np.linalg.det(np.eye(len(loop.driven)) - K @ P)
+        F[rows] = np.linalg.det(one - K @ P) / direct
         for some in (rows, every):
             gaps = x[some, None] - np.append(x, x[swings].conj())
             gaps[np.arange(some.size), some] = 1.0

@@ -249,6 +249,8 @@ class WaferStage(Value):
         if not ports.u or not ports.y:
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
         random = generator(rng)
+        # whole samples, so that periods are equal
+        period = round(positive(period, "period") * self.rate) / self.rate
         count, duration = len(ports.u), whole(periods, "periods") * period
         duration += whole(discard, "discard", minimum=0) * period
         signal = multisine(

@@ -250,8 +250,8 @@ class Evaluator:
 
 def _same_others(one: LoopDesign, two: LoopDesign, name: str) -> bool:
     """Return whether the loops of all axes but one are the same in two designs."""
-    pairs = [(axis, two.axes[n]) for n, axis in one.axes.items() if n != name]
-    alike = all(a is b or not (a.closed or b.closed) for a, b in pairs)
+    pairs = [(axis, two.axes.get(n)) for n, axis in one.axes.items() if n != name]
+    alike = all(a is b or (b and not (a.closed or b.closed)) for a, b in pairs)
     return alike and (one.rate, one.rigid) == (two.rate, two.rigid)
 
 

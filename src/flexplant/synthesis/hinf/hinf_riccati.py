@@ -181,7 +181,7 @@ class _Bracket:
     def next_gamma(self) -> float:
         """Return the gamma to try next."""
         if self.high == np.inf:
-            return self.failed * (1.0 + self.step)
+            return max(self.failed, SETTLED) * (1.0 + self.step)
         low = max(self.failed, 1e-2 * self.high)
         middle = float(np.sqrt(low * self.high))
         if self.blind:  # the limit is often next to the bound: steps that become wider

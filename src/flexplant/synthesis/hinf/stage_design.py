@@ -333,11 +333,13 @@ class _StageTask(Design):
         wanted = at = float(self.wanted or 0.0)
         ends = [0.0, np.inf]  # of weights that are too slow, and too fast
         known: list[tuple[float, float]] = []
+        method: type[Riccati] = UncheckedRiccati
         for _ in range(_MOST):
-            one = self._designed(at, below, UncheckedRiccati)
+            one = self._designed(at, below, method)
             reached = self._crossing(one.solution.K)
             if abs(reached / wanted - 1.0) <= CLOSE:
-                one = one.checked()
+                # checked ones from here on, if the two cross elsewhere
+                one, method = one.checked(), Riccati
                 reached = self._crossing(one.solution.K)
             if abs(reached / wanted - 1.0) <= CLOSE:
                 return one

@@ -17,7 +17,7 @@ from ...lti.response_solvers import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
 from ...store import Value, checked
-from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TINY, TYPED
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, ROUNDING, TINY, TYPED
 from ..preparation import less_feedthrough
 from ..structured.judges import (
     OVER,
@@ -497,7 +497,7 @@ class ObjectivePrograms:
         unit = self.unit
         for _ in range(MOST_STEPS):
             found = self._optimum(unit, rate)
-            if 0.5 < found / unit < 2.0:
+            if 0.5 < found / unit < 2.0 or found < ROUNDING * self.unit:
                 break
             unit = found
         return found

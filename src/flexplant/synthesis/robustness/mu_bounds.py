@@ -451,7 +451,11 @@ class Cover:
         real = self.poles[self.poles.imag == 0]
         kept = np.concatenate([real, self.swinging])
         swing, width = kept.imag, np.abs(kept.real)
-        near = (swing[:, None] + width[:, None] * around_resonance()).ravel()
+        # four times closer at the tops
+        near = np.concatenate(
+            [width[:, None] * around_resonance() * close for close in (0.25, 1)], 1
+        )
+        near = (swing[:, None] + near).ravel()
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
         end = min(high, max(top, 10 * low))
         base = np.linspace(low, end, SAMPLES)

@@ -159,8 +159,9 @@ def _sampled(W: StateSpace, low: float, high: float) -> FloatArray:
     inside = own[(own > low) & (own < end)]
     points = np.concatenate([np.linspace(low, end, SAMPLES), inside])
     if end > 2 * low:
-        # four decades
-        points = np.concatenate([points, np.geomspace(max(low, 1e-4 * end), end, SAMPLES)])
+        # four decades, as many points in each
+        more = np.geomspace(max(low, 1e-4 * end), end, 4 * SAMPLES)
+        points = np.concatenate([points, more])
     return np.unique(points / (2 * np.pi))
 
 

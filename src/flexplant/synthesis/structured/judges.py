@@ -18,7 +18,7 @@ from ...lti.norms import peak_gain
 from ...lti.response_solvers import responses
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant
-from ...tolerances import CLOSE, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, TINY
+from ...tolerances import CLOSE, NEGLIGIBLE, PRECISION, ROOT, ROUNDING, SPLIT, TINY
 from ..preparation import Prepared, prepared
 from .nonsmooth import Pieces
 
@@ -385,7 +385,7 @@ class PeakJudge(SmoothJudge):
         first, S, slope = (self._sampled if a else self._continuous)(poles, c * b, loop.D[0, 0], a)
         total = first * loop.D[0, 0] + float(np.real(np.sum(c * b * S)))
         apart = poles[:, None] - poles
-        near = np.abs(apart) < ROOT * np.abs(poles)  # a divided difference is a derivative there
+        near = np.abs(apart) < SPLIT * np.abs(poles)  # a divided difference is a derivative there
         divided = np.where(near, 0.5 * (slope[:, None] + slope), S[:, None] - S)
         divided = divided / np.where(near, 1.0, apart)
         back = np.linalg.inv(V)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray
-from ...tolerances import FOUR_DIGITS, NEGLIGIBLE, SAME, TINY, TYPED
+from ...tolerances import FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, SAME, TINY, TYPED
 
 #: value (infinite where not defined) and gradient
 Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -138,8 +138,8 @@ def minimax(
     # [ApkarianNoll2006]_
     value, _ = function.value(x)
     pieces, weights, mu = function.pieces(x), None, None
-    values, refused = [value], False
-    while len(values) <= steps and not spent():
+    values, refused = [value], 0
+    while len(values) <= steps and refused < MOST_STEPS and not spent():
         if mu is None:
             slope = float(np.linalg.norm(pieces.gradient[np.argmax(pieces.value)]))
             if not slope:  # the number does not depend on the parameters here
@@ -156,19 +156,19 @@ def minimax(
         new, place = function.value(x + step)
         part = (value - new) / decrease
         if part >= _ENOUGH:
-            x, value, refused, weights = x + step, new, False, None
+            x, value, refused, weights = x + step, new, 0, None
             pieces = function.pieces(x)
             values.append(value)
             mu *= 1.0 / _MORE if part > _GOOD else _MORE if part < _POOR else 1.0
             if len(values) > _STALLED and values[-_STALLED - 1] - value <= _GAIN:
                 break
         else:
-            refused = True
+            refused += 1
             if np.isfinite(new):
                 pieces = pieces.and_those(function.piece(x, place))
                 weights = np.append(weights, np.zeros(pieces.value.size - weights.size))
             mu *= _MORE
-    return Minimum(x, value, len(values) <= steps and not spent())
+    return Minimum(x, value, len(values) <= steps and refused < MOST_STEPS and not spent())
 
 
 class _Model:
