@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from flexplant.arrays import positive, real_array, whole
+from flexplant.arrays import generator, positive, real_array, seed_sequence, whole
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.seeds import generator, seed_sequence
 from flexplant.store import Value, frozen, rebuild
 from flexplant.words import check_names, name_list, signal_names
 

@@ -15,9 +15,9 @@ from typing import IO, Any, Self, TypeVar
 
 import numpy as np
 
+from .arrays import Rng, seed_sequence
 from .errors import FlexplantError, ModelError
 from .parallel import mapped
-from .seeds import Rng, seed_sequence
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, frequency_band, positive, whole
+from ..arrays import ComplexArray, FloatArray, frequency_band, generator, positive, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf, error_statistics
-from ..seeds import generator
 from ..store import Value, checked
 from ..tolerances import CHANCE, DEVIATIONS, NEGLIGIBLE, RANK, TINY, TYPED
 from .spectra import Records

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import COLUMNS, FloatArray, IntArray, Matrix
+from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, Rng
 from ..certificates import Certificate, Verified
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
-from ..seeds import Rng
 from ..sparse.factor import LARGEST_FULL
 from ..sparse.lowest import BLOCK, EXTRA, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.other_factors import Cholmod

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, divisor
+from ..arrays import REFUSED, FloatArray, IntArray, divisor
 from ..errors import AssumptionError, CertificateError, counted, some_names
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
-from ..seeds import REFUSED
 from ..store import Value
 from ..tolerances import SAME, SETTLED, TYPED
 from ..work import Work

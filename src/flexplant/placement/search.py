@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, positive, whole
+from ..arrays import FloatArray, Rng, positive, whole
 from ..errors import (
     InfeasibleError,
     LabelError,
@@ -22,7 +22,6 @@ from ..errors import (
 )
 from ..fingerprints import fingerprint
 from ..plant import Actuator, StandardPlant
-from ..seeds import Rng
 from ..store import Value, checked
 from ..words import instance, name_list
 from ..work import Work

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import ComplexArray, FloatArray, IntArray, divisor
+from ..arrays import REFUSED, ComplexArray, FloatArray, IntArray, divisor
 from ..errors import ModelError
 from ..labels import Place
 from ..modes.matching import assigned
 from ..modes.modes import sampled_moves
-from ..seeds import REFUSED
 from ..sparse.symmetric import dense
 from ..structure.rigid import rigid_motions
 from ..tolerances import ROUNDING, SAME, TINY, TYPED

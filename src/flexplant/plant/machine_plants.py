@@ -11,10 +11,9 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, between, whole
+from ..arrays import MOST_DRAWS, FloatArray, Rng, between, generator, whole
 from ..errors import AssumptionError, FlexplantWarning, ModelError, named_modes
 from ..lti.statespace import as_statespace
-from ..seeds import MOST_DRAWS, Rng, generator
 from ..store import Value
 from ..tolerances import INTERVAL
 from ..updating import FrfResidual

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, positive, whole
+from ..arrays import MOST_DRAWS, FloatArray, positive, whole
 from ..errors import ModelError, counted, short
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
-from ..seeds import MOST_DRAWS
 from ..store import Value
 from ..tolerances import SAME
 from ..words import function, instance, with_unit

@@ -8,7 +8,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray, positive, real_array, whole
+from ..arrays import (
+    MOST_DRAWS,
+    FloatArray,
+    generator,
+    positive,
+    real_array,
+    seed_of,
+    seed_sequence,
+    whole,
+)
 from ..errors import AssumptionError, ModelError, only_one, require_known, short, warn
 from ..identification.periodic import MOST_SAMPLES
 from ..loop import ClosedLoop, ScheduledLoop
@@ -18,7 +27,6 @@ from ..plant import StandardPlant, standard_plant
 from ..plant.building import white_noise
 from ..plant.partitioned import require_sampled
 from ..plant.port import DERIVATIVES
-from ..seeds import MOST_DRAWS, generator, seed_of, seed_sequence
 from ..tolerances import SAME, TYPED
 from ..words import flag, instance, several
 from .force_warnings import warn_beyond_ranges, warn_of_opposing_forces

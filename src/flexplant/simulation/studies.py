@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, seed_sequence
 from ..errors import (
     LabelError,
     ModelError,
@@ -28,7 +28,6 @@ from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..fingerprints import fingerprint
 from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
-from ..seeds import seed_sequence
 from ..store import Value
 from ..words import SHOWN, instance, mapping
 from ..work import Checkpoint

@@ -11,10 +11,9 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from ..arrays import COLUMNS, FloatArray, IntArray, Matrix
+from ..arrays import COLUMNS, FloatArray, IntArray, Matrix, Rng
 from ..errors import SolverError, attempted, counted
 from ..parallel import PIECE, one_thread, tick
-from ..seeds import Rng
 from ..tolerances import (
     FOUR_DIGITS,
     MOST_STEPS,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, below_half_rate, positive, whole
+from ..arrays import ComplexArray, FloatArray, below_half_rate, generator, positive, whole
 from ..errors import ModelError, require_known
 from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, multisine, offsets
@@ -19,7 +19,6 @@ from ..lti.statespace import StateSpace
 from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
 from ..plant.realisation import ModalRealisation, realise
 from ..reduction import ReducedModel
-from ..seeds import generator
 from ..simulation import Quantiser, Response, simulate
 from ..store import Value
 from ..structure import FEModel, ModalDamping, plate, solid_block

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..arrays import FloatArray, whole
+from ..arrays import REFUSED, FloatArray, whole
 from ..errors import ModelError, counted
 from ..identification import MeasuredModes
 from ..modes import Modes
 from ..modes.matching import ALIKE
-from ..seeds import REFUSED
 from ..store import Value
 from ..tolerances import INTERVAL, ROUNDING, TINY, TYPED
 from ..words import instance

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, divisor, real_array, whole
+from ..arrays import FloatArray, Rng, divisor, generator, real_array, whole
 from ..errors import (
     FlexplantError,
     LabelError,
@@ -19,7 +19,6 @@ from ..errors import (
     counted,
 )
 from ..modes.matching import NEAR
-from ..seeds import Rng, generator
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, ROUNDING, TINY, TYPED
 from .family import Point, changed_model
 from .judgement.goodness import chance, chi_square, is_bad, noise_misfit

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ComplexArray, FloatArray, between, positive, whole
+from ..arrays import MOST_DRAWS, ComplexArray, FloatArray, Rng, between, generator, positive, whole
 from ..errors import ModelError, attempted, counted, require_known, short, warn
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..modes.matching import ALIKE, CLUSTER, in_span
-from ..seeds import MOST_DRAWS, Rng, generator
 from ..sparse.factor import DENSE_LIMIT
 from ..store import Value
 from ..tolerances import INTERVAL

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray, positive, whole
+from ..arrays import FloatArray, Rng, generator, positive, whole
 from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress, expect
-from ..seeds import Rng, generator
 from ..structure.model import FEModel
 from ..tolerances import CLOSE, MOST_STEPS, TINY, TYPED
 from ..words import flag, instance

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import ComplexArray, FloatArray, between, whole
+from ...arrays import MOST_DRAWS, ComplexArray, FloatArray, between, generator, whole
 from ...certificates import Certificate, Verified, stability
 from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
@@ -20,7 +20,6 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
-from ...seeds import MOST_DRAWS, generator
 from ...store import Value
 from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, TYPED
 from ..hinf.tolerated_modes import mode_channels, tolerated, with_mode_channels

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import ComplexArray, FloatArray
+from ...arrays import ComplexArray, FloatArray, generator
 from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
@@ -25,7 +25,6 @@ from ...lti.response_solvers import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
 from ...plant.uncertainty.delta_blocks import Block, RepeatedScalar, filled_blocks
-from ...seeds import generator
 from ...store import Value
 from ...tolerances import NEGLIGIBLE, ROUNDING, TINY
 from .lower import crossing_multiple, destabilising, worst_corner

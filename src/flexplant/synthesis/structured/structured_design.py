@@ -9,14 +9,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...arrays import FloatArray, whole
+from ...arrays import MOST_DRAWS, FloatArray, Rng, generator, whole
 from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, short
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import AnyPlant, StandardPlant
-from ...seeds import MOST_DRAWS, Rng, generator
 from ...tolerances import CLOSE, NEGLIGIBLE, ROOT, SAME, TINY, TYPED
 from ..controller import Controller, certified_norm, reached_norms, required_stability
 from ..hinf.moved_design import PlantRange

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import ComplexArray, FloatArray, between, complex_array
+from ...arrays import ComplexArray, FloatArray, Rng, between, complex_array, generator
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...modes import matching
-from ...seeds import Rng, generator
 from ...sparse.symmetric import dense
 from ...store import Value
 from ...words import SHOWN
