@@ -38,7 +38,7 @@ LINES = [
     ("identification/refine.py", "self.cost += float(error @ error)",
      "self.cost += 2.0 * float(error @ error)"),
     ("lti/sampling.py", "np.asarray(asd)[loud] / np.sqrt(2.0)", "np.asarray(asd)[loud]"),
-    ("lti/discretisation.py", "np.arctan(0.5 * dt * omega)", "np.arctan(0.4 * dt * omega)"),
+    ("lti/conversions.py", "np.arctan(0.5 * dt * omega)", "np.arctan(0.4 * dt * omega)"),
     ("lti/sampling.py", "decay * np.sin(turning) /", "1.2 * decay * np.sin(turning) /"),
     ("identification/spectra.py", "count / (1.0 + 2.0 * doubled)", "1.0 * count"),
     ("reduction/ranking.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),

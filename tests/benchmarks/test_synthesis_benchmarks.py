@@ -17,7 +17,7 @@ import pytest
 
 from flexplant.estimation import design_kalman
 from flexplant.lti import StateSpace
-from flexplant.lti.discretisation import bilinear
+from flexplant.lti.conversions import bilinear
 from flexplant.plant import reference_errors, stage_weights
 from flexplant.synthesis import Lmi, design_hinf, design_servo
 from oracles_synthesis import brute_norm, closed_loop, split, stability

@@ -18,7 +18,7 @@ from flexplant.lti import (
     series,
     tustin,
 )
-from flexplant.lti.discretisation import bilinear
+from flexplant.lti.conversions import bilinear
 from flexplant.lti.sampling import held_exactly, pair_expm, pair_exponential
 from oracles_plant import delayed_run, hold
 

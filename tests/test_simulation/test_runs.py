@@ -6,7 +6,7 @@ import scipy.linalg
 
 from flexplant.loop import ClosedLoop, close_loop
 from flexplant.lti import StateSpace
-from flexplant.lti.discretisation import Recursion
+from flexplant.lti.response_solvers import Recursion
 from flexplant.lti.sampling import sample_and_hold
 from flexplant.plant import StandardPlant
 from flexplant.plant.building import white_noise

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, real_array
 from ..errors import LabelError, SolverError, counted, unknown_label, warn
-from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of, solve_stein
+from ..lti.response_solvers import Recursion
 from ..parallel import PIECE, one_thread
 from ..store import Value
 from ..tolerances import TYPED

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.sparse import csgraph
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..lti.discretisation import Recursion
 from ..lti.equations import solve_stein, sylvester
+from ..lti.response_solvers import Recursion
 from ..tolerances import FOUR_DIGITS, RESIDUAL, ROUNDING, TYPED
 from .estimator_channels import Recorded
 from .filter_models import FilterModel, innovation_root

@@ -66,8 +66,8 @@ from .balancing import norm_report as norm_report
 from .conversions import continuous as continuous
 from .conversions import descriptor as descriptor
 from .conversions import resampled as resampled
+from .conversions import tustin as tustin
 from .delays import Delayed as Delayed
-from .discretisation import tustin as tustin
 from .equations import solve_lyapunov as solve_lyapunov
 from .equations import solve_stein as solve_stein
 from .filters import high_pass_filter as high_pass_filter

@@ -1,20 +1,92 @@
-"""A sampled system taken back to continuous time or to another rate; a descriptor system."""
+"""Conversions between continuous and sampled time, other rates, descriptor systems."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arrays import FloatArray, positive, real_array
+from ..arrays import FloatArray, between, positive, real_array
 from ..errors import ModelError
 from ..tolerances import RANK, ROUNDING, SAME
 from ..words import one_of
-from .discretisation import bilinear, tustin
+from .blocks_of_states import bilinear_matrices, trapezoidal
 from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace
+
+
+def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSpace:
+    """Return the bilinear (Tustin) equivalent of a filter at a rate.
+
+    ``s = a (z - 1) / (z + 1)`` with a = 2 rate, or a = w / tan(w / (2 rate)) so that the response
+    at one frequency w is kept exactly.
+
+    Parameters
+    ----------
+    sys : StateSpace
+        A continuous system: a weight or a controller; for a plant use `discretized`.
+    rate : float [Hz]
+        Sampling rate.
+    prewarp : float [Hz], optional
+        The frequency at which the response is kept.
+
+    Returns
+    -------
+    StateSpace
+        System with dt = 1 / rate and the same names.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is sampled already, prewarp is not below half the rate, or a pole lies at a.
+
+    References
+    ----------
+    [Franklin1998]_, section 6.1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([1.0], [1.0, 1.0])
+    >>> fx.lti.tustin(lag, 10.0).poles().real.round(6)  # (20 - 1) / (20 + 1)
+    array([0.904762])
+    """
+    g = as_statespace(sys)
+    if g.dt and g.n_states:
+        raise ModelError(f"{g!r} is sampled already. Pass the continuous system.")
+    a = 2.0 * positive(rate, "rate")
+    if prewarp is not None:
+        why = "It is in Hz, below half the rate."
+        w = 2.0 * np.pi * between(prewarp, "prewarp", 0.0, 0.5 * rate, why)
+        a = w / np.tan(w / a)
+    if _has_pole_at(a, g.A):
+        raise ModelError(f"{g!r} has a pole at {a:g} rad/s, which Tustin maps to infinity.")
+    A, B, C, D = trapezoidal((g.A, g.B, g.C, g.D), a)
+    return g.replace(A=A, B=B, C=C, D=D, dt=1.0 / rate)
+
+
+def _has_pole_at(place: float, A: FloatArray) -> bool:
+    """Return whether an eigenvalue lies there; a condition number would depend on units."""
+    distance = np.abs(np.linalg.eigvals(A) - place)
+    return bool(np.min(distance, initial=np.inf) <= ROUNDING * abs(place))
+
+
+def image_freq(omega: Any, dt: float) -> Any:
+    """Return the frequencies [Hz] that belong to those of the bilinear image [rad/s]."""
+    return np.arctan(0.5 * dt * omega) / (np.pi * dt) if dt else omega / (2.0 * np.pi)
+
+
+def bilinear(sys: System, rate: float) -> StateSpace:
+    """Return the continuous system that `tustin` would sample to this one."""
+    # z = (a + s) / (a - s), a = 2 rate: stability and norms are kept; w = a tan(theta / 2)
+    g = as_statespace(sys)
+    a = 2.0 * positive(rate, "rate")
+    if _has_pole_at(-1.0, g.A):
+        raise ModelError(f"{g!r} has a pole at z = -1, which the bilinear map sends to infinity.")
+    A, B, C, D = bilinear_matrices((g.A, g.B, g.C, g.D), a)
+    return g.replace(A=A, B=B, C=C, D=D, dt=0.0, blocks=None)
 
 
 def continuous(sys: System, *, method: Literal["hold", "tustin"] = "hold") -> StateSpace:

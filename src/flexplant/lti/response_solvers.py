@@ -1,8 +1,9 @@
-"""The gains of a system at many frequencies: closed-form block solves, else those of any A."""
+"""What a system answers at many frequencies, or over a record: solvers arranged for speed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -357,3 +358,111 @@ def _schur_gains(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _
         ]
 
     return gains
+
+
+#: sizes of a block [samples]
+_SIZES = [2**k for k in range(8)]
+#: cost of an operation with a single vector, and of a call, relative to an operation in a matrix
+#: product
+ONE_VECTOR, CALL = 3.0, 3e4
+
+
+def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
+    """Return the cheapest size of a block, and its number of operations per sample."""
+
+    # n states, p outputs, m inputs; the preparation is shared by a number of samples
+    def cost(size: int) -> float:
+        prepare = 2 * size * n * n * (m + p) + 2 * np.log2(size) * n**3 + size**2 * n * p * m
+        step = (2 * ONE_VECTOR * n * n + CALL) / size
+        return float(step + 2 * n * (m + p) + (size + 1) * p * m + prepare / max(samples, 1))
+
+    size = min(_SIZES, key=cost)
+    return size, cost(size)
+
+
+class Recursion(NamedTuple):
+    """``x[k+1] = F x[k] + G v[k], out[k] = H x[k] + J v[k]``."""
+
+    F: FloatArray
+    G: FloatArray
+    H: FloatArray
+    J: FloatArray
+
+    def run(self, v: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) for inputs (N, m) from a first state (n,), and the last one."""
+        out, x = np.empty((v.shape[0], self.J.shape[0])), start
+        for piece, part, after in self.pieces(v, start):
+            out[piece], x = part, after
+        return out, x
+
+    def pieces(
+        self, v: FloatArray, start: FloatArray
+    ) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+        """Yield samples, their outputs (k, p) and the state after them, piece by piece."""
+        x, blocks = start, self.in_blocks(self.best_size(v.shape[0]))
+        whole = v.shape[0] // blocks.size * blocks.size
+        for first in range(0, whole, PIECE):
+            piece = slice(first, min(first + PIECE, whole))
+            out, x = blocks.run(v[piece], x)
+            yield piece, out, x
+        if whole < v.shape[0]:
+            rest, x = self.sample_by_sample(v[whole:], x)
+            yield slice(whole, v.shape[0]), rest, x
+
+    def sample_by_sample(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) and the last state, as the equations are written."""
+        out = np.empty((v.shape[0], self.J.shape[0]))
+        for k in range(v.shape[0]):
+            out[k] = self.H @ x + self.J @ v[k]
+            x = self.F @ x + self.G @ v[k]
+        return out, x
+
+    def best_size(self, samples: int) -> int:
+        """Return the size of a block that costs least for a record of this length."""
+        p, m = self.J.shape
+        return cheapest(self.F.shape[0], p, m, samples)[0]
+
+    def in_blocks(self, size: int) -> Blocks:
+        """Return the matrices of a block of a number of samples, a power of two."""
+        # with rows: x+ = x F' + v G'. what the first half of a block does to the second passes
+        # through the state between them
+        step, enter, see = (np.ascontiguousarray(part.T) for part in (self.F, self.G, self.H))
+        direct, done = [np.ascontiguousarray(self.J.T)], 1
+        while done < size:
+            direct.append(enter @ see)
+            enter, see = np.vstack([enter @ step, enter]), np.hstack([see, step @ see])
+            step, done = step @ step, 2 * done
+        return Blocks(step, enter, see, direct, size)
+
+
+class Blocks(NamedTuple):
+    """``x[k+b] = x[k] step + v enter``, ``out = x see + v direct``, rows v and out of b samples.
+
+    `direct` of a sample acts on itself, and then of 1, 2, 4, ... samples on as many that follow.
+    """
+
+    step: FloatArray
+    enter: FloatArray
+    see: FloatArray
+    direct: list[FloatArray]
+    size: int
+
+    def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state."""
+        # N is a whole number of blocks. everything except `x step` is a product of two matrices
+        count = v.shape[0] // self.size
+        v = np.ascontiguousarray(v)
+        states = np.empty((count + 1, x.size))
+        states[0] = x
+        np.matmul(v.reshape(count, -1), self.enter, out=states[1:])
+        moved = np.empty(x.size)
+        for now, following in pairwise(states):
+            np.dot(now, self.step, out=moved)
+            following += moved
+        out = v @ self.direct[0]
+        for k, later in enumerate(self.direct[1:], 1):
+            first, second = ((len(v) >> k, 2, size) for size in later.shape)
+            out.reshape(second)[:, 1] += v.reshape(first)[:, 0] @ later
+        by_block = out.reshape(count, -1)
+        by_block += states[:-1] @ self.see
+        return out, states[-1]

@@ -14,8 +14,7 @@ from ..errors import ModelError, ShapeError, counted, require_known
 from ..store import Value
 from ..tolerances import SPLIT, TYPED
 from ..words import known_units, one_of, with_unit
-from .discretisation import Recursion
-from .response_solvers import continuous_poles
+from .response_solvers import Recursion, continuous_poles
 from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace
 

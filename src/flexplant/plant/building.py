@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive
 from ..errors import ModelError, counted, warn
-from ..lti.discretisation import tustin
+from ..lti.conversions import tustin
 from ..lti.frequency import QUANTITIES
 from ..lti.interconnection import among, append, series
 from ..lti.sampling import (

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import divisor, positive, whole
 from ..errors import AssumptionError, ModelError, require_known
-from ..lti.discretisation import tustin
+from ..lti.conversions import tustin
 from ..lti.filters import high_pass_filter, inverse_sensitivity, lead_lag_filter
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import FloatArray, IntArray, divisor
 from ..loop import ClosedLoop
 from ..loop.blocks import applied_law
-from ..lti.discretisation import CALL, ONE_VECTOR, Blocks, Recursion, cheapest
+from ..lti.response_solvers import CALL, ONE_VECTOR, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import StandardPlant

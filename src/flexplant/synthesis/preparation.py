@@ -19,7 +19,7 @@ import scipy.linalg as la
 from ..arrays import FloatArray
 from ..errors import AssumptionError, ModelError
 from ..lti.blocks_of_states import Matrices
-from ..lti.discretisation import bilinear, image_freq, tustin
+from ..lti.conversions import bilinear, image_freq, tustin
 from ..lti.equations import mean_speed
 from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace

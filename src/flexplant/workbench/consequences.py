@@ -18,8 +18,8 @@ from ..arrays import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
 from ..loop.machine_figures import BANDWIDTH, MARGIN
-from ..lti.discretisation import Recursion
 from ..lti.interconnection import feedback, series
+from ..lti.response_solvers import Recursion
 from ..lti.sampling import discretized
 from ..parallel import bars_of_thread
 from ..plant import AnyPlant, StandardPlant

@@ -11,7 +11,7 @@ import numpy as np
 from ...arrays import whole
 from ...errors import ModelError, ShapeError, short
 from ...lti.blocks_of_states import block_matrix
-from ...lti.discretisation import tustin
+from ...lti.conversions import tustin
 from ...lti.statespace import StateSpace, as_statespace
 from ...store import Value, checked
 from ...words import flag

@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ...arrays import ComplexArray, FloatArray, whole
 from ...errors import CertificateError, ModelError, counted
-from ...lti.discretisation import image_freq
+from ...lti.conversions import image_freq
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...errors import CertificateError, ModelError
-from ...lti.discretisation import bilinear, tustin
+from ...lti.conversions import bilinear, tustin
 from ...lti.sampling import discretized
 from ...lti.statespace import StateSpace
 from ...tolerances import CLOSE

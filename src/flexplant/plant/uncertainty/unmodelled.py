@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ...arrays import FloatArray
 from ...errors import ModelError, require_known, short
-from ...lti.discretisation import bilinear, tustin
+from ...lti.conversions import bilinear, tustin
 from ...lti.riccati import filter_care
 from ...lti.statespace import StateSpace, single_channel
 from ...words import name_list

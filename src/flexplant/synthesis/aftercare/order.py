@@ -13,7 +13,7 @@ from ...certificates import Certificate, Verified, stability, stability_check, s
 from ...errors import CertificateError, FlexplantError, FlexplantWarning, ModelError
 from ...loop import close_loop
 from ...lti.balancing import balanced
-from ...lti.discretisation import tustin
+from ...lti.conversions import tustin
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import connect, feedback, lft, series

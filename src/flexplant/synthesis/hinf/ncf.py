@@ -13,7 +13,7 @@ from ...certificates import Certificate, Verified, stability_check
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
-from ...lti.discretisation import bilinear, tustin
+from ...lti.conversions import bilinear, tustin
 from ...lti.equations import OnAxisError, balanced_matrix, mean_speed
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import lft, series

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import number, positive, whole
 from ...errors import ModelError, ShapeError, counted, short
-from ...lti.discretisation import bilinear
+from ...lti.conversions import bilinear
 from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...store import Value, checked
 from ..controller import Controller

@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import FloatArray, whole
 from ...certificates import Certificate, Verified
 from ...errors import CertificateError, FlexplantError, ModelError, SolverError, counted
-from ...lti.discretisation import tustin
+from ...lti.conversions import tustin
 from ...lti.filters import zpk
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft, series, side_by_side

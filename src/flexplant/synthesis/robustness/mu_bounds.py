@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...arrays import ComplexArray, FloatArray, generator
 from ...errors import AssumptionError, ModelError, SolverError
-from ...lti.discretisation import bilinear, image_freq
+from ...lti.conversions import bilinear, image_freq
 from ...lti.equations import axis_frequencies, state_scale
 from ...lti.frequency_sweep import DRAWN, around_resonance
 from ...lti.modal import obstacle

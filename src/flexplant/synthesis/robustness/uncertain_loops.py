@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import FloatArray
 from ...errors import AssumptionError, ModelError, short
 from ...loop import ClosedLoop, close_loop
-from ...lti.discretisation import bilinear, image_freq, tustin
+from ...lti.conversions import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.response_solvers import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace, single_channel

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...errors import ModelError, counted
-from ...lti.discretisation import bilinear
+from ...lti.conversions import bilinear
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...plant import StandardPlant
 from ...plant.partitioned import Partition

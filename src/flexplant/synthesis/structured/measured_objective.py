@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import FloatArray, positive
 from ...errors import ModelError, require_known, short
-from ...lti.discretisation import tustin
+from ...lti.conversions import tustin
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
 from ...plant import AnyPlant

@@ -14,7 +14,7 @@ from ...arrays import FloatArray, real_array, whole
 from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.blocks_of_states import Matrices as LawMatrices
-from ...lti.discretisation import bilinear, tustin
+from ...lti.conversions import bilinear, tustin
 from ...lti.riccati import control_care, filter_care
 from ...lti.statespace import StateSpace, System
 from ...plant import AnyPlant
