@@ -320,7 +320,8 @@ def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
     if rng is None:
         return np.random.SeedSequence()
     numbers = [rng] if isinstance(rng, int | np.integer) else rng
-    if isinstance(numbers, list | tuple | np.ndarray) and getattr(numbers, "ndim", 1):
+    single = isinstance(numbers, np.ndarray) and not numbers.ndim
+    if isinstance(numbers, list | tuple | np.ndarray) and not single:
         entropy = [n for n in numbers if isinstance(n, int | np.integer) and n >= 0]
         if len(entropy) == len(numbers) and not any(isinstance(n, bool) for n in numbers):
             given = [int(n) for n in entropy]

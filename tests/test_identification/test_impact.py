@@ -9,8 +9,7 @@ import scipy.signal as ss
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import identify_modes, impact_frf
-from flexplant.testbeds.virtual_machine import DRAWING
-from flexplant.testbeds.virtual_plates import plate_modes, ritz_plate
+from flexplant.testbeds.virtual_machine import DRAWING, plate_modes, ritz_plate
 from oracles_identification import pole
 
 RATE = 4000.0

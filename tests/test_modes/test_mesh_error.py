@@ -6,7 +6,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.modes.modes import sampled_moves
-from flexplant.testbeds.virtual_plates import plate_modes, ritz_plate
+from flexplant.testbeds.virtual_machine import plate_modes, ritz_plate
 from oracles_mindlin import mindlin_frequencies
 
 #: so thin that rotary inertia, which the meshes lack, is 1e-6

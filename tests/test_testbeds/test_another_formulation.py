@@ -9,7 +9,7 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import InfeasibleError, LabelError, ModelError, ShapeError
 from flexplant.sparse.symmetric import dense
-from flexplant.testbeds.virtual_plates import ritz_plate
+from flexplant.testbeds.virtual_machine import ritz_plate
 from stages import RATE, ports
 
 PLATE = {

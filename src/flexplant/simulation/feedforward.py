@@ -23,9 +23,8 @@ from ..plant.port import DERIVATIVES, TERMS
 from ..store import Value
 from ..tolerances import SAME
 from ..words import flag, instance, name_list
-from .force_warnings import warn_beyond_ranges
 from .motion import SetPointProfile
-from .nonlinear_elements import Acts, split_elements
+from .nonlinear_elements import Acts, split_elements, warn_beyond_ranges
 
 #: number of frequency lines of the least squares, and lowest line relative to the bandwidth of the
 #: loop, or to one over the duration of the move

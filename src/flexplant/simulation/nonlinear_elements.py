@@ -1,4 +1,4 @@
-"""Nonlinear elements of a loop: limits, quantisation, hysteresis, lost samples, jitter."""
+"""Nonlinear elements of a loop: limits and moves beyond them, quantisation, jitter and others."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from ..arrays import FloatArray, between, divisor, positive, real_array
-from ..errors import ModelError, require_known, short
-from ..plant import StandardPlant
+from ..arrays import ComplexArray, FloatArray, between, divisor, positive, real_array
+from ..errors import AssumptionError, ModelError, require_known, short, warn
+from ..plant import StandardPlant, driven_axes
+from ..plant.axes import complex_gain, resting_frequency
+from ..plant.inverse import at_rest, followed_at_rest, solved
 from ..store import Value, checked
-from ..words import instance, why_not_called
+from ..tolerances import NEGLIGIBLE
+from ..words import instance, several, why_not_called
+from .motion import SetPointProfile
 
 
 def _upper_limit(value: Any, name: str) -> float:
@@ -469,3 +473,91 @@ def _checked_elements(name: str, element: Any) -> list[Acts]:
     if len(set(kinds)) < len(kinds):
         raise ModelError(f"{name!r} has two elements of one kind: give only one.")
     return listed
+
+
+#: number of derivatives of a move whose forces count: position (springs), velocity, acceleration
+_TERMS = 3
+
+
+def warn_beyond_ranges(
+    plant: StandardPlant, signals: Mapping[str, Any], elements: Mapping[str, Any], time: FloatArray
+) -> None:
+    """Warn of a `Saturation` that moves of references exceed, with the required values.
+
+    Values and rates of forces and readings are those of the plant near rest that follows the moves
+    exactly, without the forces that react to disturbances. References without a set-point profile
+    count as at rest.
+    """
+    limits = {name: one for name, given in elements.items() if (one := _limit(given)) is not None}
+    moves = {name: move for name, move in signals.items() if isinstance(move, SetPointProfile)}
+    if not limits or not moves or not plant.ports.followed:
+        return
+    for name, needed in _needed(plant, moves, list(limits), time).items():
+        limit, unit, driven = limits[name], plant.units.get(name, ""), name in plant.u
+        least = -limit.limit if limit.least is None else limit.least
+        low, high = float(needed.min(initial=0.0)), float(needed.max(initial=0.0))
+        who = f"the move of {', '.join(moves)} needs"
+        if low < least * (1.0 + NEGLIGIBLE) or high > limit.limit * (1.0 + NEGLIGIBLE):
+            advice = (
+                "Lower the acceleration of the move (its stroke, where springs are pushed), or "
+                "choose a stronger actuator"
+                if driven
+                else "Shorten the move, or choose a longer range"
+            )
+            warn(
+                f"{who} {low:.4g} to {high:.4g} {unit} of {name!r}, whose range is {least:.4g} to "
+                f"{limit.limit:.4g} {unit}. {advice}."
+            )
+        fastest = float(np.max(np.abs(np.diff(needed) / np.diff(time)), initial=0.0))
+        if limit.rate is not None and fastest > limit.rate * (1.0 + NEGLIGIBLE):
+            advice = (
+                "Lower the jerk of the move (its velocity, where springs are pushed), or choose a "
+                "faster amplifier"
+                if driven
+                else "Lower the velocity of the move"
+            )
+            warn(
+                f"{who} {name!r} to change by {fastest:.4g} {unit}/s, and its rate is "
+                f"{limit.rate:.4g} {unit}/s. {advice}."
+            )
+
+
+def _limit(given: Any) -> Saturation | None:
+    """Return the Saturation among the elements of a channel."""
+    listed = given if several(given) else [given]
+    return next((one for one in listed if isinstance(one, Saturation)), None)
+
+
+def _needed(
+    plant: StandardPlant, moves: Mapping[str, SetPointProfile], names: list[str], time: FloatArray
+) -> dict[str, FloatArray]:
+    """Return actuator forces and sensor readings over time, by name, during moves."""
+    found = {name: moves[name].at(time).position for name in names if name in moves}
+    try:
+        driven = driven_axes(plant, freq=resting_frequency(plant))
+    except AssumptionError:  # the plant has no inverse, which the design reports
+        return found
+    followed = {
+        p.derived(axis, "ref"): p.channel(axis) for p, axis in plant.assembled.ports.followed
+    }
+    if any(followed.get(name) not in driven.channels for name in moves):
+        return found
+    signals = np.zeros((len(driven.channels), _TERMS, time.size))
+    for name, move in moves.items():
+        signals[driven.channels.index(followed[name])] += np.array(move.at(time))[:_TERMS]
+    g, T, axes, dt = plant.system, driven.T, driven.channels, plant.dt
+    forced = [name for name in names if name in plant.u]
+    if forced:
+
+        def inverse(s: complex) -> ComplexArray:
+            G = complex_gain(g, s, axes, plant.u) @ T
+            return np.asarray(T @ solved(G, np.eye(len(axes), dtype=np.complex128), axes))
+
+        gains = at_rest(inverse, dt, axes, _TERMS)
+        forces = np.einsum("uam,amt->ut", gains, signals)
+        found |= {name: forces[plant.u.index(name)] for name in forced}
+    seen = [name for name in names if name in plant.y and name not in moves]
+    if seen:
+        places = followed_at_rest(g, T, plant.u, axes, seen, dt)[..., 0]
+        found |= dict(zip(seen, places @ signals[:, 0], strict=True))
+    return found

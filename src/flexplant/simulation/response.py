@@ -1,4 +1,4 @@
-"""Records of a run, and servo metrics: RMS, moving average, moving standard deviation."""
+"""Records of a run, their servo metrics (RMS, MA, MSD), and forces at their end that oppose."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
-from ..errors import ModelError, ShapeError, counted, unknown_label
+from ..errors import ModelError, ShapeError, counted, some_names, unknown_label, warn
 from ..estimation.estimator_channels import ChannelError
-from ..loop import Spectrum
+from ..loop import ClosedLoop, Spectrum
+from ..plant.axes import idle_forces, opposing_part
 from ..store import Value
 from ..tolerances import TYPED
 from ..words import check_names, known_units, name_list
@@ -290,3 +291,51 @@ def _cumulative(parts: FloatArray) -> FloatArray:
     out = np.zeros((*parts.shape[:-1], parts.shape[-1] + 1))
     np.cumsum(parts, axis=-1, out=out[..., 1:])
     return out
+
+
+#: fraction of a run at its end for the mean of forces, and its least number of samples
+_END, _FEWEST = 0.1, 20
+#: steady force, relative to the largest force of any actuator in the run, above which a warning is
+#: given
+_SHARE = 0.05
+#: multiple of the standard deviation at the end above which a mean counts as steady
+_STEADY = 3.0
+
+
+def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
+    """Warn of steady forces at the end of a run that move none of the axes of the POIs."""
+    # these forces only heat the actuators and bend the structure between them
+    count = max(_FEWEST, round(_END * run.time.size))
+    if not loop.machine.ports.z or len(loop.driven) < 2 or run.time.size <= count:
+        return
+    efforts = np.stack([np.atleast_2d(run[name]) for name in loop.driven])  # (m, runs, n_time)
+    most = np.abs(efforts).max(axis=(0, 2))
+    end = efforts[..., -count:]
+    mean = end.mean(axis=2)
+    if not np.any(np.abs(mean) > _SHARE * most):
+        return
+    idle = idle_forces(loop.machine, loop.driven)
+    mean = np.stack([opposing_part(idle, one) for one in mean.T], axis=1)
+    # the deviation of idle forces alone: those that move the machine may vary more
+    about = np.tensordot(idle @ np.linalg.pinv(idle), end, axes=1)
+    steady = np.abs(mean) > np.maximum(_SHARE * most, _STEADY * about.std(axis=2))
+    opposed = np.sum(steady, axis=0) > 1  # a single actuator cannot oppose itself
+    if np.any(opposed):
+        worst = int(np.argmax(np.where(opposed, np.abs(mean).max(axis=0), -np.inf)))
+        warn(_said(loop, mean[:, worst], steady[:, worst], float(most[worst])))
+
+
+def _said(loop: ClosedLoop, mean: FloatArray, steady: FloatArray, most: float) -> str:
+    """Return the warning of steady forces (m,), with the largest force of the run."""
+    units = loop.units
+    names = [
+        f"{name} with {mean[i]:.3g} {units.get(name, '')}".rstrip()
+        for i, name in enumerate(loop.driven)
+        if steady[i]
+    ]
+    return (
+        f"at the end of the run actuators steadily push against each other: {some_names(names)}. "
+        f"These forces move none of the POIs' axes; the largest force of the run is {most:.3g}. "
+        "Command the actuators together (design_servo, fx.plant.driven_axes), correct the offsets "
+        "and scales of their sensors, or give the difference of the forces a weight."
+    )

@@ -29,11 +29,10 @@ from ..plant.partitioned import require_sampled
 from ..plant.port import DERIVATIVES
 from ..tolerances import SAME, TYPED
 from ..words import flag, instance, several
-from .force_warnings import warn_beyond_ranges, warn_of_opposing_forces
 from .motion import SetPointProfile
 from .moving_machine import MovingMachine, trajectory
-from .nonlinear_elements import Acting, Acts, split_elements
-from .response import Response
+from .nonlinear_elements import Acting, Acts, split_elements, warn_beyond_ranges
+from .response import Response, warn_of_opposing_forces
 from .runs import Conditions, make_runner
 
 #: a signal over time: a set-point, one value per sample, a constant, or a function of time

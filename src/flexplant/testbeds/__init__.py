@@ -36,6 +36,6 @@ from .driven_machines import steering_mirror as steering_mirror
 from .lumped_machines import three_masses as three_masses
 from .virtual_blocks import magnet_stage as magnet_stage
 from .virtual_machine import WaferStage as WaferStage
-from .virtual_plates import wafer_stage as wafer_stage
+from .virtual_machine import wafer_stage as wafer_stage
 
 __dir__ = _public_names(__name__)

@@ -14,8 +14,16 @@ from ..modes import solve_modes
 from ..plant import GroundSpring, suspend
 from ..reduction import ModalTruncation, reduce
 from ..structure import FEModel, ModalDamping, PointMass
-from .virtual_machine import WaferStage
-from .virtual_plates import LATENCY, SECOND, SPREAD, STEP, PolynomialShape, lobatto, waves
+from .virtual_machine import (
+    LATENCY,
+    SECOND,
+    SPREAD,
+    STEP,
+    PolynomialShape,
+    WaferStage,
+    lobatto,
+    waves,
+)
 
 #: an aluminium block
 BLOCK: Mapping[str, Any] = {
