@@ -101,7 +101,7 @@ LINES = [
      "count * count"),
     ("identification/periodic.py", "1.0 - periods * noise /",
      "1.0 - noise /"),
-    ("identification/line_weights.py", "power / (1.0 - fitted_share)",
+    ("identification/lines.py", "power / (1.0 - fitted_share)",
      "power / 1.0"),
 ]  # fmt: skip
 

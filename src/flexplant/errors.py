@@ -67,6 +67,12 @@ class LabelError(FlexplantError, ValueError):
     """A name or a point is unknown, doubled or not allowed."""
 
 
+class ChannelError(LabelError, KeyError):
+    """A record or an estimate does not have a channel; also a KeyError, as for any Mapping."""
+
+    __str__ = Exception.__str__
+
+
 class ShapeError(FlexplantError, ValueError):
     """The sizes of the arrays do not belong together."""
 

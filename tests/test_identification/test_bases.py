@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from flexplant.identification.lines import Lines
 from flexplant.identification.pole_test import fewer_terms, more_terms
-from flexplant.identification.refine import Lines, PoleFit, refined
+from flexplant.identification.refine import PoleFit, refined
 from oracles_identification import modal_frf, noisy, pole
 
 FREQ = np.arange(8.0, 100.0, 0.25)
@@ -41,7 +42,7 @@ def test_costs_with_other_poles_are_those_of_whole_fits(seed):
     H = noisy(modal_frf(FREQ, true, phi, phi[:n_in]), DEVIATION, rng)
     weight = np.full(H.shape, np.sqrt(2.0) / DEVIATION)
     poles, part = true * (1.0 + 1e-3 * rng.normal(size=5)), phi[:n_in].astype(complex)
-    fit = PoleFit(Lines(FREQ, H, weight, LOWER, UPPER, None), poles, part)
+    fit = PoleFit(Lines(FREQ, H, weight, lower=LOWER, upper=UPPER), poles, part)
     whole = least_squares_cost(H, poles, part)
     assert fit.cost == pytest.approx(whole, rel=1e-8)
 
@@ -74,11 +75,11 @@ def test_other_numbers_of_residual_terms_gain_what_whole_fits_gain(seed):
         H = noisy(H, DEVIATION, rng)
         weight = np.sqrt(2.0) / (DEVIATION * rng.uniform(1.0, 2.0, H.shape))
         poles, part = true[:4], phi[:n_in, :4].astype(complex)
-        fit = PoleFit(Lines(FREQ, H, weight, LOWER, upper, None), poles, part)
+        fit = PoleFit(Lines(FREQ, H, weight, lower=LOWER, upper=upper), poles, part)
         trials = next(iter(propose(fit)))
         assert trials
         for trial in trials:
-            other = Lines(FREQ, H, weight, LOWER, trial.lines.upper, None)
+            other = Lines(FREQ, H, weight, lower=LOWER, upper=trial.lines.upper)
             gain = fit.cost - PoleFit(other, poles, part).cost
             assert trial.gain == pytest.approx(gain, rel=1e-6)
 
@@ -87,7 +88,7 @@ def test_a_fit_at_its_minimum_is_returned_as_it_is():
     rng = np.random.default_rng(0)
     true, phi = pole([20.0, 33.0, 50.0], [0.01] * 3), rng.normal(size=(4, 3))
     H = noisy(modal_frf(FREQ, true, phi, phi[:2]), DEVIATION, rng)
-    lines = Lines(FREQ, H, np.full(H.shape, np.sqrt(2.0) / DEVIATION), LOWER, UPPER, None)
+    lines = Lines(FREQ, H, np.full(H.shape, np.sqrt(2.0) / DEVIATION), lower=LOWER, upper=UPPER)
     fit = refined(lines, true, phi[:2] + 0j, steps=20, fine=True)
     for _ in range(9):
         again, fit = fit, refined(lines, fit.poles, fit.participation, steps=20, first=fit)

@@ -7,7 +7,7 @@ from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.identification.diagram import Moments
-from flexplant.identification.terms import pole_terms, residual_terms
+from flexplant.identification.lines import pole_terms, residual_terms
 from flexplant.lti import Frf
 from oracles_identification import held_mode, modal_frf, pole
 

@@ -20,7 +20,7 @@ from flexplant.identification import (
     identify_modes,
     stabilisation_diagram,
 )
-from flexplant.identification.line_weights import prepared_lines
+from flexplant.identification.lines import Lines, prepared_lines
 from flexplant.identification.pole_test import (
     improved,
     missed_poles,
@@ -28,7 +28,7 @@ from flexplant.identification.pole_test import (
     split_proposals,
     unexplained,
 )
-from flexplant.identification.refine import LEAST, Lines, PoleFit, refined
+from flexplant.identification.refine import LEAST, PoleFit, refined
 from flexplant.lti import Frf
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole
 
@@ -120,7 +120,7 @@ def test_a_missed_mode_is_warned_of_and_a_merged_one_added():
         alone = identify_modes(frf, start=start)
     score = np.abs(alone.poles - CLOSE[2]) / np.abs(alone.std)
     assert score[0] > 4  # as it was without a word
-    lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
+    lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), lower=2, upper=3)
     fit = refined(lines, CLOSE[[2]], PHI[:3, [2]].astype(complex), steps=150)
     assert unexplained(fit)[0].freq == pytest.approx(90.04, abs=0.1)
     fit = improved(fit, [(missed_poles, 6)], steps=150)
@@ -203,7 +203,7 @@ def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
     found = identify_modes(frf, orders=range(2, 25))
     assert len(found) == 6
     assert np.sum(np.abs(found.freq - 120.0) < 0.3) == 2
-    ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 5, None)
+    ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), lower=2, upper=5)
     one = refined(ready, found.poles[:5], found.participation[:, :5], steps=150)
     two = improved(one, [(split_proposals, 6)], steps=150)
     assert two.poles.size == 6
@@ -215,7 +215,7 @@ def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
 def test_a_pair_is_taken_apart_with_one_input():
     truth = pole([47.5, 48.2, 112.0], [0.004, 0.004, 0.01])
     frf = measured(truth, PHI[:, :3], n_in=1, level=1e-2)
-    ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
+    ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), lower=2, upper=3)
     merged = refined(ready, truth[1:], np.ones((1, 2), dtype=complex), steps=150)
     assert merged.poles.size == 2
     apart = improved(merged, [(split_proposals, 6)], steps=150)
@@ -227,7 +227,7 @@ def test_a_few_outputs_prove_a_pole_that_all_share():
     """The fits of the other outputs alone, which take most of the time, are not made then."""
     truth = pole([47.5, 80.0, 112.0], [0.004, 0.004, 0.01])
     frf = measured(truth, PHI[:, :3], n_in=1, level=1e-3)
-    lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
+    lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), lower=2, upper=3)
     ones = np.ones((1, 3), dtype=complex)
     less, more = (refined(lines, truth[:m], ones[:, :m], steps=150) for m in (2, 3))
     assert len(lines.parts) > 1
@@ -285,7 +285,7 @@ def test_refined_poles_stay_stable():
     s = 2j * np.pi * freq
     truth = pole([70.0, 130.0], [-0.01, 0.01])  # the first one grows
     H = sum(1e3 / (s - p) + 1e3 / (s - p.conjugate()) for p in truth)
-    lines = Lines(freq, H[None, None], np.ones((1, 1, freq.size)), 0, 0, None)
+    lines = Lines(freq, H[None, None], np.ones((1, 1, freq.size)), lower=0, upper=0)
     start = pole([70.5, 130.2], [0.01, 0.02])
     found = refined(lines, start, np.ones((1, 2), complex), steps=100).poles
 
@@ -516,7 +516,7 @@ def test_two_modes_at_one_input_stay_two_without_a_variance():
 def test_slopes_against_central_differences():
     frf = measured(CLOSE[[0, 2, 6]], PHI[:, :3], n_in=2, freq=np.arange(40.0, 170.0, 1.0))
     weight = np.sqrt(2.0 / frf.variance)
-    lines = Lines(frf.freq, frf.data, weight, 2, 2, None)
+    lines = Lines(frf.freq, frf.data, weight, lower=2, upper=2)
     poles = CLOSE[[0, 2, 6]] * (1 + 1e-4)
     part = np.array([[1.0, 1.0, 0.3 - 0.1j], [0.4, -0.2j, 1.0]])
     pivots = np.array([0, 0, 1])

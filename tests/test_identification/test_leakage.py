@@ -17,7 +17,7 @@ from flexplant.identification import (
     impact_frf,
     multisine,
 )
-from flexplant.identification.terms import hann_ratio
+from flexplant.identification.lines import hann_ratio
 from flexplant.io import read_frf_csv, write_frf_csv
 from flexplant.lti import Frf
 from oracles_identification import pole

@@ -5,8 +5,8 @@ import pytest
 
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import identify_modes, stabilisation_diagram
-from flexplant.identification.line_weights import prepared_lines
-from flexplant.identification.refine import Lines, pivoted
+from flexplant.identification.lines import Lines, prepared_lines
+from flexplant.identification.refine import pivoted
 from flexplant.lti import Frf
 from oracles_identification import modal_frf, pole
 
@@ -64,7 +64,7 @@ def test_poles_that_nearly_coincide_keep_the_equations_of_a_step_positive():
     """Their difference held rounding of the residual terms: an eigenvalue of -2e-8, refused."""
     _, frf = record(3, spacing=0.5)
     ready = prepared_lines(frf, None)
-    lines = Lines(ready.freq, ready.data, ready.weight, 2, 9, None)
+    lines = Lines(ready.freq, ready.data, ready.weight, lower=2, upper=9)
     poles = pole([0.98151, 0.98177, 63.0, 120.0, 200.0, 340.0], np.array([1e-7, 1e-7, *[1e-2] * 4]))
     part = np.random.default_rng(3).normal(size=(2, 6)) + 0j
     part[:, 1] = part[:, 0] * (1 + 1e-2j)

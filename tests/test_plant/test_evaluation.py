@@ -9,7 +9,7 @@ import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response
 from flexplant.modes import solve_modes
-from flexplant.plant import assemble_plant, building, evaluation_model
+from flexplant.plant import assemble_plant, building, partitioned
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import ModalDamping
 from plates import make_plate
@@ -168,7 +168,7 @@ def test_a_system_made_elsewhere_has_a_plant_as_its_evaluation_model():
 def test_it_is_solved_and_assembled_once(monkeypatch):
     """Its modes are solved once, and its plant is assembled once, whoever asks for it."""
     calls = Counter()
-    for owner, name in ((evaluation_model, "plant_modes"), (building, "continuous_plant")):
+    for owner, name in ((partitioned, "plant_modes"), (building, "continuous_plant")):
         plain = getattr(owner, name)
 
         def counted(*given, plain=plain, name=name):

@@ -30,10 +30,10 @@ from .causes import (
     sampled_modes,
     settling,
 )
+from .error import row_of
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import poi_channels, row_of
-from .filter_models import left_out
+from .filter_models import left_out, poi_channels
 from .innovations import (
     ExcessPeak,
     InnovationLines,

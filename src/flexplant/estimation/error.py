@@ -5,6 +5,7 @@ The model of its design is not used.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError, unknown_label, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.blocks_of_states import ModalMap, equal_matrices
@@ -34,7 +35,7 @@ from ..plant.machine_plants import FigureInterval, interval, interval_text
 from ..store import Value
 from ..tolerances import CLOSE, INTERVAL, MISSED, ROOT, ROUNDING, TINY, TYPED
 from ..words import SHOWN, sizes_of
-from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
+from .filter_models import poi_channels, same_pois, sensors
 
 #: fraction of a variance above which such modes are named
 _MOST = 0.5
@@ -504,3 +505,30 @@ class PoiFilter(PoiEstimator):
         elif on is not None:
             variances = error_variances(same_pois(self.plant, on), self.system).values
         return float(np.sqrt(max(variances[row], 0.0)))
+
+
+def estimates(channels: Sequence[str], kind: str = "hat") -> tuple[str, ...]:
+    """Return the names of the estimates, such as `die:hat` and `die:rx:hat`."""
+    first = _firsts(channels)
+    owners = [channel.rpartition(":")[0] or channel for channel in channels]
+    return tuple(
+        f"{poi if first[poi] == i else channels[i]}:{kind}" for i, poi in enumerate(owners)
+    )
+
+
+def row_of(channels: Sequence[str], name: str) -> int:
+    """Return the POI channel of a name: `die`, `die:z`, `die:hat` and `die:error` are equal."""
+    known: dict[str, int] = {}
+    for kind in ("hat", "error"):
+        known |= {alias: i for i, alias in enumerate(estimates(channels, kind))}
+    known |= _firsts(channels)
+    known |= {channel: i for i, channel in enumerate(channels)}
+    if not isinstance(name, str) or name not in known:
+        raise unknown_label("POI channel", name, channels)
+    return known[name]
+
+
+def _firsts(channels: Sequence[str]) -> dict[str, int]:
+    """Return the first channel of each POI."""
+    last_first = reversed([*enumerate(channels)])
+    return {channel.rpartition(":")[0] or channel: i for i, channel in last_first}

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, real_array
-from ..errors import LabelError, SolverError, counted, unknown_label, warn
+from ..errors import ChannelError, LabelError, SolverError, counted, unknown_label, warn
 from ..lti.equations import scale_of, solve_stein
 from ..lti.response_solvers import Recursion
 from ..parallel import PIECE, one_thread
 from ..store import Value
 from ..tolerances import TYPED
 from ..words import instance, known_units, sizes_of
-from .estimator_channels import ChannelError, estimates, recorded, row_of
+from .error import estimates, row_of
 from .filter_models import FEW_DIGITS, FilterModel, innovation_root
-from .passage import STATIONARY, Moment, Start, Walk, stationary_start
+from .passage import STATIONARY, Moment, Start, Walk, recorded, stationary_start
 from .steady_filter import Filter, FixedLag, Lag, Predictor, Sight, Smoother, Steady
 
 #: fraction of a sensor's samples above which gated samples are not outliers

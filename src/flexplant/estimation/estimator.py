@@ -18,8 +18,15 @@ from ..plant import AnyPlant
 from ..tolerances import TYPED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
-from .estimator_channels import poi_channels
-from .filter_models import LEFT_OUT, FilterModel, LeftOut, beyond_text, filter_model, left_out
+from .filter_models import (
+    LEFT_OUT,
+    FilterModel,
+    LeftOut,
+    beyond_text,
+    filter_model,
+    left_out,
+    poi_channels,
+)
 from .lag_report import LAGS, LagReport, lag_errors
 from .steady_filter import Filter, Lag, Sight
 

@@ -13,22 +13,21 @@ from typing import Any
 import numpy as np
 
 from ..arrays import ComplexArray, FloatArray, IntArray, divisor
-from ..errors import AssumptionError, ModelError, SolverError, counted
+from ..errors import AssumptionError, ModelError, SolverError, counted, unknown_label
 from ..lti.blocks_of_states import ModalMap
 from ..lti.equations import square_root
-from ..lti.statespace import StateSpace
+from ..lti.statespace import StateSpace, System
 from ..modes.matching import NEAR, assigned
-from ..plant import AnyPlant, StandardPlant
+from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of, standard_plant
 from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
-from ..plant.evaluation_model import NOT_JUDGED
 from ..plant.origins import Assembled
+from ..plant.partitioned import NOT_JUDGED
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..store import Value
-from ..tolerances import ROUNDING
-from .estimator_channels import poi_channels, sensors
+from ..tolerances import ROUNDING, SAME
 
 #: error text where a covariance cannot be followed sample by sample
 FEW_DIGITS = (
@@ -500,3 +499,56 @@ def _difference(one: Any, other: Any) -> FloatArray:
     seen = np.hstack([one[2], -other[2]])
     X = -(driven @ driven.conj().T) / (poles[:, None] + poles.conj())
     return np.asarray((seen @ X @ seen.conj().T).real)
+
+
+#: z channels that are not motions of a POI
+DERIVED = (":error", ":effort")
+
+
+def checked_plant(given: AnyPlant | System) -> AnyPlant:
+    """Return a StandardPlant that has something to estimate and to measure."""
+    plant = plant_of(given)
+    if isinstance(plant, GeneralizedPlant) and plant.scaled:
+        plant = standard_plant(plant)  # refuses weights: an estimator is of physical channels
+    plain = plant.machine
+    mixed = [plain.y.index(name) for name in plain.y if name in plain.w]
+    rows = [plant.y.index(name) for name in sensors(plant)]
+    if np.any(plant.reading_gain[np.ix_(rows, mixed)]):
+        raise ModelError(
+            "the block that the plant is read through mixes references with sensors: a reference "
+            "would look like a motion. Estimate from the sensors, on plant.unweighted."
+        )
+    for side, names in (("POI in z", poi_channels(plant)), ("sensor in y", sensors(plant))):
+        if not names:
+            raise AssumptionError(f"the plant has no {side}, which an estimator needs.")
+    return plant
+
+
+def sensors(plant: AnyPlant) -> tuple[str, ...]:
+    """Return the names in y that are measurements; references are in w as well."""
+    return tuple(name for name in plant.y if name not in plant.w)
+
+
+def poi_channels(plant: AnyPlant) -> tuple[str, ...]:
+    """Return the names in z that are motions of POIs."""
+    return tuple(name for name in plant.z if not name.endswith(DERIVED))
+
+
+def same_pois(plant: AnyPlant, on: AnyPlant | System) -> AnyPlant:
+    """Return another plant that has the sensors, POIs and sampling time of the first."""
+    other: AnyPlant = plant.around(plant_of(on).machine)
+    if not np.isclose(other.dt, plant.dt, rtol=SAME, atol=0.0):
+        raise ModelError(
+            "the error of an estimator needs a plant of its sampling time, "
+            f"{plant.dt:g} s, got {other.dt:g} s. Sample both at one rate."
+        )
+    for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
+        for name in names:
+            if name not in getattr(other, side):
+                raise unknown_label(f"channel of {side} of the other plant", name, names)
+    if poi_channels(other) != poi_channels(plant):
+        raise ModelError(
+            f"the other plant has the POIs {', '.join(poi_channels(other))}, the filter's has "
+            f"{', '.join(poi_channels(plant))}. Assemble both with the same ports."
+        )
+    return other

@@ -19,15 +19,17 @@ from ..parallel import one_thread
 from ..plant import AnyPlant
 from ..plant.partitioned import require_noise, require_sampled
 from ..tolerances import CLOSE, RESIDUAL, TYPED
-from .error import error_variances
+from .error import error_variances, estimates
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, estimates, poi_channels, sensors
 from .filter_models import (
     LEFT_OUT,
     FilterModel,
     LeftOut,
+    checked_plant,
     filter_model,
     left_out,
+    poi_channels,
+    sensors,
     unsure_noise,
     weigh,
 )

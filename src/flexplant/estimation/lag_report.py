@@ -22,8 +22,8 @@ from ..plant.inverse import moved_at_rest
 from ..plant.partitioned import require_sampled
 from ..store import Value
 from ..tolerances import SAME
-from .error import PoiEstimator, error_variances
-from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
+from .error import PoiEstimator, error_variances, estimates, row_of
+from .filter_models import checked_plant, poi_channels, same_pois, sensors
 from .steady_filter import Sight, Steady
 
 #: lags of the table [s]

@@ -30,7 +30,7 @@ from .causes import settling
 from .consistency_tests import consistency
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, sensors
+from .filter_models import checked_plant, sensors
 from .innovations import seen_from_states, squared
 from .kalman import design_kalman
 

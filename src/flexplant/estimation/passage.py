@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from functools import cached_property
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csgraph
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray, floats, real_array
+from ..errors import LabelError, ModelError, ShapeError, short, unknown_label
 from ..lti.equations import solve_stein, sylvester
 from ..lti.response_solvers import Recursion
+from ..parallel import PIECE
 from ..tolerances import FOUR_DIGITS, RESIDUAL, ROUNDING, TYPED
-from .estimator_channels import Recorded
 from .filter_models import FilterModel, innovation_root
 from .steady_filter import FilterGains, Sight, Steady, filter_gains
 
@@ -454,3 +455,89 @@ def kept_states(A: FloatArray) -> IntArray:
         if radius >= (1.0 - ROUNDING):
             kept.append(states)
     return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)
+
+
+class Recorded(NamedTuple):
+    """A record: time (N,), measurements y with NaN where missing, and commands u.
+
+    `both` is [y u] (N, ny + nu).
+    """
+
+    time: FloatArray
+    both: FloatArray
+    ny: int
+
+    @property
+    def y(self) -> FloatArray:
+        """Measurements (N, ny)."""
+        return self.both[:, : self.ny]
+
+    @property
+    def u(self) -> FloatArray:
+        """Commands (N, nu)."""
+        return self.both[:, self.ny :]
+
+
+def recorded(records: Any, model: Any) -> Recorded:
+    """Return the sensors and commands of a filter's model from what was recorded."""
+    if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
+        raise ModelError(
+            f"records must give channels by name, got {short(records)}. Pass a Response, a data "
+            "frame, or a mapping such as {'y1': array, 'u1': array}."
+        )
+    known = [str(name) for name in records.keys()]  # noqa: SIM118 - a data frame iterates so too
+    for name in (*model.sensors, *model.commands):
+        if name not in known:
+            missing = unknown_label("channel", name, known, "the records")
+            what = (
+                "A sensor that was not recorded is an array of NaN"
+                if name in model.sensors
+                else "A command that was not given is an array of zeros"
+            )
+            raise LabelError(f"{missing} {what}: the filter needs all of its channels.")
+    names = (*model.sensors, *model.commands)
+    parts = [_run_values(records[n], n, missing=n in model.sensors) for n in names]
+    sizes = {name: part.size for name, part in zip(names, parts, strict=True)}
+    if len(set(sizes.values())) > 1:
+        raise ShapeError(
+            f"channels of one record have one length, got {short(sizes)}. Cut them to the same "
+            "samples, or fill what is missing of a sensor with NaN."
+        )
+    count, ny = parts[0].size, len(model.sensors)
+    if not count:
+        raise ShapeError("the record is empty: give at least one sample.")
+    both = np.empty((count, len(parts)))
+    for first in range(0, count, PIECE):  # a piece of all columns stays in the cache
+        piece = slice(first, first + PIECE)
+        for i, part in enumerate(parts):
+            both[piece, i] = part[piece]
+    return Recorded(_time(records, known, count, model.dt), both, ny)
+
+
+def _run_values(values: Any, name: str, *, missing: bool) -> FloatArray:
+    array = floats(values, f"channel {name!r}")
+    if array.ndim != 1:
+        raise ShapeError(
+            f"channel {name!r} must be (N,), one run over time, got {array.shape}. Of several runs "
+            "take one: response.replace(data=response.data[0])."
+        )
+    if missing and not np.any(np.isinf(array)):
+        return array
+    return real_array(values, f"channel {name!r}")
+
+
+def _time(records: Any, known: list[str], count: int, dt: float) -> FloatArray:
+    """Return the times, which must be in steps of dt."""
+    given = records["time"] if "time" in known else getattr(records, "time", None)
+    if given is None or callable(given):
+        return np.asarray(dt * np.arange(count))
+    time = real_array(given, "time", (count,))
+    steps = np.diff(time)
+    if steps.size and np.max(np.abs(steps - dt)) > 1e-3 * dt:  # clocks of recorders
+        k = int(np.argmax(np.abs(steps - dt)))
+        raise ModelError(
+            f"the record goes from {time[k]:.9g} to {time[k + 1]:.9g} s in one sample, the samples "
+            f"of the filter are {dt:.9g} s apart. Design it at the rate of the record, and put NaN "
+            "in the place of samples that were lost."
+        )
+    return time

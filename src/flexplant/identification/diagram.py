@@ -26,7 +26,7 @@ from ..errors import ModelError, SolverError, counted
 from ..modes.matching import assigned, in_span, mac_matrix
 from ..store import Value, checked
 from ..tolerances import NULL, SAME, TINY
-from .line_weights import NEAR, PreparedLines
+from .lines import NEAR, PreparedLines
 
 #: flags of a pole; each includes the previous ones
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,18 @@ from ..modes.matching import ALIKE, mac_matrix
 from ..parallel import Progress, expect
 from ..tolerances import TINY
 from .diagram import PoleSelection, StabilisationDiagram, diagram_of, weighted_by_remainder
-from .line_weights import NARROW, NEAR, PreparedLines, Rejected, mains_multiple
+from .lines import (
+    NARROW,
+    NEAR,
+    UPPER,
+    Exhausted,
+    Lines,
+    PreparedLines,
+    Products,
+    Rejected,
+    afforded_terms,
+    mains_multiple,
+)
 from .model_error import (
     NOISE,
     SAME_RESONANCE,
@@ -43,9 +54,8 @@ from .pole_test import (
     unwindowed,
     warned,
 )
-from .refine import Exhausted, Lines, PoleFit, Products, pivoted, refined, scaled_inverse
+from .refine import PoleFit, pivoted, refined, scaled_inverse
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
-from .terms import UPPER, afforded_terms
 
 
 def gated(
@@ -247,15 +257,17 @@ class Task:
             # outputs would seem to disagree
             most = afforded_terms(ready.freq.size, self.lower)
             upper = UPPER[-1] if self.hold is None else max(UPPER[-1], *most, 0)
+        known = {one.name: getattr(ready, one.name) for one in fields(PreparedLines)}
         return Lines(
-            *(ready.freq, ready.data, ready.weight, self.lower, upper, self.hold, ready.known),
+            **(known | {"side": rows}),
+            lower=self.lower,
+            upper=upper,
+            hold=self.hold,
             late=self.delay % 1.0,
-            inflation=ready.inflation,
             variance_freedom=self.frf.freedom,
             segment=hann_segment(self.frf),
             most=self.most,
             work=self.budget,
-            side=rows,
             setups=self.together if self.side == rows else (),
         )
 

@@ -25,9 +25,8 @@ from .diagram import (
 )
 from .frf_estimation import repetitions, stacked_runs
 from .identification_stages import MOST_POLES, RUNS, Task, identified
-from .line_weights import PreparedLines, prepared_lines
+from .lines import UPPER, PreparedLines, axis, pole_terms, prepared_lines, residual_terms
 from .result import IdentifiedModes, of_segments
-from .terms import UPPER, axis, pole_terms, residual_terms
 
 #: largest number of residual terms on one side of the band: higher powers of a frequency cannot be
 #: distinguished in double precision

@@ -15,7 +15,7 @@ from ..lti.frequency import Frf, error_statistics
 from ..store import Value
 from ..tolerances import CERTAIN, TINY
 from ..words import instance
-from .line_weights import mains_multiple
+from .lines import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, records
 

@@ -10,8 +10,8 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError
 from ..modes.matching import ALIKE, mac_matrix
 from ..tolerances import CERTAIN, CHANCE, MOST_STEPS, NEGLIGIBLE, TINY
-from .line_weights import NEAR
-from .refine import OWN, Lines, PoleFit, pivoted, refined, scaled_inverse
+from .lines import NEAR, Lines
+from .refine import OWN, PoleFit, pivoted, refined, scaled_inverse
 
 #: distance, in half-widths (geometric mean of two poles), within which poles of different shapes
 #: may be one resonance; one bandwidth where the weaker pole is the broader: the remainder of a

@@ -13,6 +13,7 @@ from ..arrays import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from ..tolerances import CERTAIN, CHANCE, CLOSE, NULL, SAME
 from .diagram import BROADEST
+from .lines import UPPER, Lines, afforded_terms
 from .model_error import (
     coherence,
     corroborated,
@@ -22,8 +23,7 @@ from .model_error import (
     supported,
     twin_poles,
 )
-from .refine import Lines, PoleFit, pivoted, refined
-from .terms import UPPER, afforded_terms
+from .refine import PoleFit, pivoted, refined
 
 #: probability that noise is taken for outputs that disagree; real differences are far larger
 ALARM = 1e-9

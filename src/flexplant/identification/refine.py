@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,20 +11,8 @@ import scipy.linalg as la
 
 from ..arrays import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted, counted
-from ..parallel import so_far
 from ..tolerances import RANK, TINY
-from .terms import (
-    FAR_APART,
-    axis,
-    halves,
-    orthonormal,
-    pole_terms,
-    qr,
-    real_and_imag,
-    residual_terms,
-    take_off,
-    with_residues,
-)
+from .lines import FAR_APART, Lines, orthonormal, real_and_imag, take_off
 
 #: largest entry of a participation vector relative to the one held at 1
 RUNAWAY = 5.0
@@ -42,139 +29,6 @@ OWN_SQUARE = 1e-6
 #: least damping ratio of a pole, and its largest distance from zero relative to the highest line:
 #: there the pole is a constant within 1 %, and with a hold its exponential does not overflow
 LEAST, FARTHEST = 1e-7, 100.0
-
-
-class Exhausted(Exception):  # noqa: N818 - not an error: the first result is kept
-    """A refinement exceeds its allowed number of operations."""
-
-
-@dataclass
-class Products:
-    """Number of operations of fits so far, the allowed number, and the expected one."""
-
-    most: float = np.inf
-    done: float = 0.0
-    expected: float = 1.0
-
-    def add(self, count: float) -> None:
-        """Count more operations and tell the bar; raise Exhausted above the limit."""
-        self.done += count
-        if self.done > self.most:
-            raise Exhausted
-        so_far(self.done, min(self.expected, self.most))
-
-
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """Data of a fit: responses, their weights, and residual terms."""
-
-    freq: FloatArray
-    data: ComplexArray  # (n_out, n_in, n_freq)
-    weight: FloatArray  # the same shape: sqrt(2)/standard deviation
-    lower: int
-    upper: int
-    hold: float | None
-    #: fraction of a period of the hold by which its input acts late; the data are advanced by it
-    late: float = field(default=0.0, kw_only=True)
-    known: bool = True  # whether the weights are those of a known variance
-    #: variance of a mean over many lines, relative to independent ones
-    inflation: float = 1.0
-    #: complex degrees of freedom of an estimated variance, None where it is exact or the fit's own
-    variance_freedom: float | None = None
-    #: length [s] of the Hann-windowed segments that the fit takes account of
-    segment: float | None = None
-    #: poles that a fit may have
-    most: int = 1000
-    work: Products = field(default_factory=Products)
-    #: name of the first axis of the data, and which of its rows were measured together
-    side: str = "outputs"
-    setups: tuple[IntArray, ...] = ()
-
-    @cached_property
-    def spacing(self) -> float:
-        """Usual distance [Hz] of neighbouring lines."""
-        return float(np.median(np.diff(self.freq)))
-
-    @property
-    def parts(self) -> tuple[IntArray, ...]:
-        """Groups of rows that may have separate poles: the rows of a set-up, otherwise each row."""
-        return self.setups or tuple(np.arange(len(self.data))[:, None])
-
-    def freedom(self, m: int) -> float:
-        """Return the expected cost of a fit with m poles: number of data minus parameters."""
-        # where errors of lines are correlated each parameter fits `inflation` times as much of them
-        n_out, n_in, _ = self.data.shape
-        used = n_out * n_in * (self.lower + self.upper) + 2 * m * (n_out + n_in)
-        return float(max(1.0, 2 * self.data.size - self.inflation * used))
-
-    def of_rows(self, rows: IntArray) -> Lines:
-        """Return the lines of some outputs."""
-        some = replace(self, data=self.data[rows], weight=self.weight[rows], setups=())
-        # the part of the residual terms is known
-        some.__dict__["smooth_bases"] = [self.smooth_bases[o] for o in rows]
-        some.__dict__["goals"] = [self.goals[o] for o in rows]
-        some.__dict__["twice"] = self.twice[rows]
-        return some
-
-    def with_upper(self, upper: int) -> Lines:
-        """Return the lines with another number of residual terms of modes above the band."""
-        other, count = replace(self, upper=upper), self.lower + upper
-        other.__dict__["twice"] = self.twice
-        if upper <= self.upper:
-            # bases of fewer terms are the leading columns
-            other.__dict__["smooth_bases"] = [
-                (Q[:, :, :count], R[:, :count, :count]) for Q, R in self.smooth_bases
-            ]
-        return other
-
-    def pole_terms(self, poles: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the terms (m, n_freq) of poles and their derivatives."""
-        return pole_terms(poles, axis(self.freq), self.hold, self.segment, late=self.late)
-
-    @cached_property
-    def smooth(self) -> ComplexArray:
-        """The residual terms (n_terms, n_freq)."""
-        top = 2 * np.pi * float(self.freq[-1])
-        return residual_terms(
-            axis(self.freq),
-            lower=self.lower,
-            upper=self.upper,
-            hold=self.hold,
-            top=top,
-            late=self.late,
-        )
-
-    @cached_property
-    def twice(self) -> FloatArray:
-        """The weights (n_out, n_in, 2 n_freq) of real and imaginary parts."""
-        return np.concatenate([self.weight, self.weight], axis=-1)
-
-    @cached_property
-    def smooth_bases(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Per output Q (n_in, 2 n_freq, n_terms) and R of the weighted residual terms."""
-        # the terms are made orthonormal with mean weights first: with others little is left to do
-        mean = np.sqrt(np.mean(self.twice**2, axis=(0, 1)))
-        shared, R = qr((real_and_imag(self.smooth) * mean).T)
-        terms, found = shared.T / mean, []
-        bases = np.empty((*self.twice.shape[:2], *terms.shape))
-        for weights, Q in zip(self.twice, bases, strict=True):
-            triangles = []
-            for w, own in zip(weights, Q, strict=True):
-                np.multiply(terms, w, out=own)
-                mine, _, size, turn = orthonormal(own)
-                own[:] = turn @ own
-                triangles.append((mine * size) @ R)
-            found.append((Q.swapaxes(1, 2), np.array(triangles)))
-        return found
-
-    @cached_property
-    def goals(self) -> list[FloatArray]:
-        """Per output the weighted data (n_in 2 n_freq,) without the residual terms."""
-        found = []
-        for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
-            goal = real_and_imag(data * w)[:, None, :]
-            found.append(take_off(Q, goal).ravel())
-        return found
 
 
 def refined(
@@ -575,6 +429,24 @@ class PoleFit:
         n_in, n_freq = self.lines.data.shape[1:]
         rows = (self.bases[o] @ own.T).reshape(n_in, 2, n_freq, 2 * self.m)
         return np.asarray(rows[:, 0] + 1j * rows[:, 1])
+
+
+def halves(plus: ComplexArray, minus: ComplexArray) -> FloatArray:
+    """Return the rows (2 m, 2 n_freq) of terms and their conjugates for residues 1, and for j."""
+    return real_and_imag(np.concatenate([plus + minus, 1j * (plus - minus)]))
+
+
+def with_residues(rows: FloatArray, residues: ComplexArray) -> FloatArray:
+    """Return the rows (..., 2 m, n) of `halves` for residues (..., m), and for j times these."""
+    m = residues.shape[-1]
+    first, second = rows[..., :m, :], rows[..., m:, :]
+    real, imag = residues.real[..., None], residues.imag[..., None]
+    found = np.empty(np.broadcast_shapes(rows.shape, (*residues.shape[:-1], 1, 1)))
+    np.multiply(real, first, out=found[..., :m, :])
+    np.multiply(real, second, out=found[..., m:, :])
+    found[..., :m, :] += imag * second
+    found[..., m:, :] -= imag * first
+    return found
 
 
 def free_inputs(pivots: Any, n_in: int) -> IntArray:

@@ -13,11 +13,10 @@ from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
 from ..tolerances import TINY
 from .diagram import StabilisationDiagram
-from .line_weights import NARROW, PreparedLines, Rejected
+from .lines import NARROW, PreparedLines, Rejected, axis, pole_terms, residual_terms
 from .measured import MeasuredModes
 from .model_error import Disagreement
 from .refine import PoleFit, free_inputs, scaled_inverse
-from .terms import axis, pole_terms, residual_terms
 
 
 def answer(

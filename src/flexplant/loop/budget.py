@@ -27,7 +27,7 @@ from ..lti.statespace import StateSpace
 from ..parallel import PIECE
 from ..plant import AnyPlant, standard_plant
 from ..plant.building import continuous_factor, white_names
-from ..plant.evaluation_model import NOT_JUDGED
+from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import MOST_STEPS, ROOT, TYPED
 from ..words import in_unit, instance

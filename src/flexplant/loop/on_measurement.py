@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..plant.partitioned import MeasuredResponse
+from ..plant.origins import MeasuredResponse
 from ..store import Value
 from .measured_loop import broken_count, in_axes, measured_between
 

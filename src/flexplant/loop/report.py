@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import ComplexArray, FloatArray, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import ROUNDS, crossings, highest
-from ..plant.evaluation_model import NOT_JUDGED
+from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
 from ..words import mapping

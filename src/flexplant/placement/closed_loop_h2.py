@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..arrays import FloatArray, positive
 from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
-from ..estimation.estimator_channels import sensors
+from ..estimation.filter_models import sensors
 from ..lti.equations import solve_stein, square_root
 from ..lti.riccati import control_dare
 from ..lti.sampling import held_exactly

@@ -13,7 +13,7 @@ from ..arrays import FloatArray, divisor
 from ..errors import InfeasibleError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import EffectiveIndependence
-from ..reduction.criteria import SelectionCriterion
+from ..reduction.methods import SelectionCriterion
 from ..store import checked
 from ..words import flag, instance
 from ..work import Work

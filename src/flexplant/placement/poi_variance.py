@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import FloatArray, positive
 from ..errors import LabelError, ModelError, only_one, require_known, short
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
-from ..estimation.estimator_channels import poi_channels, sensors
+from ..estimation.filter_models import poi_channels, sensors
 from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant

@@ -92,7 +92,6 @@ from .decoupling import Decoupling as Decoupling
 from .decoupling import GravityAxes as GravityAxes
 from .decoupling import decouple as decouple
 from .decoupling import gravity_axes as gravity_axes
-from .evaluation_model import EvaluationModel as EvaluationModel
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
@@ -110,7 +109,8 @@ from .moving import PortPath as PortPath
 from .moving import PositionMap as PositionMap
 from .origins import Assembled as Assembled
 from .origins import Foreign as Foreign
-from .partitioned import MeasuredResponse as MeasuredResponse
+from .origins import MeasuredResponse as MeasuredResponse
+from .partitioned import EvaluationModel as EvaluationModel
 from .port import ForcePort as ForcePort
 from .port import MeasuredRow as MeasuredRow
 from .port import SensorPort as SensorPort

@@ -489,3 +489,15 @@ def _assumption_lines(items: tuple[Assumption, ...]) -> list[str]:
         + (f" {item.remedy}" if item.remedy else "")
         for item in items
     ]
+
+
+class CheckedSystem(PartitionedSystem):
+    """A partitioned system that tells which standard assumptions hold."""
+
+    def check(self) -> AssumptionReport:
+        """Return which standard assumptions hold, in physical terms, rigid-body modes first."""
+        return self._report
+
+    @cached_property
+    def _report(self) -> AssumptionReport:
+        return AssumptionReport(self)

@@ -24,9 +24,8 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import Structure
 from ..tolerances import NEGLIGIBLE, ROUNDING, SAME
-from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign
-from .partitioned import Partition, PartitionedSystem
+from .partitioned import EvaluationModel, Partition, PartitionedSystem
 from .port import ForcePort, MeasuredRow, SensorPort
 from .ports import Ports
 from .realisation import ModalRealisation, natural

@@ -15,18 +15,17 @@ from ..labels import Place
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace, single_channel
 from ..words import instance, name_list
-from .assumptions import AssumptionReport
+from .assumptions import CheckedSystem
 from .building import at_rate
-from .evaluation_model import EvaluationModel
 from .moving import PositionMap, position_map
-from .partitioned import PartitionedSystem
+from .partitioned import EvaluationModel, PartitionedSystem
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 #: fields of the machine, which `replace` changes there
 _OF_MACHINE = ("origin", "uncertainty", "evaluation", "measurement")
 
 
-class Weighable(PartitionedSystem):
+class Weighable(CheckedSystem):
     """What can be done with a machine, and with weights and blocks around it."""
 
     def weighted(
@@ -102,14 +101,6 @@ class Weighable(PartitionedSystem):
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""
         return self.system.to_control()
-
-    def check(self) -> AssumptionReport:
-        """Return which standard assumptions hold, in physical terms, rigid-body modes first."""
-        return self._report
-
-    @cached_property
-    def _report(self) -> AssumptionReport:
-        return AssumptionReport(self)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

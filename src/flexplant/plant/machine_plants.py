@@ -22,7 +22,8 @@ from ..words import in_unit, with_unit
 from .building import another_machine, sampled
 from .forces import Actuator
 from .machine_draws import DrawnModes, MachineFamily, obstacle
-from .partitioned import MeasuredResponse, Partition
+from .origins import MeasuredResponse
+from .partitioned import Partition
 from .port import ForcePort, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, plant_modes

@@ -1,4 +1,4 @@
-"""Where a plant comes from: a structure that it was assembled from, or a system made elsewhere."""
+"""Where a plant comes from: a structure, a system made elsewhere; what was measured of it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import LabelError
 from ..labels import DIRECTIONS
+from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace
 from ..store import Value
 from .ports import Ports
@@ -111,6 +112,33 @@ class Foreign(Value):
     continuous: Any = None
     ports: Ports = field(default_factory=Ports)
     realisation: ClassVar[ModalRealisation] = _NO_MODES
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredResponse(Value):
+    """The measured response of a machine; see `StandardPlant.measured`.
+
+    Parameters
+    ----------
+    frf : Frf
+        Response from actuators to sensors.
+    hold : bool
+        False if the response was measured from sample to sample and contains the zero-order hold.
+    delay : float [samples]
+        Delay that the response contains.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> frf = fx.frequency_response(plant.continuous.Gyu, [10.0, 20.0])
+    >>> plant.measured(frf.select(outputs=["y1"])).measurement.hold
+    True
+    """
+
+    frf: Frf
+    hold: bool = True
+    delay: float = 0.0
 
 
 #: where a plant may have come from

@@ -1,10 +1,11 @@
-"""A system partitioned into w, u, z and y: the base of a machine and of a generalized plant."""
+"""A system partitioned into w, u, z and y, the base of all plants, and its evaluation model."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self, TypeGuard
 
 import numpy as np
@@ -21,15 +22,25 @@ from ..errors import (
     some_names,
     unknown_label,
 )
-from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..modes import Modes
+from ..reduction import ReducedModel
 from ..store import Value
 from ..structure import FEModel
-from ..words import mapping, name_list
-from .evaluation_model import NOT_JUDGED, EvaluationModel
-from .origins import ELSEWHERE, TYPE_THIS, Assembled, Foreign, Origin, PlantChannel, sides_of
+from ..structure.rigid import Structure
+from ..words import instance, mapping, name_list
+from .origins import (
+    ELSEWHERE,
+    TYPE_THIS,
+    Assembled,
+    Foreign,
+    MeasuredResponse,
+    Origin,
+    PlantChannel,
+    sides_of,
+)
 from .ports import Ports
-from .realisation import MODAL, ModalRealisation
+from .realisation import MODAL, ModalRealisation, plant_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -328,34 +339,83 @@ def is_system(given: object) -> TypeGuard[System]:
 
 def is_plant(given: object) -> TypeGuard[PartitionedSystem | System]:
     """Return whether it is a plant or a system with labels, not a structure."""
+    if isinstance(given, FEModel | Modes | ReducedModel):
+        return False  # `hasattr` is slow here: it makes the message with similar names
     return isinstance(given, PartitionedSystem) or is_system(given)
 
 
+#: what a result of a plant without an evaluation model says
+NOT_JUDGED = "not judged on a larger model"
+_HINT = "Pass Modes, an FEModel, a ReducedModel or a StandardPlant."
+
+
 @dataclass(frozen=True, eq=False)
-class MeasuredResponse(Value):
-    """The measured response of a machine; see `StandardPlant.measured`.
+class EvaluationModel(Value):
+    """A model of the machine with the modes that the design model of a plant lacks.
+
+    Made by ``assemble_plant(model, ports, evaluation=source)``. Every plant that is made from that
+    plant has it too; `StandardPlant.evaluation_plant` is this model with the plant's channels.
 
     Parameters
     ----------
-    frf : Frf
-        Response from actuators to sensors.
-    hold : bool
-        False if the response was measured from sample to sample and contains the zero-order hold.
-    delay : float [samples]
-        Delay that the response contains.
+    source : Modes, FEModel, ReducedModel or StandardPlant
+        The larger model. If it is a structure, the ports of the plant are applied to it. If it is a
+        reduced model, the modes that it left out are included. If it is a plant, it must have the
+        same channels as the plant that is judged on it.
+    ports : Ports, optional
+        Ports that replaced those of the plant after its assembly. A source that is a plant gets
+        these ports too.
 
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> frf = fx.frequency_response(plant.continuous.Gyu, [10.0, 20.0])
-    >>> plant.measured(frf.select(outputs=["y1"])).measurement.hold
-    True
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3), count=4)
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(modes.select([0, 1]), ports, evaluation=modes)
+    >>> plant.evaluation.source.n_modes
+    4
     """
 
-    frf: Frf
-    hold: bool = True
-    delay: float = 0.0
+    source: Any
+    ports: Ports | None = None
+
+    @classmethod
+    def of(cls, given: Any) -> EvaluationModel | None:
+        """Return the argument `evaluation` of `assemble_plant` as an EvaluationModel, or None."""
+        if given is None or isinstance(given, cls):
+            return given
+        given = getattr(given, "nominal", given)
+        if not is_plant(given):
+            instance(given, FEModel | Modes | ReducedModel, "evaluation", _HINT)
+        return cls(given)
+
+    @classmethod
+    def known_to(cls, model: Structure) -> EvaluationModel | None:
+        """Return a ReducedModel that kept its truncated modes as an evaluation model, else None."""
+        known = isinstance(model, ReducedModel) and model.truncated is not None
+        return cls(model) if known else None
+
+    @property
+    def is_structure(self) -> bool:
+        """Whether the source is a structure, to which the ports of the plant are applied."""
+        return isinstance(self.source, FEModel | Modes | ReducedModel)
+
+    def with_ports(self, ports: Ports) -> EvaluationModel:
+        """Return the same evaluation model with other ports."""
+        return self if self.is_structure else self.replace(ports=ports)
+
+    @cached_property
+    def realisation(self) -> ModalRealisation:
+        """The modes of a structure, solved once for all plants that are judged on it."""
+        given = self.source
+        return plant_modes(given.completed() if isinstance(given, ReducedModel) else given)
+
+    @property
+    def text(self) -> str:
+        """The model in a few words."""
+        kind = type(self.source).__name__
+        count = getattr(self.source, "n_modes", None)
+        return kind if count is None else f"{kind}, {count} modes"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

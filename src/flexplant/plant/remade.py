@@ -23,9 +23,8 @@ from .building import (
     warn_of_another_body,
     wired,
 )
-from .evaluation_model import EvaluationModel
 from .origins import Assembled, Foreign, PlantChannel
-from .partitioned import Partition
+from .partitioned import EvaluationModel, Partition
 from .ports import Poi, Ports
 
 

@@ -16,11 +16,11 @@ from ..lti.frequency import Frf
 from ..lti.statespace import System
 from ..words import flag, instance
 from .building import PASS_PORTS, continuous_plant, evaluation_plant, sampled
-from .evaluation_model import EvaluationModel
 from .generalized import GeneralizedPlant, Weighable
 from .machine_plants import PlantMachines, fitted_machines
 from .moving import PortPath, along, moved_ports, seen_elsewhere
-from .partitioned import MeasuredResponse, Partition
+from .origins import MeasuredResponse
+from .partitioned import EvaluationModel, Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .remade import check_channels, matched, own_plant, rebuilt, selected

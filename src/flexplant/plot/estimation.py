@@ -13,7 +13,7 @@ from ..arrays import FloatArray, between, positive, real_array
 from ..errors import ModelError, ShapeError
 from ..estimation import ConsistencyReport, Estimate, LagReport
 from ..estimation.consistency_tests import FEWEST
-from ..estimation.estimator_channels import row_of
+from ..estimation.error import row_of
 from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison

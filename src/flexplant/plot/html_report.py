@@ -25,7 +25,7 @@ from ..modes import Modes
 from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..plant import AnyPlant, StandardPlant, driven_axes
-from ..plant.evaluation_model import NOT_JUDGED
+from ..plant.partitioned import NOT_JUDGED
 from ..reduction import ReducedModel
 from ..rooms import versions
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict

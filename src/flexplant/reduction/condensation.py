@@ -18,15 +18,8 @@ from ..store import checked
 from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
 from ..words import several
-from .methods import (
-    ReductionMethod,
-    Solver,
-    block,
-    fe_model,
-    labels_given,
-    projected_model,
-    refused_partition,
-)
+from .methods import ReductionMethod, labels_given, refused_partition
+from .projection import Solver, block, fe_model, projected_model
 from .reduced import ReducedModel
 
 _SINGULAR = (

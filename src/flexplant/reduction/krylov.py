@@ -21,7 +21,8 @@ from ..sparse.symmetric import dense
 from ..store import checked
 from ..structure import FEModel
 from ..tolerances import RANK, SAME, TINY, TYPED
-from .methods import ReductionMethod, fe_model, projected_model
+from .methods import ReductionMethod
+from .projection import fe_model, projected_model
 from .reduced import ReducedModel
 
 

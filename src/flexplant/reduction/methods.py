@@ -1,68 +1,234 @@
-"""`reduce`, the common part of reductions by projection, and the method of the paper."""
+"""`reduce`, the method of the paper, and the choice of the DOFs that it keeps."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
-from ..arrays import FloatArray, Matrix
-from ..errors import LabelError, ModelError, ShapeError, SolverError, attempted, counted, some_names
+from ..arrays import ComplexArray, FloatArray, positive, whole
+from ..errors import LabelError, ModelError, ShapeError, attempted, counted, some_names
 from ..labels import DofSet, Place
 from ..modes.modes import Modes, require_real
 from ..modes.solve import solve_modes
 from ..modes.statics import places
 from ..parallel import Progress
-from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
-from ..sparse.symmetric import dense, projected, unit_diagonal
 from ..store import Value, checked
 from ..structure import Damping, FEModel
-from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import MISSED, NEGLIGIBLE, RANK, TINY, TYPED
+from ..structure.definite import refuse_unstable
+from ..tolerances import NEGLIGIBLE, TYPED
 from ..words import instance, name_list
-from .criteria import PivotedQr
-from .ranking import ErrorBound
 from .reduced import ReducedModel
 
+#: shapes at DOFs, real or complex
+Rows: TypeAlias = FloatArray | ComplexArray
 
-class Solver:
-    """A factorised positive definite matrix, dense or sparse."""
 
-    def __init__(self, matrix: Matrix, singular: str) -> None:
-        self._matrix: Any = matrix
-        self._singular = singular
-        self._once: Callable[[FloatArray], Any]
-        try:
-            if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
-                factor = MultifrontalFactor(matrix)
-                self._once = lambda loads: factor.solve(np.ascontiguousarray(loads))
-                return
-            scaled, size = unit_diagonal(dense(matrix))
-            lower = la.cholesky(dense(scaled), lower=True)
-        except (SolverError, la.LinAlgError) as error:
-            raise ModelError(singular) from error
-        # a square root: pivots below 1e-14 of a unit diagonal count as zero
-        if np.diag(lower).min(initial=1.0) < 1e-7:
-            raise ModelError(singular)
-        scale = size[:, None]
-        self._once = lambda loads: la.cho_solve((lower, True), loads * scale) * scale
+class SelectionCriterion(Value):
+    """The base class of criteria by which `select_dofs` chooses DOFs.
 
-    def solve(self, loads: FloatArray) -> FloatArray:
-        """Return the (n, m) solution, refined once."""
-        if not loads.size:
-            return np.zeros_like(loads)
-        found: FloatArray = self._once(loads)
-        found = found + self._once(loads - np.asarray(self._matrix @ found))
-        left = np.linalg.norm(loads - np.asarray(self._matrix @ found))
-        # a mechanism that the factorisation did not detect, because of rounding, carries no load
-        if not left <= MISSED * np.linalg.norm(loads):
-            raise ModelError(self._singular)
-        return found
+    Modes and attachment vectors are the k columns of a matrix, which has a row for each DOF. A
+    criterion chooses rows of this matrix.
+
+    Examples
+    --------
+    The library's criteria are instances of this class:
+
+    >>> import flexplant as fx
+    >>> isinstance(fx.reduction.Greedy(), fx.reduction.SelectionCriterion)
+    True
+    """
+
+    @abstractmethod
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
+        """Return the positions of the `count` rows of the array `pool` (p, k) that are chosen.
+
+        The rows of `required` (q, k) are chosen already and are not counted.
+        """
+
+    @abstractmethod
+    def values(self, rows: Rows) -> FloatArray:
+        """Return the value of the criterion for each of the chosen rows (n, k), in their order."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PivotedQr(SelectionCriterion):
+    """QR with column pivoting: each DOF is the one that the previous DOFs explain least.
+
+    The row of a DOF holds its motion in each mode. The value of a DOF is the length of the part of
+    its row that is orthogonal to all previous rows.
+
+    References
+    ----------
+    [Manohar2018]_.
+
+    Examples
+    --------
+    The two ends of a chain distinguish its first two modes best:
+
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2, criterion=fx.reduction.PivotedQr()).labels
+    ('1:x', '3:x')
+    """
+
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
+        """Return the positions of the chosen rows; see `SelectionCriterion.chosen`."""
+        if not count:
+            return []
+        if required.shape[0]:
+            span = la.qr(required.T, mode="economic")[0]
+            for _ in range(2):
+                pool = pool - (pool @ span.conj()) @ span.T
+        return [int(i) for i in la.qr(pool.T, mode="r", pivoting=True)[1][:count]]
+
+    def values(self, rows: Rows) -> FloatArray:
+        """Return the length of the part of each row that is orthogonal to all rows before it."""
+        return np.abs(np.diag(la.qr(rows.T, mode="r")[0]))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DofSelection(Value):
+    """DOFs that `select_dofs` chose, for use by `DesiredDofs`, `Guyan` or as a boundary.
+
+    Parameters
+    ----------
+    labels : tuple of str
+        The DOFs, required ones first.
+    condition : float
+        Condition number of the matrix phi_kk, which holds the rows of the mode shapes at these
+        DOFs, and those of the attachment vectors if there are any. A low number is good.
+    values : (count,) array, optional
+        Value of the criterion for each DOF, in the order of the labels.
+    criterion : SelectionCriterion
+        Criterion by which they were chosen.
+
+    Examples
+    --------
+    Two DOFs are chosen for two modes:
+
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2).labels
+    ('1:x', '3:x')
+    """
+
+    labels: tuple[str, ...]
+    condition: float
+    values: FloatArray = field(default_factory=lambda: np.zeros(0))
+    criterion: SelectionCriterion = field(default_factory=PivotedQr)
+
+    def __repr__(self) -> str:
+        more = f", ... {self.labels[-1]}" if len(self.labels) > 3 else ""
+        listed = f"{counted(len(self.labels), 'DOF')} ({', '.join(self.labels[:3])}{more})"
+        return f"<DofSelection: {listed}, condition {self.condition:.3g}>"
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.labels)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+def _candidates(modes: Modes) -> list[str]:
+    """Return the displacements, or all labels where displacements do not distinguish the modes."""
+    straight = [label for label in modes.dofs.labels if ":r" not in label]
+    if len(straight) == len(modes.dofs):
+        return straight
+    rows = modes.basis[modes.dofs.indices(straight)]
+    sizes = la.eigvalsh(rows.conj().T @ rows)
+    return straight if sizes[0] > TYPED**2 * sizes[-1] else list(modes.dofs.labels)
+
+
+def select_dofs(
+    modes: Modes,
+    count: int,
+    *,
+    candidates: Iterable[str] | None = None,
+    required: Iterable[str] = (),
+    criterion: SelectionCriterion | None = None,
+    limit: float = 1e12,
+) -> DofSelection:
+    """Return DOFs whose motions distinguish modes and attachment vectors well.
+
+    phi_kk holds the rows of modes and attachment vectors at the chosen DOFs. A low condition number
+    of this matrix is good, since `DesiredDofs` inverts it.
+
+    Parameters
+    ----------
+    modes : Modes
+        Modes, real or complex, with their attachment vectors.
+    count : int
+        Number of DOFs, at most the number of modes plus the number of attachment vectors. With
+        exactly this sum, `DesiredDofs` keeps all modes. With fewer DOFs, it keeps fewer modes.
+    candidates : iterable of str, optional
+        Labels to choose from. None: all displacements, and the rotations too where displacements
+        do not distinguish the modes, as of bodies that turn.
+    required : iterable of str
+        DOFs that are kept in any case.
+    criterion : PivotedQr, EffectiveIndependence or Greedy, optional
+        Criterion of the choice. None: `PivotedQr`.
+    limit : float
+        Largest accepted condition number of phi_kk.
+
+    Raises
+    ------
+    ModelError
+        When `count` is not a whole number, or no choice of candidates distinguishes the modes.
+
+    Examples
+    --------
+    Two corners are required, and the third DOF is chosen among three candidates:
+
+    >>> from flexplant.structure import kirchhoff_plate
+    >>> from flexplant.modes import solve_modes
+    >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,
+    ...                         youngs_modulus=70e9, poisson_ratio=0.35)
+    >>> near = ["7:z", "12:z", "23:z"]
+    >>> select_dofs(solve_modes(plate, count=3), 3, required=["1:z", "5:z"], candidates=near)
+    <DofSelection: 3 DOFs (1:z, 5:z, 23:z), condition 1.93>
+    """
+    instance(modes, Modes, "modes", "Pass solve_modes(model, count=24).")
+    rule = PivotedQr() if criterion is None else criterion
+    hint = "Pass reduction.PivotedQr() or reduction.Greedy()."
+    instance(rule, SelectionCriterion, "criterion", hint)
+    basis = modes.basis
+    kept = list(name_list(required, "required DOFs"))
+    if len(set(kept)) != len(kept):
+        raise LabelError(f"required DOFs appear twice: {kept}.")
+    pool = _candidates(modes) if candidates is None else name_list(candidates, "candidates")
+    pool = [label for label in dict.fromkeys(pool) if label not in set(kept)]
+    rows, open_rows = modes.dofs.indices(kept), modes.dofs.indices(pool)
+    k = basis.shape[1]
+    number = whole(count, "count", minimum=-(10**9))
+    if not max(1, len(kept)) <= number <= k:
+        raise ShapeError(
+            f"count must be from {max(1, len(kept))} (the required DOFs) to {k} ({modes.n_modes} "
+            f"modes plus {counted(modes.n_vectors, 'attachment vector')}), got {count!r}."
+        )
+    missing = number - len(kept)
+    if missing > len(pool):
+        raise ShapeError(
+            f"{missing} DOFs are wanted, but there are {len(pool)} candidates: name more, "
+            "candidates=modes.dofs.labels for all."
+        )
+    taken = rule.chosen(basis[rows], basis[open_rows], missing) if missing else []
+    chosen = kept + [pool[i] for i in taken]
+    picked = basis[modes.dofs.indices(chosen)]
+    singular = la.svdvals(picked)
+    top = positive(limit, "limit")
+    if not singular[-1] * top > singular[0]:
+        raise ModelError(
+            f"no {number} of these DOFs distinguish the modes (condition above {top:.3g}): the "
+            "required ones depend on each other, or all candidates lie on node lines. Name other "
+            "candidates, such as modes.dofs.labels."
+        )
+    condition = float(singular[0] / singular[-1])
+    return DofSelection(tuple(chosen), condition, rule.values(picked), rule)
 
 
 def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
@@ -74,128 +240,6 @@ def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
         doubled = sorted({label for label in labels if labels.count(label) > 1})
         raise LabelError(f"{name} {doubled} appear twice: the matrix to invert would be singular.")
     return labels
-
-
-def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
-    """Return the structure if it has the matrices that a method needs."""
-    if isinstance(structure, FEModel):
-        return structure
-    raise ModelError(
-        f"{type(method).__name__} works on the matrices M and K, which {type(structure).__name__} "
-        f"do not hold: reduce(model, {type(method).__name__}(...)) with the FEModel."
-    )
-
-
-def block(matrix: Matrix, rows: Any, columns: Any) -> Any:
-    """Return a block of a dense or sparse matrix."""
-    if sp.issparse(matrix):
-        sparse: Any = matrix
-        return sparse[rows][:, columns]
-    return np.asarray(matrix)[np.ix_(rows, columns)]
-
-
-def projected_model(
-    model: FEModel,
-    T: FloatArray,
-    *,
-    dofs: DofSet,
-    method: str,
-    coordinates: Sequence[str] = (),
-    damping: Damping | None = None,
-    condition: float | None = None,
-    condition_of: str = "M*",
-    bound: ErrorBound | None = None,
-    singular: str = "",
-    static_at: Sequence[str] = (),
-) -> ReducedModel:
-    """Return the reduced model with the matrices ``T^T M T``, ``T^T K T`` and ``T^T D T``.
-
-    Use this function in your own reduction method, after it has computed T (`ReductionMethod`).
-
-    Parameters
-    ----------
-    model : FEModel
-        Full structure.
-    T : (n, k) array
-        Columns that span the kept motions, including the rigid-body motions.
-    dofs : DofSet
-        DOFs of the k coordinates. Empty: the coordinates are not DOFs.
-    method : str
-        Name of the method, which messages and the printed model show.
-    coordinates : sequence of str
-        Names of the coordinates. They are needed if not all coordinates are DOFs.
-    damping : Damping, optional
-        Damping of the reduced model in place of the model's D.
-    condition, condition_of : float, str
-        Condition number of the matrix that your method inverts, and the name of this matrix.
-    bound : ErrorBound, optional
-        Bound of the error between channels, where your method has one.
-    singular : str
-        Advice that the error message gives when the columns of T depend on each other.
-    static_at : sequence of str
-        Labels whose static response is exact in the span of T.
-
-    Returns
-    -------
-    ReducedModel
-        Model whose motions are combinations of the columns of T.
-
-    Raises
-    ------
-    ModelError
-        When the columns of T depend on each other, or do not contain the rigid-body motions.
-
-    Examples
-    --------
-    With T = I, the reduced model is the full model:
-
-    >>> import numpy as np
-    >>> import flexplant as fx
-    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.reduction.projected_model(model, np.eye(3), dofs=model.dofs, method="none").M.diagonal()
-    array([1., 1., 1.])
-    """
-    M, K = projected(model.M, T), projected(model.K, T)
-    scaled, scale = unit_diagonal(M)
-    values = la.eigvalsh(dense(scaled))
-    if not values[0] > RANK * values[-1]:
-        raise ModelError(
-            f"the {T.shape[1]} coordinates of {method} depend on each other (condition of M* "
-            f"{values[-1] / max(float(values[0]), TINY):.3g}): M* would be singular. "
-            + (singular or "Take fewer.")
-        )
-    full = model.rigid_body
-    load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
-    rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
-    missed = float(np.abs(T @ rigid - full).max(initial=0.0))
-    if not missed <= MISSED * np.abs(full).max(initial=0.0):
-        raise ModelError(
-            f"{method} does not hold the rigid-body motions of the structure (misses "
-            f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "
-            + (singular or "Add coordinates that do.")
-        )
-    if damping is not None:  # modes with the damping ratios of the law
-        omega, phi = elastic_modes(M, K, rigid)
-        omega, phi = np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
-        zeta = damping.zeta(omega)
-        D = projected(np.diag(2 * zeta * omega), (M @ phi).T)
-    else:
-        D = np.zeros_like(M) if model.D is None else projected(model.D, T)
-    return ReducedModel(
-        M=M,
-        D=D,
-        K=K,
-        T=T,
-        dofs=dofs,
-        full_dofs=model.dofs,
-        rigid_body=rigid,
-        method=method,
-        condition=float(values[-1] / values[0]) if condition is None else condition,
-        condition_of=condition_of,
-        coordinates=coordinates,
-        bound=bound,
-        static_at=static_at,
-    )
 
 
 _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."

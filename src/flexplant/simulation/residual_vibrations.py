@@ -11,7 +11,7 @@ import scipy.linalg as la
 from ..arrays import FloatArray, positive
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
-from ..plant.evaluation_model import NOT_JUDGED
+from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import NEGLIGIBLE, SAME
 from ..words import instance, with_unit

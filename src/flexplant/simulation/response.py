@@ -9,8 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, positive, real_array
-from ..errors import ModelError, ShapeError, counted, some_names, unknown_label, warn
-from ..estimation.estimator_channels import ChannelError
+from ..errors import ChannelError, ModelError, ShapeError, counted, some_names, unknown_label, warn
 from ..loop import ClosedLoop, Spectrum
 from ..plant.axes import idle_forces, opposing_part
 from ..store import Value

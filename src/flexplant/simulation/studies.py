@@ -24,7 +24,8 @@ from ..errors import (
     warn,
 )
 from ..estimation import KalmanEstimator, StaticEstimator
-from ..estimation.estimator_channels import estimates, poi_channels, row_of
+from ..estimation.error import estimates, row_of
+from ..estimation.filter_models import poi_channels
 from ..fingerprints import fingerprint
 from ..lti.statespace import StateSpace
 from ..parallel import Lost, Progress, one_thread, survived
