@@ -49,7 +49,9 @@ def test_blocks_are_the_samples_one_by_one(kind):
     given = rng.standard_normal((10_003, len(loop.plant.w))) * 1e-6
     start = 1e-6 * rng.standard_normal(loop.monitored.n_states)
     noise = white_noise(loop.plant)
-    fast, plain = (make_runner(loop, noise, given, grows=grows) for grows in (False, True))
+    fast, plain = (
+        make_runner(loop, noise, np.abs(given).max(axis=0), grows=grows) for grows in (False, True)
+    )
     assert (type(fast), type(plain)) == (InBlocks, SampleBySample)
     expected = shown(plain, loop, given, start)
     wrong = np.abs(shown(fast, loop, given, start) - expected).max(axis=1)
@@ -60,7 +62,9 @@ def test_blocks_that_lose_digits_are_not_taken(monkeypatch):
     """One entry of the matrices of a block is 1e-8 of itself off."""
     loop = close_loop(stage(), observer(), servo())
     given, exact = np.ones((500, len(loop.plant.w))), Recursion.in_blocks
-    wanted = shown(make_runner(loop, white_noise(loop.plant), given), loop, given)
+    wanted = shown(
+        make_runner(loop, white_noise(loop.plant), np.abs(given).max(axis=0)), loop, given
+    )
 
     def off(self, size):
         blocks = exact(self, size)
@@ -68,7 +72,7 @@ def test_blocks_that_lose_digits_are_not_taken(monkeypatch):
         return blocks
 
     monkeypatch.setattr(Recursion, "in_blocks", off)
-    runner = make_runner(loop, white_noise(loop.plant), given)
+    runner = make_runner(loop, white_noise(loop.plant), np.abs(given).max(axis=0))
     assert isinstance(runner, SampleBySample)
     scale = np.abs(wanted).max(axis=1, keepdims=True)
     np.testing.assert_allclose(shown(runner, loop, given) / scale, wanted / scale, atol=1e-10)
@@ -94,7 +98,7 @@ def test_thousands_of_modes_go_mode_by_mode():
     law = StateSpace([], [], [], [[0.0]], dt, inputs=["y"], outputs=["u"])
     loop = ClosedLoop(plant, (law,), law)
     given = np.zeros((300, 1))
-    runner = make_runner(loop, white_noise(plant), given)
+    runner = make_runner(loop, white_noise(plant), np.abs(given).max(axis=0))
     assert isinstance(runner, SampleBySample)
     start = np.zeros(2 * modes)
     start[k] = 1.0

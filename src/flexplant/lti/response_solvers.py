@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple, TypeAlias
@@ -367,13 +368,15 @@ _SIZES = [2**k for k in range(8)]
 ONE_VECTOR, CALL = 3.0, 3e4
 
 
-def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
+def cheapest(n: int, p: int, m: int, samples: int, abreast: int = 1) -> tuple[int, float]:
     """Return the cheapest size of a block, and its number of operations per sample."""
+    # n states, p outputs, m inputs; the preparation is shared by a number of samples, and a call by
+    # records that run abreast
+    product = ONE_VECTOR if abreast == 1 else 1.0
 
-    # n states, p outputs, m inputs; the preparation is shared by a number of samples
     def cost(size: int) -> float:
         prepare = 2 * size * n * n * (m + p) + 2 * np.log2(size) * n**3 + size**2 * n * p * m
-        step = (2 * ONE_VECTOR * n * n + CALL) / size
+        step = (2 * product * n * n + CALL / abreast) / size
         return float(step + 2 * n * (m + p) + (size + 1) * p * m + prepare / max(samples, 1))
 
     size = min(_SIZES, key=cost)
@@ -447,22 +450,32 @@ class Blocks(NamedTuple):
     direct: list[FloatArray]
     size: int
 
-    def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state."""
+    def run(
+        self, v: FloatArray, x: FloatArray, pushed: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state.
+
+        Records (r, N, m) from states (r, n) run abreast. `pushed` (N / b, k) is added to the first
+        k states at the end of each block.
+        """
         # N is a whole number of blocks. everything except `x step` is a product of two matrices
-        count = v.shape[0] // self.size
-        v = np.ascontiguousarray(v)
-        states = np.empty((count + 1, x.size))
-        states[0] = x
-        np.matmul(v.reshape(count, -1), self.enter, out=states[1:])
-        moved = np.empty(x.size)
-        for now, following in pairwise(states):
-            np.dot(now, self.step, out=moved)
+        *abreast, samples, m = v.shape
+        count, total = samples // self.size, math.prod(abreast) * samples
+        states = np.empty((*abreast, count + 1, x.shape[-1]))
+        before, after = states[..., :-1, :], states[..., 1:, :]
+        v = np.ascontiguousarray(v).reshape(total, m)
+        states[..., 0, :] = x
+        after[...] = (v.reshape(total // self.size, -1) @ self.enter).reshape(after.shape)
+        if pushed is not None:
+            after[:, : pushed.shape[1]] += pushed
+        moved = np.empty(x.shape)
+        for now, following in pairwise(np.moveaxis(states, -2, 0)):
+            np.matmul(now, self.step, out=moved)
             following += moved
         out = v @ self.direct[0]
         for k, later in enumerate(self.direct[1:], 1):
-            first, second = ((len(v) >> k, 2, size) for size in later.shape)
+            first, second = ((total >> k, 2, size) for size in later.shape)
             out.reshape(second)[:, 1] += v.reshape(first)[:, 0] @ later
-        by_block = out.reshape(count, -1)
-        by_block += states[:-1] @ self.see
-        return out, states[-1]
+        by_block = out.reshape(total // self.size, -1)
+        by_block += before.reshape(len(by_block), -1) @ self.see
+        return out.reshape(*abreast, samples, -1), states[..., -1, :]

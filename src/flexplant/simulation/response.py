@@ -307,9 +307,9 @@ def warn_of_opposing_forces(loop: ClosedLoop, run: Response) -> None:
     count = max(_FEWEST, round(_END * run.time.size))
     if not loop.machine.ports.z or len(loop.driven) < 2 or run.time.size <= count:
         return
-    efforts = np.stack([np.atleast_2d(run[name]) for name in loop.driven])  # (m, runs, n_time)
-    most = np.abs(efforts).max(axis=(0, 2))
-    end = efforts[..., -count:]
+    efforts = [np.atleast_2d(run[name]) for name in loop.driven]  # (runs, n_time) of each
+    most = np.max([np.maximum(one.max(axis=1), -one.min(axis=1)) for one in efforts], axis=0)
+    end = np.stack([one[:, -count:] for one in efforts])
     mean = end.mean(axis=2)
     if not np.any(np.abs(mean) > _SHARE * most):
         return

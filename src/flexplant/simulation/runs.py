@@ -222,18 +222,21 @@ class Drawn:
         kept = part.max(axis=0, initial=0.0) * len(part.T) > ROOT
         self.factor = np.ascontiguousarray(noise.factor[:, kept])
 
-    def draw(
-        self, generator: np.random.Generator, samples: int, hold: int = 1
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return white samples (samples, few) for the factor, and noises of the columns of w."""
+    @property
+    def few(self) -> int:
+        """Number of white samples for the factor."""
+        return int(self.factor.shape[1])
+
+    def draw(self, generator: np.random.Generator, samples: int, hold: int = 1) -> FloatArray:
+        """Return (samples, few + k): white samples for the factor, noises of k columns of w."""
         # sensors are read in the first of every `hold` samples, with the noise of that rate
-        few = self.factor.shape[1]
-        drawn = generator.standard_normal((samples, few + self.columns.size))
-        white, single = drawn[:, :few], drawn[:, few:] * self.deviation
+        drawn = generator.standard_normal((samples, self.few + self.columns.size))
+        single = drawn[:, self.few :]
+        single *= self.deviation
         if hold > 1:
             single[:, self.read] /= np.sqrt(hold)
             single[np.ix_(np.arange(samples) % hold > 0, self.read)] = 0.0
-        return white, single
+        return drawn
 
 
 def _shown(factor: FloatArray, plant: StandardPlant) -> FloatArray:
@@ -260,12 +263,12 @@ _ROUNDING = 100.0
 def make_runner(
     loop: ClosedLoop,
     noise: WhiteNoise,
-    given: FloatArray,
+    size: FloatArray,
     *,
     grows: bool = False,
     met: Conditions | None = None,
 ) -> SampleBySample | InBlocks:
-    """Return the faster way through a linear loop.
+    """Return the faster way through a linear loop, for w given up to a size (nw,).
 
     Blocks of samples cost less unless a plant in modal blocks is so large that its O(n) operations
     for a sample are fewer. They are used when a block agrees with the same samples one by one to
@@ -280,8 +283,8 @@ def make_runner(
     moving = Moving(loop.machine, met.paths) if met.paths else None
     single = SampleBySample(loop, machine_of(loop), drawn, hold=met.finer)
     if not grows and loop.machine.system.n_states + loop.controller.n_states:
-        blocks = InBlocks(loop, drawn, given, moving, met.finer)
-        if blocks.cost < single.cost and blocks.agrees(single, given):
+        blocks = InBlocks(loop, drawn, size, moving, met.finer)
+        if blocks.cost < single.cost and blocks.agrees(single, size):
             return blocks
     single.moving = moving
     return single
@@ -358,10 +361,10 @@ class SampleBySample:
         k = given.shape[-2]
         self.w[:, :k], self.w[:, k:] = given, 0.0
         for r, generator in enumerate(self.generators):
-            white, single = self.noise.draw(generator, self.stretch, self.hold)
-            w = self.w[r]
-            w[:, self.noise.columns] += single
-            states[1:, r] = white @ self.noise.factor.T + w @ self.B1.T
+            drawn = self.noise.draw(generator, self.stretch, self.hold)
+            w, few = self.w[r], self.noise.few
+            w[:, self.noise.columns] += drawn[:, few:]
+            states[1:, r] = drawn[:, :few] @ self.noise.factor.T + w @ self.B1.T
             y[:, r] = w @ self.D21.T
         return self.advance(k, data)
 
@@ -391,7 +394,12 @@ class SampleBySample:
 
 
 class InBlocks:
-    """One run after the other, in blocks of samples of the closed loop as one system."""
+    """One run after the other, in blocks of samples of the closed loop as one system.
+
+    Within a block white disturbances move the plant as if nothing were connected. What this adds to
+    the plant's outputs enters the loop together with the noises of the sensors: these outputs are
+    far fewer than the disturbances and their moments over a sample.
+    """
 
     abreast = 1
 
@@ -399,7 +407,7 @@ class InBlocks:
         self,
         loop: ClosedLoop,
         noise: Drawn,
-        given: FloatArray,
+        size: FloatArray,
         moving: Moving | None = None,
         hold: int = 1,
     ) -> None:
@@ -409,10 +417,14 @@ class InBlocks:
         self.n_shown = before + len(loop.controller.outputs)
         self.driven = slice(before, before + len(loop.driven))
         self.u = [len(plant.w) + plant.u.index(name) for name in loop.driven]
-        named = np.any(given != 0.0, axis=0)
-        named[noise.columns] = True
-        self.columns = np.flatnonzero(named)
-        self.inputs = self.columns.size + noise.factor.shape[1]
+        named, loud = size > 0.0, np.zeros(size.size, dtype=bool)
+        loud[noise.columns] = True
+        only_read = ~np.any(plant.B1, axis=0) & ~np.any(plant.D11, axis=0)
+        self.columns = np.flatnonzero(named | loud & ~only_read)
+        own = plant.D21[:, noise.columns] * (only_read & ~named)[noise.columns]
+        moved = plant.C2[:, : plant.system.n_states if noise.few else 0]
+        self.noisy = np.flatnonzero(np.any(np.hstack([moved, own]), axis=1))
+        self.read = own[self.noisy]
         self.outputs = self.n_shown + (plant.system.n_states if moving else 0)
         n, m = plant.system.n_states + loop.controller.n_states, hold * self.inputs
         self.size, cost = cheapest(n, hold * self.outputs, m, _TYPICAL // hold)
@@ -421,18 +433,32 @@ class InBlocks:
             self.size //= 2
         self.cost = cost / hold
         self.stretch = hold * max(PIECE // hold // STRETCH, 1) * STRETCH
-        self.w = np.zeros((self.stretch, given.shape[1]))
-        self.v = np.empty((self.stretch, self.inputs))
+        self.w = np.zeros((self.stretch, size.size))
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs of the loop."""
+        return self.columns.size + self.noisy.size
 
     @cached_property
     def blocks(self) -> tuple[Blocks, IntArray]:
-        """The matrices of a block, equal outputs once, and which of them each output is."""
-        system = lifted_loop(
-            self.loop, self.noise.factor, self.columns, self.hold, self.moving is not None
-        )
-        rows, shown = np.unique(np.hstack([system.H, system.J]), axis=0, return_inverse=True)
-        H, J = np.split(rows, [len(system.F)], axis=1)
-        return system._replace(H=H, J=J).in_blocks(self.size), shown.ravel()
+        """The matrices of a block of the loop, and which of its outputs each output is."""
+        states = self.moving is not None
+        system = lifted_loop(self.loop, self.columns, self.noisy, self.hold, states)
+        return _distinct(system, self.size)
+
+    @cached_property
+    def alone(self) -> tuple[Blocks, IntArray]:
+        """The same of the plant alone, from what is drawn to noisy y, to z and shown states."""
+        g, factor, read = self.plant.system, self.noise.factor, self.read
+        states = np.eye(self.outputs - self.n_shown, g.n_states)
+        H = np.vstack([self.plant.C2[self.noisy], self.plant.C1, states])
+        G = np.hstack([factor, np.zeros((g.n_states, read.shape[1]))])
+        J = np.zeros((len(H), G.shape[1]))
+        J[: len(read), self.noise.few :] = read
+        abreast = self.stretch // (self.size * self.hold)
+        size, _ = cheapest(*reversed(H.shape), G.shape[1], _TYPICAL, abreast)
+        return _distinct(Recursion(g.A, G, H, J), min(size, self.size))
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put the run at a state of plant and controller; it draws from its generator."""
@@ -440,23 +466,37 @@ class InBlocks:
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
-        k, known = given.shape[-2], self.columns.size
-        white, single = self.noise.draw(self.generator, self.stretch, self.hold)
+        k = given.shape[-2]
+        drawn = self.noise.draw(self.generator, self.stretch, self.hold)
         self.w[:k], self.w[k:] = given.reshape(k, -1), 0.0
-        self.w[:, self.noise.columns] += single
-        self.v[:, :known], self.v[:, known:] = self.w[:, self.columns], white
-        out, self.x = self._run(self.v, self.x)
+        self.w[:, self.noise.columns] += drawn[:, self.noise.few :]
+        out, self.x = self._run(self.w, drawn, self.x)
         if self.moving is not None:
-            self._move(self.moving, out[:k])
-        data[0] = out[:k, : self.n_shown].T
+            self._move(self.moving, out.T[:k])
+        data[0] = out[: self.n_shown, :k]
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
 
-    def _run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs of single samples, and the last state."""
+    def _run(
+        self, w: FloatArray, drawn: FloatArray, x: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (p, N) in single samples, and the last state."""
+        v, pushed, nz, noisy = w[:, self.columns], None, len(self.plant.z), self.noisy.size
+        if drawn.size:
+            alone, each = self.alone
+            records = drawn.reshape(-1, self.size * self.hold, drawn.shape[1])
+            own, pushed = alone.run(records, np.zeros((len(records), len(alone.step))))
+            own = own.reshape(len(w), -1)
+            v = np.hstack([v, own[:, each[:noisy]]])
+            added = np.take(own.T, each[noisy:], axis=0)
         blocks, shown = self.blocks
-        out, x = blocks.run(v.reshape(len(v) // self.hold, -1), x)
-        return np.take(out, shown, axis=1).reshape(-1, self.outputs), x
+        found, x = blocks.run(v.reshape(len(v) // self.hold, -1), x, pushed)
+        parts = np.take(found.T, shown, axis=0).reshape(self.hold, self.outputs, -1)
+        out = parts.transpose(1, 2, 0).reshape(self.outputs, -1)
+        if drawn.size:
+            out[:nz] += added[:nz]
+            out[self.n_shown :] += added[nz:]
+        return out, x
 
     def _move(self, moving: Moving, out: FloatArray) -> None:
         """Put what POIs along their paths do into out (k, channels, then states)."""
@@ -469,52 +509,62 @@ class InBlocks:
             for rows in moving.rows(self.first + start, part.stop - start):
                 rows.show(z, states, inputs[part])
 
-    def agrees(self, single: SampleBySample, given: FloatArray) -> bool:
+    def agrees(self, single: SampleBySample, size: FloatArray) -> bool:
         """Return whether two blocks (or one that fills a stretch) are the same samples singly."""
         block, rng = self.size * self.hold, np.random.default_rng(0)
         k = min(2 * block, max(single.stretch // block, 1) * block)
-        size = np.abs(given).max(axis=0, initial=0.0)
-        w = size * rng.standard_normal((k, size.size))
-        white, extra = self.noise.draw(rng, k)
-        w[:, self.noise.columns] += extra
-        v = np.hstack([w[:, self.columns], white])
+        w, few = size * rng.standard_normal((k, size.size)), self.noise.few
+        drawn = self.noise.draw(rng, k)
+        w[:, self.noise.columns] += drawn[:, few:]
         start = np.zeros(self.plant.system.n_states + self.loop.controller.n_states)
         expected = np.zeros((2, self.n_shown, k))
         single.begin(start, [rng, rng])
         states, y, _ = single.buffers
         for r, times in enumerate((1.0, 3.0)):
             single.w[r, :k] = times * w
-            states[1 : k + 1, r] = times * (white @ single.noise.factor.T + w @ single.B1.T)
+            states[1 : k + 1, r] = times * (drawn[:, :few] @ self.noise.factor.T + w @ single.B1.T)
             y[:k, r] = times * (w @ single.D21.T)
         single.advance(k, expected)
         rounding = np.abs(expected[1] / 3.0 - expected[0]).max(axis=1)
-        wrong = np.abs(self._run(v, start)[0][:, : self.n_shown].T - expected[0]).max(axis=1)
+        wrong = np.abs(self._run(w, drawn, start)[0][: self.n_shown] - expected[0]).max(axis=1)
         allowed = RESIDUAL * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))
 
 
+def _distinct(system: Recursion, size: int) -> tuple[Blocks, IntArray]:
+    """Return the matrices of a block, equal outputs once, and which of them each output is."""
+    rows = [row.tobytes() for row in np.hstack([system.H, system.J])]
+    once = list(dict.fromkeys(rows))
+    kept = [rows.index(row) for row in once]
+    blocks = system._replace(H=system.H[kept], J=system.J[kept]).in_blocks(size)
+    return blocks, np.array([once.index(row) for row in rows], dtype=np.int64)
+
+
 def lifted_loop(
-    loop: ClosedLoop, factor: FloatArray, columns: IntArray, hold: int, states: bool
+    loop: ClosedLoop, columns: IntArray, noisy: IntArray, hold: int, states: bool
 ) -> Recursion:
-    """Return a sampled loop whose controller acts in the first of every `hold` samples."""
+    """Return a sampled loop whose controller acts in the first of every `hold` samples.
+
+    Its inputs are columns of w and what is added to noisy outputs y.
+    """
     plant, law, g = loop.machine, loop.controller, loop.machine.system
     used = [plant.u.index(name) for name in loop.driven]
-    enter = np.hstack([plant.B1[:, columns], factor])
-    n, nc, m, k = g.n_states, law.n_states, enter.shape[1], columns.size
-    both = n + nc
+    n, nc, k = g.n_states, law.n_states, columns.size
+    both, m = n + nc, k + noisy.size
+    read = np.hstack([plant.D21[:, columns], np.eye(len(plant.y))[:, noisy]])
     # every signal as a matrix over [x; c; inputs of the first sample; of the second; ...]
     unit = np.eye(both + hold * m)
     x, c = unit[:n], unit[n:both]
     seen = []
     for j in range(hold):
         v = unit[both + j * m : both + (j + 1) * m]
-        y = plant.C2 @ x + plant.D21[:, columns] @ v[:k]
+        y = plant.C2 @ x + read @ v
         if not j:
             c, out = law.A @ c + law.B @ y, law.C @ c + law.D @ y
             u = out[: len(used)]
         z = plant.C1 @ x + plant.D12[:, used] @ u + plant.D11[:, columns] @ v[:k]
         seen += [z, y, out, *([x] if states else [])]
-        x = g.A @ x + plant.B2[:, used] @ u + enter @ v
+        x = g.A @ x + plant.B2[:, used] @ u + plant.B1[:, columns] @ v[:k]
     step, shown = np.vstack([x, c]), np.vstack(seen)
     parts = (step[:, :both], step[:, both:], shown[:, :both], shown[:, both:])
     return Recursion(*map(np.ascontiguousarray, parts))

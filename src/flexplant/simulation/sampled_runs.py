@@ -181,6 +181,7 @@ def simulate(
     numbers = _run_numbers(runs)
     signals = named_references(plant, reference)
     given = known_inputs(plant, signals, disturbance, time, 0 if runs is None else len(numbers))
+    size = np.maximum(given.max(axis=(0, 1), initial=0.0), -given.min(axis=(0, 1), initial=0.0))
     if not positions:
         warn_beyond_ranges(plant, signals, elements or {}, time)
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
@@ -206,7 +207,7 @@ def simulate(
             sensed = Acting(plant.y, met.on_y, float(plant.dt)) if met.on_y else None
             runner = MovingMachine(loop, path, noise=noise, schedule=schedule, sensed=sensed)
         else:
-            runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
+            runner = make_runner(loop, white, size, grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
         total = len(groups) * -(-steps // runner.stretch)
         with Progress(total, "simulate", progress=progress) as bar:
@@ -226,7 +227,7 @@ def simulate(
     drawn = seed_of(seed) if white.factor.size or white.columns.size else None
     record.flags.writeable = False  # a value keeps such an array, and copies others
     run = Response(time, record, shown, loop.units, drawn)
-    if not positions and not grows and np.any(given):
+    if not positions and not grows and np.any(size):
         warn_of_opposing_forces(loop, run)
     return run
 
@@ -340,7 +341,7 @@ def known_inputs(
             f"disturbance must be a mapping, got {short(disturbance)}: name the channel of w, "
             "disturbance={name: signal}."
         )
-    given = np.zeros((1, time.size, len(plant.w)))
+    given = np.zeros((1, len(plant.w), time.size))
     for kind, known, signals in (
         ("reference", both, {**reference, **_derivatives(reference, both, own, time)}),
         ("disturbance", others, disturbance or {}),
@@ -350,8 +351,8 @@ def known_inputs(
             values = _signal_samples(signal, f"{kind} {name!r}", time, runs)
             if values.ndim == 2 and len(given) < len(values):
                 given = np.tile(given, (len(values), 1, 1))
-            given[:, :, plant.w.index(name)] = values
-    return given
+            given[:, plant.w.index(name)] = values
+    return given.transpose(0, 2, 1)
 
 
 def _derivatives(
