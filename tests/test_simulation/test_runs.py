@@ -40,11 +40,32 @@ def free_mass():
     return close_loop(plant, StateSpace([], [], [], [[0.0]], inputs=["y"], outputs=["u"]))
 
 
+def shaken(seen):
+    """White noise on one of three states, which y shows two samples later, or not at all."""
+    A, G = [[0.9, 0.1, 0.0], [0.3 * seen, 0.5, 0.0], [0.0, 0.2, 0.7]], [[1.0], [0.0], [0.0]]
+    C = [[0.0, 1.0, 1.0] if seen else [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    names = {"inputs": ["w", "u"], "outputs": ["z", "y"]}
+    plant = StandardPlant.from_statespace(
+        StateSpace(A, [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]], C, np.zeros((2, 2)), 0.1, **names),
+        u=["u"], y=["y"], asd={"w": 1e-6}, noise_factor=1e-6 * np.array(G),
+    )  # fmt: skip
+    law = StateSpace([[0.5]], [[1.0]], [[-0.1]], [[-0.05]], 0.1, inputs=["y"], outputs=["u"])
+    return close_loop(plant, law)
+
+
+LOOPS = {
+    "stage": lambda: close_loop(stage(), observer(), servo()),
+    "free mass": free_mass,
+    "noise that is measured a sample late": lambda: shaken(True),
+    "noise that is not measured": lambda: shaken(False),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["stage", "free mass"])
+@pytest.mark.parametrize("kind", LOOPS)
 def test_blocks_are_the_samples_one_by_one(kind):
     """With noise, a start that is not rest and more than one piece of blocks."""
-    loop = close_loop(stage(), observer(), servo()) if kind == "stage" else free_mass()
+    loop = LOOPS[kind]()
     rng = np.random.default_rng(0)
     given = rng.standard_normal((10_003, len(loop.plant.w))) * 1e-6
     start = 1e-6 * rng.standard_normal(loop.monitored.n_states)

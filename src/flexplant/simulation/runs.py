@@ -457,7 +457,7 @@ class InBlocks:
         J = np.zeros((len(H), G.shape[1]))
         J[: len(read), self.noise.few :] = read
         abreast = self.stretch // (self.size * self.hold)
-        size, _ = cheapest(*reversed(H.shape), G.shape[1], _TYPICAL, abreast)
+        size, _ = cheapest(g.n_states, len(H), G.shape[1], _TYPICAL, abreast)
         return _distinct(Recursion(g.A, G, H, J), min(size, self.size))
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
