@@ -21,7 +21,7 @@ from flexplant.updating import (
     update,
 )
 from flexplant.updating.search import SearchEnd
-from flexplant.updating.search.objective import Trail
+from flexplant.updating.search.least_squares import Trail
 
 
 @pytest.mark.slow

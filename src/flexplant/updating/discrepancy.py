@@ -18,11 +18,9 @@ from ..store import Value
 from ..tolerances import CLOSE, DEVIATIONS, INTERVAL, MOST_STEPS, NEGLIGIBLE, SAME, TYPED
 from ..words import instance
 from .family import Point
-from .residuals.modal_residuals import USUAL, Eigenvalues, growth
-from .residuals.residual import Bound, Kind
+from .residuals.residual import USUAL, Bound, Eigenvalues, Kind, eigenvalue_sensitivities, growth
 from .search import Objective, SearchEnd
-from .search.objective import SearchPlan
-from .sensitivities import eigenvalue_sensitivities
+from .search.least_squares import SearchPlan
 
 #: degrees of freedom of the usual discrepancy of a kind: two measured modes outweigh it, and it
 #: holds without measured modes

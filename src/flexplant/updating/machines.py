@@ -19,7 +19,7 @@ from ..store import Value
 from ..tolerances import INTERVAL, ROUNDING, TINY, TYPED
 from ..words import instance
 from .parameters import AddedMass, Parameter, PointParameter
-from .sensitivities import eigenvalue_sensitivities
+from .residuals.residual import eigenvalue_sensitivities
 
 #: probability that chance alone rejects a slope or a mode: three standard deviations
 LEVEL = 0.003

@@ -21,13 +21,13 @@ from ..errors import (
 from ..modes.matching import NEAR
 from ..tolerances import FOUR_DIGITS, NEGLIGIBLE, ROOT, ROUNDING, TINY, TYPED
 from .family import Point, changed_model
-from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
 from .parameters import PointParameter, checked_values
 from .residuals.frf_residual import FrfResidual
-from .residuals.modal_residuals import Eigenvalues, ModeShapes
-from .residuals.residual import Residual
+from .residuals.residual import Eigenvalues, Residual
+from .residuals.shape_residuals import ModeShapes
 from .search import Objective, SearchEnd, TrustRegion
-from .search.objective import SearchPlan, Trail
+from .search.least_squares import SearchPlan, Trail
+from .search.objective import chance, chi_square, is_bad, noise_misfit
 from .update_result import Starts
 
 #: the end of a search, or the reason why it failed

@@ -20,11 +20,10 @@ from ..tolerances import INTERVAL
 from ..words import with_deviation
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .family import changed_model
-from .judgement.goodness import chance, is_bad
 from .machines import COUNT, Machines, Trend, trend_of
 from .parameters import AddedMass, Parameter
-from .residuals.modal_residuals import Eigenvalues
-from .residuals.residual import Residual
+from .residuals.residual import Eigenvalues, Residual
+from .search.objective import chance, is_bad
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,12 +17,11 @@ from ..words import flag, instance
 from .discrepancy import weigh_discrepancy
 from .family import changed_model, is_large
 from .full_basis import FullBasis
-from .judgement.goodness import chi_square, covariance, is_bad, resolution, worst
 from .parameters import Parameter, checked_parameters, checked_values
-from .residuals.modal_residuals import Eigenvalues
-from .residuals.residual import Residual
+from .residuals.residual import Eigenvalues, Residual
 from .search import Auto, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
-from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
+from .search.least_squares import ITERATIONS, SearchPlan, unit_changes
+from .search.objective import Defect, chi_square, covariance, is_bad, resolution, worst
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .update_result import History, UpdateResult
 

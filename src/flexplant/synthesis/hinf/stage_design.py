@@ -26,7 +26,7 @@ from ...plant.uncertainty.mode_delta import DampingDelta, Frequencies
 from ...plant.uncertainty.uncertain_plants import UncertainPlant
 from ...plant.visibility import untouched_modes
 from ...tolerances import CLOSE, SAME
-from ...updating.residuals.modal_residuals import USUAL
+from ...updating.residuals.residual import USUAL
 from ..controller import Controller
 from ..pipeline import Design, Solution, designed, solved, verified
 from .hinf_design import HinfDesign, TolerantDesign

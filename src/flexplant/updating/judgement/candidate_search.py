@@ -18,7 +18,7 @@ from ..family import is_large
 from ..full_basis import FullBasis
 from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
-from .goodness import chance, is_bad
+from ..search.objective import chance, is_bad
 from .subsets import Subsets
 from .twins import ALIKE, alike_sets
 

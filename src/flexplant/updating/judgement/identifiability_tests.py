@@ -16,7 +16,7 @@ from ...words import SHOWN
 from ..family import repeated_groups
 from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
-from .goodness import resolution
+from ..search.objective import resolution
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,8 +17,8 @@ from ...sparse.symmetric import factors
 from ...tolerances import CLOSE, FOUR_DIGITS, MOST_STEPS, NEGLIGIBLE, NULL, SETTLED, TINY, TYPED
 from ..family import Eigen, Family, Point
 from ..search import Objective, TrustRegion
-from ..search.objective import SearchEnd
-from .goodness import chance, independent_share, is_bad, noise_misfit, worst
+from ..search.least_squares import SearchEnd
+from ..search.objective import chance, independent_share, is_bad, noise_misfit, worst
 
 #: number of best subsets of each size that are extended
 BEAM = 3

@@ -19,13 +19,13 @@ from ...words import SHOWN
 from ..family import Point
 from ..parameters import Parameter, checked_parameters
 from ..residuals.frf_residual import FrfResidual
-from ..residuals.modal_residuals import ModeShapes
 from ..residuals.residual import Residual
+from ..residuals.shape_residuals import ModeShapes
 from ..search import Objective, checked_residuals
-from ..search.objective import UpdateMethod, compared_modes
+from ..search.least_squares import UpdateMethod
+from ..search.objective import chance, compared_modes, independent_share, is_bad
 from ..update_result import UpdateResult
 from ..updates import update
-from .goodness import chance, independent_share, is_bad
 
 
 def mac(X: Any, Y: Any) -> FloatArray:

@@ -1,21 +1,23 @@
-"""Least squares: Gauss-Newton, the paper's (13) and (14), a trust region, or both in turn."""
+"""Searches: Gauss-Newton, the paper's (13) and (14), a trust region, or both in turn."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
 from ...arrays import FloatArray, between, divisor, positive, whole
 from ...errors import ModelError, SolverError, counted
-from ...store import checked
+from ...parallel import tick
+from ...store import Value, checked
 from ...tolerances import CLOSE, MISSED, NULL, SAME
 from ...words import one_of
 from ..family import Point
-from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes
+from .objective import Objective
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")
@@ -35,6 +37,150 @@ STUCK = (
 
 #: reason of a search with a limit
 STOPPED = "max_iterations reached"
+
+#: label of the progress bar
+ITERATIONS = "update, iterations"
+#: steps that the searches from all starts of an update take together, on average
+_STEPS = 40.0
+
+
+@dataclass
+class Trail:
+    """The points a search has moved to."""
+
+    p: list[FloatArray] = field(default_factory=list)
+    poles: list[Any] = field(default_factory=list)
+    error: list[float] = field(default_factory=list)
+    fraction: list[float] = field(default_factory=list)
+
+    def add(self, objective: Objective, p: FloatArray, fraction: float) -> None:
+        """Add the point at `p`, where the objective is."""
+        tick(ITERATIONS, _STEPS)
+        point = objective.at(p)
+        self.p.append(np.array(p))
+        self.poles.append(objective.poles(point))
+        self.error.append(float(np.sum(objective.values(point, prior=False) ** 2)))
+        self.fraction.append(fraction)
+
+    def joined(self, later: Trail) -> Trail:
+        """Return this way and the one that goes on where it ends."""
+        parts = zip(vars(self).values(), vars(later).values(), strict=True)
+        return Trail(*(own + more[1:] for own, more in parts))
+
+
+@dataclass
+class SearchEnd:
+    """Result of a search."""
+
+    p: FloatArray
+    cost: float
+    trail: Trail
+    converged: bool
+    reason: str
+    #: methods that were tried and their ends, if there were several
+    tried: tuple[str, ...] = ()
+    #: the model at the end
+    point: Point | None = None
+
+
+class UpdateMethod(Value):
+    """The base class of methods that minimise the sum of squares of the residuals.
+
+    A new method is a subclass that defines `search`.
+
+    Examples
+    --------
+    The library's methods are instances of this class:
+
+    >>> import flexplant as fx
+    >>> isinstance(fx.updating.GaussNewton(), fx.updating.UpdateMethod)
+    True
+    """
+
+    #: default largest number of steps
+    steps: ClassVar[int] = 200
+    #: whether it keeps to the bounds of parameters
+    keeps_bounds: ClassVar[bool] = True
+    #: whether eigenvalues alone are weighted by W of the paper's (12), not by their covariance
+    weighs_poles: ClassVar[bool] = False
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether the result is the exact minimum of the sum of squares of all residuals."""
+        return not self.penalised
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the search does not move in directions that the data determine badly.
+
+        The result then depends on the start values, and its covariance is not known.
+        """
+        return False
+
+    @abstractmethod
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> SearchEnd:
+        """Return the end of a search that starts from given values of the parameters.
+
+        The result contains the parameters at the end and half the sum of squares there. It also
+        contains all steps, whether the search converged, and the reason why it ended.
+
+        Parameters
+        ----------
+        objective : Objective
+            Half the sum of squares of the whitened residuals, as a function of the parameters.
+        start : (q,) array
+            Start values of the parameters.
+        most : int, optional
+            Largest number of steps; by default the attribute `steps` of the method.
+        tolerance : float
+            Relative change of the fitted values that counts as zero.
+
+        Raises
+        ------
+        ModelError, SolverError
+            When no step from the start helps.
+        """
+
+
+class SearchPlan(NamedTuple):
+    """A method with its largest number of steps (None: its default) and relative tolerance."""
+
+    method: UpdateMethod
+    most: int | None
+    tolerance: float
+
+    def begun(self, objective: Objective, begin: FloatArray) -> SearchEnd:
+        """Return the end of a search whose modes are numbered where it begins."""
+        objective.origin = None
+        return self._ended(objective, begin)
+
+    def resumed(self, objective: Objective, end: SearchEnd) -> SearchEnd:
+        """Return the end of a search that goes on from another's."""
+        objective.origin = end.point
+        found = self._ended(objective, end.p)
+        found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
+        return found
+
+    def _ended(self, objective: Objective, begin: FloatArray) -> SearchEnd:
+        found = self.method.search(objective, begin, most=self.most, tolerance=self.tolerance)
+        found.point = objective.at(found.p, refer=True)
+        return found
+
+
+def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
+    """Return what counts as one change of each parameter."""
+    width = (objective.upper - objective.lower) / 2
+    length = np.linalg.norm(J, axis=0)
+    felt = 1 / divisor(length)
+    unit = np.where(np.isfinite(width), width, felt)
+    return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
 
 
 class _ImpossibleError(Exception):

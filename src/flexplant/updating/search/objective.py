@@ -1,24 +1,23 @@
-"""All residuals and priors as one least-squares problem, and the base class of searches."""
+"""All residuals and priors as one least-squares problem; its goodness of fit, its covariance."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+import scipy.sparse as sp
 
 from ...arrays import ComplexArray, FloatArray, divisor
 from ...errors import ModelError
-from ...parallel import tick
-from ...store import Value
-from ...words import instance
-from ..family import Family, Point, first_point
+from ...tolerances import CHANCE, MISSED, NEGLIGIBLE, ROUNDING, SAME, TINY, TYPED
+from ...words import SHOWN, instance
+from ..family import Eigen, Family, Point, first_point, repeated_groups
 from ..parameters import Parameter
-from ..residuals.modal_residuals import BoundEigenvalues
-from ..residuals.residual import Bound, Residual
-from ..sensitivities import PoleRows, mode_columns, split_point
+from ..residuals.residual import Bound, BoundEigenvalues, Residual, mode_columns, splitting
 
 
 class Defect(NamedTuple):
@@ -189,6 +188,76 @@ class Objective:
         return point.eigen.poles[point.columns(self.numbers)]
 
 
+class PoleRows:
+    """All measured eigenvalues of an objective, weighted as its residuals weigh them."""
+
+    def __init__(self, bounds: Sequence[BoundEigenvalues]) -> None:
+        self.bounds = bounds
+        self.numbers = tuple(n for bound in bounds for n in bound.numbers)
+        self.target = np.concatenate([bound.target for bound in bounds])
+
+    def whitened(self, rows: ComplexArray) -> FloatArray:
+        """Return weighted [Re; Im] of complex rows (m,) or (m, q)."""
+        ends = np.cumsum([len(bound.numbers) for bound in self.bounds])[:-1]
+        parts = zip(self.bounds, np.split(rows, ends), strict=True)
+        return np.concatenate([bound.whitened(part) for bound, part in parts])
+
+
+def split_point(point: Point, data: PoleRows) -> Point:
+    """Return the point with exactly repeated modes turned to the split of the next step."""
+    # the split depends on the step, and the step on the split: among both directions of every
+    # parameter, the step that fits best with its own split is used. Their numbers rise with their
+    # new frequencies
+    groups = repeated_groups(point.eigen.poles)
+    if not groups:
+        return point
+    repeated = {i for group in groups for i in group}
+    labels = point.labels.copy()
+    for group in groups:
+        labels[group] = np.sort(labels[group])
+    point = Point(point.family, point.p, point.eigen, labels)
+    try:
+        columns = point.columns(data.numbers)
+    except ModelError:
+        return point  # a mode is lost, which raises an error where it is needed
+    family = point.family
+    S = family.sensitivity(point.eigen, columns)
+    eigen = point.eigen
+    if repeated.intersection(columns):
+        S, eigen = _best_split(point, columns, S, data)
+    found = Point(family, point.p, eigen, point.labels)
+    found.turned = dict(zip(data.numbers, S, strict=True))
+    return found
+
+
+def _best_split(
+    point: Point, columns: list[int], S: ComplexArray, data: PoleRows
+) -> tuple[ComplexArray, Eigen]:
+    """Return S of (11) and the modes as the best step splits them."""
+    family, poles = point.family, point.eigen.poles[columns]
+    gap = data.target - poles
+    scale = family.strength(float(np.median(np.abs(data.target))))
+    best = (np.inf, S, point.eigen)
+    split = splitting(family, point.eigen)
+
+    def along(direction: FloatArray) -> tuple[ComplexArray, Eigen]:
+        eigen, rows = split(direction)
+        return np.array([rows.get(c, row) for c, row in zip(columns, S, strict=True)]), eigen
+
+    for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
+        turned, eigen = along(way)
+        # rounding in the row of a vector that stays would give a step without bounds
+        felt = np.where(np.abs(turned) > SAME * scale, turned, 0.0)
+        white = data.whitened(felt) / scale
+        step = np.linalg.lstsq(white, data.whitened(gap), rcond=MISSED)[0] / scale
+        if np.any(step):
+            turned, eigen = along(step)
+        left = float(np.sum(data.whitened(gap - turned @ step) ** 2))
+        if left < best[0]:
+            best = (left, turned, eigen)
+    return best[1], best[2]
+
+
 def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     """Return the residuals as a tuple, checked."""
     listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
@@ -214,146 +283,204 @@ def compared_modes(residual: Residual) -> tuple[int, ...]:
     return tuple(getattr(measured, "modes", None) or ())
 
 
-#: label of the progress bar
-ITERATIONS = "update, iterations"
-#: steps that the searches from all starts of an update take together, on average
-_STEPS = 40.0
+def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[float | None, int]:
+    """Return `noise_misfit` and its degrees of freedom; those of all rows where no noise is known.
+
+    The degrees of freedom are the number of rows minus the part of the parameters: the trace of
+    these rows of the projector on all slopes, which is its rank where all noise is known. Rows
+    with shared errors count by their share of independent ones, `Bound.independent`.
+    """
+    misfit = noise_misfit(objective, point, free)
+    taken = np.sum(_orthonormal(objective.slopes(point)[:, free]) ** 2, axis=1)
+    dof, data = 0.0, 0
+    for bound, rows in objective.rows(point):
+        data = rows.stop
+        if misfit is None or bound.has_noise:
+            left = rows.stop - rows.start - bound.lost - float(np.sum(taken[rows]))
+            dof += bound.independent * left
+    return misfit, max(round(dof + float(np.sum(1.0 - taken[data:]))), 0)
 
 
-@dataclass
-class Trail:
-    """The points a search has moved to."""
-
-    p: list[FloatArray] = field(default_factory=list)
-    poles: list[Any] = field(default_factory=list)
-    error: list[float] = field(default_factory=list)
-    fraction: list[float] = field(default_factory=list)
-
-    def add(self, objective: Objective, p: FloatArray, fraction: float) -> None:
-        """Add the point at `p`, where the objective is."""
-        tick(ITERATIONS, _STEPS)
-        point = objective.at(p)
-        self.p.append(np.array(p))
-        self.poles.append(objective.poles(point))
-        self.error.append(float(np.sum(objective.values(point, prior=False) ** 2)))
-        self.fraction.append(fraction)
-
-    def joined(self, later: Trail) -> Trail:
-        """Return this way and the one that goes on where it ends."""
-        parts = zip(vars(self).values(), vars(later).values(), strict=True)
-        return Trail(*(own + more[1:] for own, more in parts))
+def independent_share(objective: Objective, point: Point) -> float:
+    """Return the share of all rows that count as independent."""
+    rows = [(bound.independent, at.stop - at.start) for bound, at in objective.rows(point)]
+    return float(sum(share * count for share, count in rows) / sum(count for _, count in rows))
 
 
-@dataclass
-class SearchEnd:
-    """Result of a search."""
+def noise_misfit(objective: Objective, point: Point, free: FloatArray) -> float | None:
+    """Return ``|N^-1/2 r|^2`` of the residuals with known noise N, None without such.
 
-    p: FloatArray
-    cost: float
-    trail: Trail
-    converged: bool
-    reason: str
-    #: methods that were tried and their ends, if there were several
-    tried: tuple[str, ...] = ()
-    #: the model at the end
-    point: Point | None = None
+    ``min_d |N^-1/2 (r + J d)|^2``, to first order, where all noise is known but other weights are
+    given: it is distributed as chi-square for any weights.
+    """
+    if not any(bound.has_noise for bound in objective.bounds):
+        return None
+    r = objective.values(point)
+    anew = objective.noise_known and not objective.noisy
+    J = objective.slopes(point)[:, free] if anew else np.zeros((r.size, 0))
+    for bound, at in objective.rows(point):
+        if not bound.has_noise:
+            r[at] = 0.0
+        elif bound.noise is not None:
+            r[at], J[at] = _whitened(bound.noise, r[at]), _whitened(bound.noise, J[at])
+    Q = _orthonormal(J)
+    r -= Q @ (Q.T @ r)
+    data = objective.rows(point)
+    found = sum(bound.independent * np.sum(r[at] ** 2) for bound, at in data)
+    return float(found + np.sum(r[data[-1][1].stop :] ** 2))
 
 
-class UpdateMethod(Value):
-    """The base class of methods that minimise the sum of squares of the residuals.
+def _orthonormal(J: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the columns of J."""
+    if not J.size:
+        return J
+    U, s, _ = np.linalg.svd(J / divisor(np.linalg.norm(J, axis=0)), full_matrices=False)
+    return np.asarray(U[:, s > TYPED * s[0]])
 
-    A new method is a subclass that defines `search`.
 
-    Examples
-    --------
-    The library's methods are instances of this class:
+def _whitened(noise: Any, rows: FloatArray) -> FloatArray:
+    """Return ``L^-1 rows`` with ``noise = L L^T``, which is banded where it is sparse."""
+    if not sp.issparse(noise):
+        return np.asarray(la.solve_triangular(la.cholesky(noise, lower=True), rows, lower=True))
+    sparse: Any = noise
+    coo = sparse.tocoo()
+    apart = coo.row - coo.col
+    width = int(apart.max())
+    band = np.zeros((width + 1, coo.shape[0]))
+    below = apart >= 0
+    band[apart[below], coo.col[below]] = coo.data[below]
+    return np.asarray(la.solve_banded((width, 0), la.cholesky_banded(band, lower=True), rows))
 
-    >>> import flexplant as fx
-    >>> isinstance(fx.updating.GaussNewton(), fx.updating.UpdateMethod)
-    True
+
+def chance(chi2: float | None, dof: int) -> float | None:
+    """Return the probability of a larger chi-square by noise, None if not known."""
+    if chi2 is None or dof < 1:
+        return None
+    from scipy.special import chdtrc
+
+    return float(chdtrc(dof, chi2))
+
+
+def is_bad(probability: float | None) -> bool:
+    """Return whether noise hardly explains the residual."""
+    return probability is not None and probability < CHANCE
+
+
+def worst(objective: Objective, point: Point) -> str:
+    """Return the residuals of known noise that fit worst, in words."""
+    r = objective.values(point)
+    found: dict[str, float] = {}
+    for bound, rows in objective.rows(point):
+        if not bound.has_noise:
+            continue
+        part, noise = r[rows], bound.noise
+        size = np.abs(part) if noise is None else np.abs(part) / np.sqrt(noise.diagonal())
+        for row in np.argsort(-size, kind="stable")[: 2 * SHOWN].tolist():
+            name = bound.row_name(row)
+            found[name] = max(found.get(name, 0.0), float(size[row]))
+    order = sorted(found, key=lambda name: -found[name])[:SHOWN]
+    return ", ".join(f"{name} ({found[name]:.3g} standard deviations)" for name in order)
+
+
+def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, FloatArray]:
+    """Return covariance (or None) and correlation of the estimate, to first order."""
+    # `G N G^T` with `G = (J^T J)^-1 J^T` and N the covariance of the weighted residuals where it is
+    # known, the residual variance s^2 of the residuals without a scale
+    J, r = objective.slopes(point), objective.values(point)
+    q = J.shape[1]
+    length = np.linalg.norm(J, axis=0)
+    safe = divisor(length)
+    U, s, Vt = np.linalg.svd(J / safe, full_matrices=False)
+    inverse = np.where(s > SAME * s[0], 1 / np.maximum(s, TINY), 0.0)
+    half = (Vt.T * inverse) / safe[:, None]
+    unit = half @ half.T
+    # U^T N U, with N the covariance of known rows (a unit matrix of priors) and of the others
+    known, other = np.zeros((s.size, s.size)), np.zeros((s.size, s.size))
+    left, spare, data = 0.0, 0.0, 0
+    for bound, rows in objective.rows(point):
+        part, data = U[rows].T @ U[rows], rows.stop
+        if bound.has_noise:
+            known += U[rows].T @ bound.noise_times(U[rows])
+        else:
+            other += part
+            left += float(r[rows] @ r[rows])
+            spare += r[rows].size - bound.lost - float(np.trace(part))
+    known += U[data:].T @ U[data:]
+    found: FloatArray | None = None
+    if objective.noise_known or spare > 0.5:
+        # half a row: a smaller trace of a projector is rounding
+        variance = left / spare if spare > 0.5 else 0.0
+        found = half @ (known + variance * other) @ half.T
+        unit = found if objective.noise_known else unit
+    std = np.sqrt(np.diag(unit))
+    size = divisor(std)
+    correlation = unit / np.outer(size, size)
+    np.fill_diagonal(correlation, 1.0)
+    regular = s.size == q and bool(s[-1] > SAME * s[0])
+    return (found if regular else None), correlation
+
+
+@dataclass(frozen=True, eq=False)
+class Resolution:
+    """Combinations of q parameters that residuals determine at a point, by singular values.
+
+    The sensitivities have columns of length one: ``J diag(1/length) = U diag(values) axes``.
     """
 
-    #: default largest number of steps
-    steps: ClassVar[int] = 200
-    #: whether it keeps to the bounds of parameters
-    keeps_bounds: ClassVar[bool] = True
-    #: whether eigenvalues alone are weighted by W of the paper's (12), not by their covariance
-    weighs_poles: ClassVar[bool] = False
+    values: FloatArray
+    axes: FloatArray
+    #: (q,) one where a parameter is not seen
+    length: FloatArray
+    #: (q,) whether any residual depends on a parameter
+    seen: npt.NDArray[np.bool_]
 
     @property
-    def least_squares(self) -> bool:
-        """Whether the result is the exact minimum of the sum of squares of all residuals."""
-        return not self.penalised
+    def clear(self) -> npt.NDArray[np.bool_]:
+        """Which combinations (q,) are determined."""
+        return np.asarray(self.values > TYPED * self.values[0])
 
-    @property
-    def penalised(self) -> bool:
-        """Whether the search does not move in directions that the data determine badly.
-
-        The result then depends on the start values, and its covariance is not known.
-        """
-        return False
-
-    @abstractmethod
-    def search(
-        self,
-        objective: Objective,
-        start: FloatArray,
-        *,
-        most: int | None = None,
-        tolerance: float = 1e-10,
-    ) -> SearchEnd:
-        """Return the end of a search that starts from given values of the parameters.
-
-        The result contains the parameters at the end and half the sum of squares there. It also
-        contains all steps, whether the search converged, and the reason why it ended.
-
-        Parameters
-        ----------
-        objective : Objective
-            Half the sum of squares of the whitened residuals, as a function of the parameters.
-        start : (q,) array
-            Start values of the parameters.
-        most : int, optional
-            Largest number of steps; by default the attribute `steps` of the method.
-        tolerance : float
-            Relative change of the fitted values that counts as zero.
-
-        Raises
-        ------
-        ModelError, SolverError
-            When no step from the start helps.
-        """
+    def combinations(self, names: Sequence[str]) -> list[str]:
+        """Return a text for each determined combination, with as few parameters as possible."""
+        # the rows that span them, solved for the same number of parameters, each of which appears
+        # once
+        rows = self.axes[self.clear] * self.length
+        rank = len(rows)
+        pivots = la.qr(self.axes[self.clear], mode="r", pivoting=True)[1][:rank]
+        reduced = np.linalg.solve(rows[:, pivots], rows)
+        felt = np.abs(reduced) / self.length > NEGLIGIBLE / self.length[pivots][:, None]
+        return [
+            " ".join(
+                [
+                    names[pivot],
+                    *(
+                        f"{'-' if reduced[i, j] < 0 else '+'} {abs(reduced[i, j]):.3g} {names[j]}"
+                        for j in np.flatnonzero(felt[i]).tolist()
+                        if j not in pivots
+                    ),
+                ]
+            )
+            for i, pivot in sorted(enumerate(pivots.tolist()), key=lambda pair: pair[1])
+        ]
 
 
-class SearchPlan(NamedTuple):
-    """A method with its largest number of steps (None: its default) and relative tolerance."""
-
-    method: UpdateMethod
-    most: int | None
-    tolerance: float
-
-    def begun(self, objective: Objective, begin: FloatArray) -> SearchEnd:
-        """Return the end of a search whose modes are numbered where it begins."""
-        objective.origin = None
-        return self._ended(objective, begin)
-
-    def resumed(self, objective: Objective, end: SearchEnd) -> SearchEnd:
-        """Return the end of a search that goes on from another's."""
-        objective.origin = end.point
-        found = self._ended(objective, end.p)
-        found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
-        return found
-
-    def _ended(self, objective: Objective, begin: FloatArray) -> SearchEnd:
-        found = self.method.search(objective, begin, most=self.most, tolerance=self.tolerance)
-        found.point = objective.at(found.p, refer=True)
-        return found
-
-
-def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
-    """Return what counts as one change of each parameter."""
-    width = (objective.upper - objective.lower) / 2
+def resolution(
+    objective: Objective, point: Point, pinned: npt.NDArray[np.bool_] | None = None
+) -> Resolution:
+    """Return what the residuals determine at a point; `pinned`: known otherwise, as by a prior."""
+    J = objective.slopes(point, prior=False)
     length = np.linalg.norm(J, axis=0)
-    felt = 1 / divisor(length)
-    unit = np.where(np.isfinite(width), width, felt)
-    return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
+    own = np.abs(J).max(initial=0.0) * ROUNDING
+    omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
+    reach = objective.family.strength(omega)
+    # a column far below the possible effect of the parameter on this model is rounding: relative to
+    # the strongest one, and, for a single parameter, as a relative change of the data
+    strongest = float(np.max(length / reach, initial=0.0))
+    change = np.linalg.norm(J / divisor(objective.size(point)[: len(J)])[:, None], axis=0)
+    # nine decades below the strongest there is only rounding
+    seen = (length > own) & (length > 1e-9 * strongest * reach)
+    seen &= change > ROUNDING * reach / omega
+    length = np.where(seen, length, 1.0)
+    known = np.eye(seen.size)[[] if pinned is None else pinned]
+    _, s, Vt = np.linalg.svd(np.vstack([np.where(seen, J / length, 0.0), known]))
+    s = np.concatenate([s, np.zeros(seen.size - s.size)])
+    return Resolution(s, Vt, length, seen)

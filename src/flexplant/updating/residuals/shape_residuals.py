@@ -1,25 +1,16 @@
-"""Residuals of measured modes: poles, and shapes without their unknown scale and phase."""
+"""Residuals of measured shapes, without their unknown scale and phase."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ...arrays import (
-    ComplexArray,
-    FloatArray,
-    positive,
-    positive_array,
-    real_array,
-    real_or_complex,
-    spread_array,
-    whole,
-)
-from ...errors import LabelError, ModelError, ShapeError, counted, require_known, short
+from ...arrays import ComplexArray, FloatArray, real_array, real_or_complex, spread_array
+from ...errors import ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import CLUSTER, assigned, clusters, mac_matrix
@@ -27,201 +18,11 @@ from ...tolerances import SAME, TYPED
 from ...words import flag, instance
 from ..family import Family, Point
 from ..parameters import named_place
-from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
-
-#: relative standard deviations of frequency and damping of a good model: twice these, 0.5 % and 30
-#: %, are typical errors of an updated model where nothing was measured
-USUAL = (2.5e-3, 0.15)
-
-
-def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
-    """Return the ratio of the errors of frequencies (m,) of a model to the usual error."""
-    # neglected effects (shear, rotary inertia, motion between nodes) cause a relative error that
-    # grows with omega, for plates and beams; errors of material or thickness cause a constant one.
-    # Both are equal at the middle of the measured frequencies
-    return np.asarray(0.5 * (1.0 + omega / np.mean(measured)))
-
-
-class _ModalResidual(Residual):
-    """A residual of measured modes."""
-
-    measured: MeasuredModes
-
-    def _checked_numbers(self) -> tuple[int, ...]:
-        hint = "Pass MeasuredModes(poles, modes=[...])."
-        instance(self.measured, MeasuredModes, "measured", hint)
-        if self.measured.modes is None:
-            raise LabelError(
-                f"{type(self).__name__} needs mode numbers, but {self.measured!r} has none, so "
-                "that the mode of each pole is not known. Give modes=[...], "
-                "counted from 1 with the rigid-body modes."
-            )
-        return self.measured.modes
-
-    def _chosen(self, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
-        """Return the measured modes of some numbers, and their positions."""
-        known = self.measured.modes or ()
-        if not isinstance(modes, Iterable) or isinstance(modes, str):
-            raise LabelError(
-                f"modes must be a list of numbers, got {short(modes)}. Pass for example [6, 7]."
-            )
-        wanted = [whole(n, "a mode") for n in modes]
-        missing = [n for n in wanted if n not in known]
-        if missing or not wanted:
-            raise LabelError(
-                f"modes {missing or '[]'} were not measured; measured are {list(known)}."
-            )
-        columns = [known.index(n) for n in wanted]
-        return self.measured.select(columns), columns
+from .residual import Bound, ModalResidual, channel_places, place_rows, split_parts
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Eigenvalues(_ModalResidual):
-    """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
-
-    Here lambda_exp are the measured poles, and lambda_num are those of the model. The error is
-    ``e = d lambda^H W d lambda`` with the vector d lambda of the residuals. W is a real, positive
-    and diagonal matrix of weights (equations (10) and (12) of the paper).
-
-    Parameters
-    ----------
-    measured : MeasuredModes
-        Poles with their mode numbers.
-    weights : (m,) array [(s/rad)^2], optional
-        Diagonal of W. None: one over the variance of each pole if `measured` has a covariance,
-        otherwise ones.
-    clusters : float
-        Relative distance of poles, such as 0.02. Modes that are closer than this form a cluster,
-        and only the mean of their poles is compared. The mean does not depend on how the modes mix.
-        Zero: each mode is compared separately.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        When the weights are not one positive number for each pole, or the poles have no numbers.
-
-    References
-    ----------
-    [paper]_, equations (9)-(12).
-
-    Examples
-    --------
-    Two measured poles with equal weights:
-
-    >>> Eigenvalues(MeasuredModes([-28.5 + 2870j, -39.3 + 3970j], modes=[6, 7]))
-    <Eigenvalues: modes 6, 7, weights equal>
-    """
-
-    measured: MeasuredModes
-    weights: FloatArray | None = field(default=None, kw_only=True)
-    clusters: float = field(default=0.0, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._checked_numbers()
-        if self.weights is not None:
-            why = "W of (12) is positive definite: leave a pole out of the measurement instead."
-            shape = (len(self.measured),)
-            self._set(weights=positive_array(self.weights, "weights", shape, hint=why))
-        self._set(clusters=positive(self.clusters, "clusters", zero=True))
-
-    def __repr__(self) -> str:
-        numbers = ", ".join(str(number) for number in self.measured.modes or ())
-        known = "equal" if self.measured.covariance is None else "1/variance"
-        kind = known if self.weights is None else "given"
-        return f"<Eigenvalues: modes {numbers}, weights {kind}>"
-
-    @property
-    def W(self) -> FloatArray:
-        """The diagonal (m,) of W in equation (12)."""
-        m = len(self.measured)
-        if self.weights is not None:
-            return self.weights
-        if self.measured.covariance is None:
-            return np.ones(m)
-        variance = np.diag(self.measured.covariance)
-        return np.asarray(1 / (variance[:m] + variance[m:]), dtype=np.float64)
-
-    def select(self, modes: Sequence[int]) -> Eigenvalues:
-        """Return the residual of some of the measured modes, given by their numbers."""
-        chosen, columns = self._chosen(modes)
-        weights = None if self.weights is None else self.weights[columns]
-        return self.replace(measured=chosen, weights=weights)
-
-    def bound(self, family: Family) -> Bound:
-        """Return the residual as `update` uses it; see `Residual.bound`."""
-        return BoundEigenvalues(self)
-
-
-class BoundEigenvalues(Bound):
-    """Poles (or means of clusters) whitened by the factor of their covariance, or by W^(1/2)."""
-
-    def __init__(self, residual: Eigenvalues) -> None:
-        measured = residual.measured
-        self.numbers = measured.modes or ()
-        m = len(measured)
-        close = clusters(measured.poles, residual.clusters) if residual.clusters else []
-        self.clusters = [group.tolist() for group in close]
-        alone = [[i] for i in range(m) if not any(i in group for group in self.clusters)]
-        self._members = [*alone, *self.clusters]
-        self.mean = np.zeros((len(self._members), m))
-        for row, group in zip(self.mean, self._members, strict=True):
-            row[group] = 1 / len(group)
-        self.target = measured.poles
-        self.noisy = residual.weights is None and measured.covariance is not None
-        both = np.kron(np.eye(2), self.mean)
-        covariance = np.diag(np.tile(1 / residual.W, 2))
-        if self.noisy and measured.covariance is not None:
-            covariance = measured.covariance
-        factor = la.cholesky(both @ covariance @ both.T, lower=True)
-        self.white = la.solve_triangular(factor, both, lower=True)
-        if measured.covariance is not None and not self.noisy:
-            self.noise = self.white @ measured.covariance @ self.white.T
-        self.size = np.abs(self.white) @ np.tile(np.abs(self.target), 2)
-        self.name = f"modes {', '.join(map(str, self.numbers))}"
-
-    def kinds(self) -> list[Kind]:
-        """Return relative errors of frequency (at constant zeta) and of damping."""
-        # of each mode, and an equal one common to all modes (such as that of the material), which
-        # no single mode shows
-        grown = growth(np.abs(self.target), np.abs(self.target))
-        pole = self.target
-        zeta = -pole.real / np.abs(pole)
-        # d lambda / d ln zeta
-        damped = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(np.maximum(1 - zeta**2, TYPED)))
-        return [
-            Kind(name, self.whitened(np.column_stack([np.diag(column), column])), usual)
-            for name, column, usual in (
-                ("frequency", grown * pole, USUAL[0]),
-                ("damping", damped, USUAL[1]),
-            )
-        ]
-
-    def row_name(self, row: int) -> str:
-        """Return the mode or modes of a row."""
-        members = self._members[row % len(self._members)]
-        return f"mode{'s' * (len(members) > 1)} {', '.join(str(self.numbers[i]) for i in members)}"
-
-    def whitened(self, rows: ComplexArray) -> FloatArray:
-        """Return weighted [Re; Im] of complex rows, one for each pole."""
-        return np.asarray(self.white @ split_parts(rows), dtype=np.float64)
-
-    def values(self, point: Point) -> FloatArray:
-        """Return measured minus model, weighted."""
-        gap = self.target - point.eigen.poles[point.columns(self.numbers)]
-        return self.whitened(gap)
-
-    def slopes(self, point: Point) -> FloatArray:
-        """Return their derivatives."""
-        S = point.sensitivity(self.numbers)
-        for group in self.clusters:
-            # the trace does not depend on the basis of the subspace
-            _, change = point.subspace([self.numbers[i] for i in group])
-            S[group] = np.trace(change, axis1=1, axis2=2) / len(group)
-        return -self.whitened(S)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ModeShapes(_ModalResidual):
+class ModeShapes(ModalResidual):
     """Residuals of measured mode shapes psi at some places, without their scale and phase.
 
     The residual is ``r = (I - P) psi``, where P is the projector on the model's shape at these
