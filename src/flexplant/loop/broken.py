@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import ComplexArray, FloatArray
 from ..errors import LabelError, short
-from ..lti.frequency_sweep import SOUGHT, climbed_grid, highest, resonance_grid
+from ..lti.frequency_sweep import SOUGHT, climbed_grid, crossings, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, MeasuredPlant
 from ..lti.response_solvers import Responder, responder
 from ..lti.statespace import StateSpace
@@ -393,4 +393,34 @@ def axis_sensitivities(loop: Any) -> dict[str, tuple[FloatArray, FloatArray]]:
         error.removesuffix(":error"): error_sensitivity(loop, ref, error)
         for ref, error in pairs.items()
         if error in loop.plant.z
+    }
+
+
+def first_crossing(
+    freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
+) -> float:
+    """Return the frequency [Hz] at which a size first rises to 1, infinite if it stays below."""
+    # by interpolation between two points where possible
+    beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
+    if not beyond.size:
+        return float("inf")
+    pair, found = slice(beyond[0] - 1, beyond[0] + 1), freq[beyond[:1]]
+    if find is not None:
+        between = crossings(lambda f: find(f) - 1.0, freq[pair], size[pair] - 1.0)
+        found = np.append(between, found)
+    return float(found[0])
+
+
+def crossing(loop: Any, reference: str, error: str, curve: tuple[FloatArray, FloatArray]) -> float:
+    """Return the frequency [Hz] at which |S| first crosses 1 from below; 0 if never below."""
+    gain = loop.gain(reference, error)
+    below = np.any(curve[1] < 1.0)
+    return first_crossing(*curve, lambda freq: np.abs(gain(freq)[0, 0])) if below else 0.0
+
+
+def axis_bandwidths(loop: Any) -> dict[str, float]:
+    """Return where |S| of each reference first crosses 1 from below [Hz], 0 if never below."""
+    return {
+        f"{axis}:ref": crossing(loop, f"{axis}:ref", f"{axis}:error", curve)
+        for axis, curve in axis_sensitivities(loop).items()
     }

@@ -38,14 +38,16 @@ from .budget import (
     stationary_row,
     unverified_variances,
 )
-from .machine_figures import MachineLoops, interval_line, loop_interval
 from .on_measurement import NOT_MEASURED, OnMeasurement, judged
 from .other_machines import (
     MARGIN,
+    MachineLoops,
     ModeTolerances,
     SpillOver,
     growing_modes,
     high,
+    interval_line,
+    loop_interval,
     mode_tolerances,
     reported_tolerances,
 )

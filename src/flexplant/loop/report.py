@@ -15,10 +15,10 @@ from ..plant.partitioned import NOT_JUDGED
 from ..store import Value
 from ..tolerances import SPLIT
 from ..words import mapping
-from .broken import BrokenLoop, error_sensitivity, inverted, reference_pair
+from .broken import BrokenLoop, crossing, error_sensitivity, inverted, reference_pair
 from .closed import ClosedLoop
-from .machine_figures import crossing, interval_line
 from .measured_loop import broken_count
+from .other_machines import interval_line
 from .sensitivity_functions import Loop, taken_apart
 
 #: relative imaginary part of a loop gain at the first or last line that counts as zero

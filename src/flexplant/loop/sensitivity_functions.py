@@ -26,9 +26,8 @@ from ..lti.response_solvers import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import AnyPlant, SensorPort
 from ..tolerances import SAME
-from .broken import BrokenLoop, inverted, movable_outputs
+from .broken import BrokenLoop, first_crossing, inverted, movable_outputs
 from .closed import ClosedLoop
-from .machine_figures import first_crossing
 from .measured_loop import broken_count, measured_between
 
 #: types of loops: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a

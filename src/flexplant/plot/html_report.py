@@ -18,7 +18,7 @@ from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
 from ..loop.blocks import references
 from ..loop.broken import axis_sensitivities, error_sensitivity
-from ..loop.machine_figures import BANDWIDTH, MARGIN
+from ..loop.other_machines import BANDWIDTH, MODULUS_MARGIN
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
@@ -386,7 +386,7 @@ def _margins(loop: ClosedLoop, row: LoopFigures) -> list[Tile]:
         return []
     known = bool(loop.plant.dt) and loop.plant.machine.machines is not None
     margin, reached = (
-        f"; {loop.interval(name).sentence}" if known else "" for name in (MARGIN, BANDWIDTH)
+        f"; {loop.interval(name).sentence}" if known else "" for name in (MODULUS_MARGIN, BANDWIDTH)
     )
     peak = 20.0 * np.log10(1.0 / row.margin)
     judged = "" if loop.left_out is None else " with the truncated modes"

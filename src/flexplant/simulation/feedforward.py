@@ -13,8 +13,7 @@ from ..arrays import ComplexArray, FloatArray, IntArray, divisor, real_array, wh
 from ..errors import AssumptionError, ModelError, counted, only_one, require_known, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
-from ..loop.broken import error_sensitivity
-from ..loop.machine_figures import first_crossing
+from ..loop.broken import error_sensitivity, first_crossing
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.axes import resting_frequency, states_at

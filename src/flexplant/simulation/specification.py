@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import FloatArray, positive
 from ..errors import AssumptionError, ModelError, aligned, only_one, require_known, short
 from ..loop import ClosedLoop, bandwidth
-from ..loop.machine_figures import MARGIN
+from ..loop.other_machines import MODULUS_MARGIN
 from ..plant import FigureInterval
 from ..plant.machine_plants import PlantMachines, interval_text
 from ..store import Value, checked
@@ -146,7 +146,7 @@ def _on_machines(low: float, high: float, unit: str, met: bool) -> tuple[str, st
 #: figures of a loop, by the name of their row
 _FIGURES: dict[str, str | Callable[[ClosedLoop], float]] = {
     "bandwidth": bandwidth,
-    "modulus margin": MARGIN,
+    "modulus margin": MODULUS_MARGIN,
 }
 _ONE_RUN = (
     "no interval of a single run: pass a function of a loop, lambda one: simulate(one, ...), "
@@ -157,7 +157,7 @@ _ONE_RUN = (
 def _stable(loop: ClosedLoop, known: PlantMachines) -> FigureInterval:
     """Return whether a loop is stable on all machines, as an interval of 0 or 1."""
     if known.missing:
-        return loop.interval(MARGIN)
+        return loop.interval(MODULUS_MARGIN)
     loops = loop.on_machines
     count = len(loops.loops)
     low, high = float(loops.unstable == 0), float(loops.unstable < count)

@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
-from ..loop.machine_figures import BANDWIDTH, MARGIN
+from ..loop.other_machines import BANDWIDTH, MODULUS_MARGIN
 from ..lti.interconnection import feedback, series
 from ..lti.response_solvers import Recursion
 from ..lti.sampling import discretized
@@ -114,7 +114,7 @@ class Question:
         each = zip(budget.names, np.sqrt(np.maximum(budget.variances, 0.0)), strict=True)
         found.sources = sorted(((n, float(v)) for n, v in each), key=lambda one: -one[1])[:12]
         if plant.dt and plant.machine.machines is not None:
-            names = (found.channel, MARGIN, BANDWIDTH)
+            names = (found.channel, MODULUS_MARGIN, BANDWIDTH)
             found.on_machines = [(name, closed.interval(name).sentence) for name in names]
 
     def _in_time(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:

@@ -14,8 +14,8 @@ from ...arrays import positive
 from ...certificates import Certificate, Verified
 from ...errors import InfeasibleError, ModelError, SolverError, named_modes
 from ...loop import ClosedLoop, close_loop
-from ...loop.machine_figures import axis_bandwidths, loop_beside
-from ...loop.other_machines import BEYOND, mode_tolerances
+from ...loop.broken import axis_bandwidths
+from ...loop.other_machines import BEYOND, loop_beside, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
